@@ -21,7 +21,7 @@ from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses
 from coopenv.base.installation import scenario_path
 from coopenv.bench.observers.rows import standard_error
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.runs import record

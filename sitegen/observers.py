@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pkgutil import resolve_name
 
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.zoo import ZOO, Entry
+from coopenv.observers.registry import ZOO, Entry
 from coopenv.runs.markdown import bullets, table
 from sitegen.mirror import ROOT, relinked
 

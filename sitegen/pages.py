@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 
 from coopenv.base.installation import list_agents, list_envs
-from coopenv.observers.zoo import ZOO
+from coopenv.observers.registry import ZOO
 from sitegen.mirror import ROOT, examples_page, page_of, relinked
 from sitegen.observers import observers
 

@@ -14,9 +14,8 @@ from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hi
 from benchmarks.planar.lies import Drifting, Replaying
 from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.arrays import Array
-from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.robust import LEAST_LOST_STD, PlanarRobust
+from coopenv.estimation.poses import Array
+from coopenv.observers.planar.plugin import LEAST_LOST_STD, PlanarEkf, PlanarRobust
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 from tests.helpers.barrier_robots import barrier_robots, carried_off

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.backends.mrclam.dataset import Dataset, Robot, Truth
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 LANDMARKS_FROM = 6  # subjects below that are robots
 Change = Callable[[Robot, np.random.Generator], Robot]

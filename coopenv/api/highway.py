@@ -14,9 +14,8 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.backends.highway import Followed, FollowedWorld, flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.map_covariance import position_covariance
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.poses import Array, position_covariance
 from coopenv.scenario import Scenario, load_scenario
 
 LONGEST = 3600.0  # s, of an episode

@@ -7,12 +7,12 @@ import numpy as np
 
 from coopenv.backends.base import SensingWorld
 from coopenv.base.errors import CoopenvError
+from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Group, ObserverError
 from coopenv.observers.interference import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
-from coopenv.observers.riccati_coordinates import riccati_covariance
 
 
 class PlugIns:
@@ -126,9 +126,10 @@ class PlugIns:
         R, view = np.asarray(estimate.rotation, dtype=float), self._world.view
         view("estimate_rotation")[w, vehicle] = R
         view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
-        P = riccati_covariance(estimate)
-        if P is not None:
-            view("covariance")[w, vehicle] = P
+        if estimate.covariance is not None:
+            view("covariance")[w, vehicle] = riccati_covariance(
+                estimate.coordinates, estimate.rotation, estimate.position, estimate.covariance
+            )
 
     def get_state(self) -> list[dict[str, Any]]:
         """Return a deep copy of every observer and message.

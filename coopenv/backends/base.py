@@ -15,7 +15,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown, suggest
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.contract import Message, check_message
 from coopenv.observers.recording import LARGEST_PAN, SHAPES, Briefing, Sensed

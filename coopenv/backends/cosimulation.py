@@ -12,7 +12,7 @@ import warp as wp
 
 from coopenv.backends.simulated import SimulatedWorld
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import ARRIVED, COLLIDED, UNDER_WAY, depart, prescribe, referee
 from coopenv.world.embedded import Source

@@ -10,7 +10,7 @@ import numpy as np
 from coopenv.backends.cosimulation import MovedWorld, Poses
 from coopenv.backends.simulated import Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.scenario.highway import Highway

@@ -21,7 +21,7 @@ from coopenv.backends.base import (
 )
 from coopenv.backends.replay_kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.rotations import exp_se3
+from coopenv.estimation.poses import exp_se3
 from coopenv.observers.contract import Message, compiled_checks
 from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due

@@ -1,10 +1,10 @@
 """Functions of a few small arrays, compiled by Numba: in NumPy every operation takes a microsecond, whatever its size.
 
-They are compiled for one type of every argument, which takes any layout, when their module is loaded for the first time
-on a machine. As in C, nobody looks whether arrays that are handed to them have shapes that belong together.
+Each function is compiled for one type per argument, which admits any memory layout. Compilation happens when the module
+is first loaded on a machine. As in C, the shapes of the arguments are not checked.
 
-Numba keeps machine code per function, and looks whether the function's file has changed, but not whether others have
-that it has functions and constants from. So code is kept in a folder whose name tells all of these sources.
+Numba caches machine code per function and invalidates it when the function's own file changes. Changes of functions and
+constants in other files go unnoticed. The cache folder is therefore named by a digest of all these sources.
 """
 
 import os

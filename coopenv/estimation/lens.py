@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 CLOSE = 1e-9
 """Of image coordinates at distance 1: how near a ray's image has to be to the point that it was found for."""

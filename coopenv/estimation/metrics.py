@@ -3,6 +3,12 @@
 Position errors are in the map frame (m), orientation errors are geodesic angles (deg), and Rtilde = Rhat^T R as in the
 paper. Nothing is aligned before it is compared: the maps are global, and an alignment would hide the mirrored solution
 (orientation half a turn off), which a bearing-only observer without a sign test can fall into.
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4 (NEES and NIS
+with chi-square bounds); Wilson, Probable inference, JASA 22, 1927 (interval of a share).
+
+Source: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
+Maps here are global, so nothing is aligned: an alignment would hide the mirrored solution.
 """
 
 import math
@@ -11,10 +17,12 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.guaranteed_rate import slowest_decay
-from coopenv.estimation.observability import Observability
+from coopenv.estimation.observability import Observability, slowest_decay
+from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg, skew
 from coopenv.estimation.trajectory import Trajectory
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
@@ -77,67 +85,6 @@ def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None
     if ends is None:
         return np.full(vehicles, len(t))
     return np.maximum(1, np.searchsorted(t, np.asarray(ends, float) + 1e-6, side="right"))
-
-
-def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
-    """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
-    return np.asarray(np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float))
-
-
-def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternions (..., 4) of rotations (..., 3, 3), scalar part first and never negative.
-
-    Each row of 4 q q^T, which is linear in R, is a multiple of q; that of the largest component is well conditioned at
-    every angle, and at small ones takes the vector part from the skew part of R, without cancellation. SciPy's would
-    raise an error over the estimates of an observer that is lost (NaN, or far from a rotation).
-    """
-    R = np.asarray(rotation, float)
-    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    outer = np.empty((*R.shape[:-2], 4, 4))
-    outer[..., 0, 0] = 1 + x + y + z
-    outer[..., 1, 1] = 1 + x - y - z
-    outer[..., 2, 2] = 1 - x + y - z
-    outer[..., 3, 3] = 1 - x - y + z
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        outer[..., 0, i + 1] = outer[..., i + 1, 0] = R[..., k, j] - R[..., j, k]
-        outer[..., j + 1, k + 1] = outer[..., k + 1, j + 1] = R[..., j, k] + R[..., k, j]
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.asarray(np.where(q[..., :1] < 0, -q, q))
-
-
-def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
-    """Return the geodesic angle between rotations (..., 3, 3) in degrees, in [0, 180].
-
-    2 atan2(|lambda|, scalar part) keeps its accuracy at both ends, where acos of the trace has none: 1e-12
-    deg is told from zero, and a half turn is 180 deg exactly.
-    """
-    q = quaternion_wxyz(error_rotation(rotation, rotation_estimate))
-    return np.asarray(np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0])))
-
-
-def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
-    """Return (..., 3) roll, pitch, yaw in degrees with R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    R = np.asarray(rotation, float)
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
-    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.asarray(np.degrees(np.stack([roll, pitch, yaw], axis=-1)))
-
-
-def error_coordinates(
-    position: np.ndarray, rotation: np.ndarray, position_estimate: np.ndarray, rotation_estimate: np.ndarray
-) -> np.ndarray:
-    """Return the observer's error (2 lambda, p - phat) as (..., 6), in rad and m.
-
-    lambda is the vector part of the unit quaternion of Rtilde; p = R^T pbar and phat = Rhat^T pbarhat are the
-    positions in the true and in the estimated body frame. These are the coordinates of the observer's P.
-    """
-    twice_lambda = 2 * quaternion_wxyz(error_rotation(rotation, rotation_estimate))[..., 1:]
-    p = np.einsum("...ji,...j->...i", np.asarray(rotation, float), np.asarray(position, float))
-    p_hat = np.einsum("...ji,...j->...i", np.asarray(rotation_estimate, float), np.asarray(position_estimate, float))
-    return np.concatenate([twice_lambda, p - p_hat], axis=-1)
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -294,3 +241,101 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
 def _mean(values: np.ndarray) -> np.ndarray:
     """Return the mean over the first axis, NaN when it is empty."""
     return np.mean(values, axis=0) if len(values) else np.full(values.shape[1:], np.nan)
+
+
+LEVEL = 0.95
+DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0  # m and deg: a run that ends above either has diverged
+
+
+class Interval(NamedTuple):
+    """Low and high end."""
+
+    low: float
+    high: float
+
+
+def mean_bounds(dof: int, runs: int = 1, level: float = LEVEL) -> Interval:
+    """Return where the mean over independent runs of a chi-square of `dof` degrees, divided by `dof`, lies.
+
+    For ANEES the runs are Monte Carlo runs at one instant: ticks of one run are correlated, so the bounds do not hold
+    for a mean over time. For NIS, which is white over time, a run may be a tick. `level` is the probability of lying
+    inside.
+    """
+    from scipy.stats import chi2  # here, as loading it takes 0.4 s
+
+    total, tail = dof * runs, (1.0 - level) / 2.0
+    return Interval(float(chi2.ppf(tail, total)) / total, float(chi2.ppf(1.0 - tail, total)) / total)
+
+
+def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> Interval:
+    """Return the interval of a probability of which `successes` in `trials` were seen; all of [0, 1] without trials."""
+    if trials == 0:
+        return Interval(0.0, 1.0)
+    z, share = float(ndtri((1.0 + level) / 2.0)), successes / trials
+    centre = share + z**2 / (2 * trials)
+    spread = z * math.sqrt(share * (1.0 - share) / trials + z**2 / (4 * trials**2))
+    scale = 1.0 + z**2 / trials
+    return Interval(max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale))
+
+
+def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:
+    """Return whether runs that end with these errors (m, deg) have diverged; NaN, of a failed one, has."""
+    return ~((position_error <= DIVERGED_POSITION) & (orientation_error <= DIVERGED_ORIENTATION))
+
+
+def position_std(covariance: Array, coordinates: Coordinates, rotation: Array, position: Array) -> Array:
+    """Return sqrt(trace) (...) of the covariance of the position in the map that P (..., 6, 6) states, m.
+
+    To first order pbar - pbarhat is, up to a rotation, rho in LEFT coordinates, rho - S(pbarhat) theta in RIGHT ones,
+    and dp - S(phat) theta in the paper's, whose phat is in the body frame. The estimate's position is in the map, m.
+    """
+    if coordinates is Coordinates.LEFT:
+        variance = np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1)
+    else:
+        if coordinates is Coordinates.RICCATI:
+            position = (np.swapaxes(rotation, -1, -2) @ position[..., None])[..., 0]
+        J = np.concatenate([-skew(position), np.broadcast_to(np.eye(3), (*position.shape, 3))], axis=-1)
+        variance = np.einsum("...ij,...jk,...ik->...", J, covariance, J)
+    return np.sqrt(np.where(variance >= 0.0, variance, np.nan))  # not every P that is stated is a covariance
+
+
+class RelativeError(NamedTuple):
+    """Root mean squares over pairs of poses; NaN where there is no pair."""
+
+    position: float  # m
+    orientation: float  # deg
+
+
+def absolute_error(position: Array, position_estimate: Array) -> float:
+    """Return ATE: the root mean square of |p - phat| in m, of positions (K, 3), over the ticks whose truth is known."""
+    known = np.isfinite(position).all(axis=-1)
+    if not known.any():
+        return float("nan")
+    difference = position[known] - position_estimate[known]
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
+
+
+def relative_error(
+    rotation: Array, position: Array, rotation_estimate: Array, position_estimate: Array, delta: int
+) -> RelativeError:
+    """Return RPE: the root mean square over pairs (k, k + delta) of E = (P_k^-1 P_k+)^-1 (Phat_k^-1 Phat_k+).
+
+    Rotations (K, 3, 3) are body to map, positions (K, 3) in the map, m; pairs whose truth is NaN are left out, and they
+    do not overlap: k = 0, delta, 2 delta, ... Relative errors of different deltas, in ticks, cannot be compared.
+    """
+    start = np.arange(0, max(len(position) - delta, 0), delta)
+    known: NDArray[np.bool_] = np.isfinite(np.concatenate([rotation, position[..., None]], axis=-1)).all(axis=(-1, -2))
+    start = start[known[start] & known[start + delta]]
+    if not len(start):
+        return RelativeError(float("nan"), float("nan"))
+    R, p = _moved(rotation, position, start, start + delta)
+    R_hat, p_hat = _moved(rotation_estimate, position_estimate, start, start + delta)
+    # E = (R^T R_hat, R^T (p_hat - p)), and the rotation keeps the length
+    distance, angle = np.linalg.norm(p_hat - p, axis=-1), orientation_error_deg(R, R_hat)
+    return RelativeError(float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(angle**2))))
+
+
+def _moved(R: Array, p: Array, begin: NDArray[np.int64], end: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return P_begin^-1 P_end as rotations (n, 3, 3) and positions (n, 3)."""
+    back = np.swapaxes(R[begin], -1, -2)
+    return back @ R[end], (back @ (p[end] - p[begin])[..., None])[..., 0]

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.format import LARGEST
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 Mask = NDArray[np.bool_]
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coopenv.estimation.consistency import LEVEL, Interval, wilson_interval
+from coopenv.estimation.metrics import LEVEL, Interval, wilson_interval
 from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation.episodes import Episodes
 

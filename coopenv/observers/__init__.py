@@ -6,7 +6,7 @@ from coopenv.base.lazy import lazy_names
 from coopenv.observers.registry import find, observer_names, register
 
 if TYPE_CHECKING:
-    from coopenv.estimation.coordinates import Coordinates
+    from coopenv.estimation.poses import Coordinates
     from coopenv.observers.contract import (
         Estimate,
         Gains,
@@ -24,7 +24,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
-            "coopenv.estimation.coordinates": ["Coordinates"],
+            "coopenv.estimation.poses": ["Coordinates"],
             "coopenv.observers.contract": [
                 "Estimate",
                 "Gains",

@@ -6,16 +6,19 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.compiled import FLAG, MATRICES, MATRIX, NUMBER, ROW, VECTOR, WHOLE, compiled
-from coopenv.estimation.compiled_matrices import congruent, place, product, transformed
-from coopenv.estimation.compiled_rotations import (
+from coopenv.estimation.compiled_algebra import (
+    congruent,
     cross_matrix,
     exp_so3,
     exp_translation,
     orthonormalised,
+    place,
+    product,
     right_jacobian,
+    transformed,
 )
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, Tick
 
 LEFT, RIGHT, INVARIANT = 0, 1, 2

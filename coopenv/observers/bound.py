@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import skew
+from coopenv.estimation.poses import Array, skew
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.recording import Recording
 

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import exp_so3, orthonormalise, skew
+from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
 from coopenv.observers.bearing_measurements import Lines, Sight, linearised
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import Gate, Stacked, halfway

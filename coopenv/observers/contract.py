@@ -17,9 +17,8 @@ from scipy.linalg.lapack import dpotrf
 
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import LARGEST
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED
+from coopenv.estimation.poses import Array, Coordinates
+from coopenv.estimation.validity import MOST_LOPSIDED, are_rotations
 
 BYTES_PER_NUMBER = 8
 MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation
@@ -248,22 +247,22 @@ PRECISIONS = (np.dtype(np.float64), np.dtype(np.float32))
 @cache
 def compiled_checks() -> Any:
     """Return the compiled checks, with which Numba is loaded; whoever must not wait later calls this beforehand."""
-    from coopenv.estimation import sound
+    from coopenv.estimation import compiled_validity
 
-    return sound
+    return compiled_validity
 
 
 def check_estimate(estimate: Estimate) -> None:
     """Refuse what is no estimate, with a CoopenvError that names the field and what is wrong with it."""
-    R, p, P, sound = estimate.rotation, estimate.position, estimate.covariance, compiled_checks()
-    if not (sound.is_plain(R, 2) and sound.is_rotation(R)):
+    R, p, P, valid = estimate.rotation, estimate.position, estimate.covariance, compiled_checks()
+    if not (valid.is_plain(R, 2) and valid.is_rotation(R)):
         _check_array("rotation", R, LARGEST, ROTATION)
-        _check_rotation(np.asarray(R))
-    if not (sound.is_plain(p, 1) and sound.is_position(p, LARGEST)):
+        _check_rotation(R)
+    if not (valid.is_plain(p, 1) and valid.is_position(p, LARGEST)):
         _check_array("position", p, LARGEST, POSITION)
     if not isinstance(estimate.coordinates, Coordinates):
         raise CoopenvError(f"coordinates are {shown(estimate.coordinates)}, not a member of Coordinates")
-    if P is not None and not (sound.is_plain(P, 2) and P.shape == COVARIANCE and is_definite(P, 0.0, LARGEST**2)):
+    if P is not None and not (valid.is_plain(P, 2) and P.shape == COVARIANCE and is_definite(P, 0.0, LARGEST**2)):
         _check_array("covariance", P, LARGEST**2, COVARIANCE)
         _check_covariance(np.asarray(P))
     if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
@@ -272,7 +271,7 @@ def check_estimate(estimate: Estimate) -> None:
 
 def check_message(message: Message) -> None:
     """Refuse what is no message; `extra` is the observer's own business, as long as it holds numbers."""
-    if not _is_sound(message):
+    if not _is_valid(message):
         _check_fields(message)
     for name, value in message.extra.items():
         if np.asarray(value).dtype.kind not in "biufc":
@@ -285,12 +284,12 @@ def check_received(message: Message, planar: bool = False) -> None:
     Besides what no message may be: a rotation that is none, a covariance that is not positive definite or of no
     plausible size, and anything that is not finite. Robots on a plane know their height: theirs may be semidefinite.
     """
-    if not _is_sound(message):
+    if not _is_valid(message):
         _check_fields(message)
         if message.position is not None and np.abs(message.position).max() > FARTHEST:
             raise CoopenvError(f"message: position beyond {FARTHEST:g} m")
         if message.rotation is not None:
-            _check_rotation(np.asarray(message.rotation, np.float64))
+            _check_rotation(message.rotation)
         if message.covariance is not None:
             P = np.asarray(message.covariance, np.float64)
             _check_covariance(P)
@@ -311,12 +310,12 @@ def _check_fields(message: Message) -> None:
         _check_array("message: covariance", message.covariance, LARGEST**2, *SENT_COVARIANCES)
 
 
-def _is_sound(message: Message) -> bool:
-    """Return whether pose and covariance are sound for certain; it does not look at `extra`."""
-    sound, p, R, P = compiled_checks(), message.position, message.rotation, message.covariance
-    if p is not None and not (sound.is_plain(p, 1) and sound.is_position(p, FARTHEST)):
+def _is_valid(message: Message) -> bool:
+    """Return whether pose and covariance are certainly valid; `extra` is not checked."""
+    valid, p, R, P = compiled_checks(), message.position, message.rotation, message.covariance
+    if p is not None and not (valid.is_plain(p, 1) and valid.is_position(p, FARTHEST)):
         return False
-    if R is not None and not (sound.is_plain(R, 2) and sound.is_rotation(R)):
+    if R is not None and not (valid.is_plain(R, 2) and valid.is_rotation(R)):
         return False
     if P is None:
         return True
@@ -355,14 +354,10 @@ def _check_array(name: str, value: ArrayLike, largest: float, *shapes: tuple[int
         raise CoopenvError(f"{name} is not a finite array of shape {shape} with numbers up to {largest:g}")
 
 
-def _check_rotation(R: Array) -> None:
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # numbers of Python: faster than arrays this small
-    off = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
-    norms = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)
-    if max(map(abs, off)) > MAX_BEND or max(norms) > 1.0 + MAX_BEND or min(norms) < 1.0 - MAX_BEND:
-        raise CoopenvError("rotation is not orthogonal")
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0:
-        raise CoopenvError("rotation is a reflection")
+def _check_rotation(R: ArrayLike) -> None:
+    matrix = np.asarray(R, np.float64)
+    if not are_rotations(matrix):
+        raise CoopenvError("rotation is a reflection" if are_rotations(-matrix) else "rotation is not orthogonal")
 
 
 def _check_covariance(P: Array) -> None:

@@ -29,9 +29,9 @@ from math import log
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled
-from coopenv.estimation.compiled_matrices import congruent
+from coopenv.estimation.compiled_algebra import congruent
+from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import Lines, Sight, corrected, linearised, recentring
 from coopenv.observers.contract import Tick
 from coopenv.observers.correction import FRAME, Frame, frame_of, halfway_gain, joseph, updated

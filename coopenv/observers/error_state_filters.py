@@ -6,12 +6,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
-from coopenv.estimation.compiled_matrices import congruent, transformed
-from coopenv.estimation.compiled_rotations import exp_so3, exp_translation
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, lengths, skew
+from coopenv.estimation.compiled_algebra import congruent, exp_so3, exp_translation, transformed
+from coopenv.estimation.poses import IDENTITY, Array, Coordinates, cholesky, lengths, skew, solve
 from coopenv.observers import bearing_measurements
 from coopenv.observers.bearing_measurements import (
     INVARIANT,

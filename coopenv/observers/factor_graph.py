@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import adjoint
+from coopenv.estimation.poses import Array, adjoint
 from coopenv.observers.bearing_measurements import ahead, linearised, sight_of
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import Gate

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError, told
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.outcomes import UNKNOWN
+from coopenv.estimation.poses import Array, Coordinates
 from coopenv.observers.contract import (
     Estimate,
     Factory,

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.outcomes import REPLAY
-from coopenv.estimation.rotations import exp_so3
+from coopenv.estimation.poses import Array, exp_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import Scenario
 

@@ -14,11 +14,9 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.poses import Array, Coordinates, left_covariance
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
-from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher
 from coopenv.world.model import Precision, entry_struct, mat66d, model_struct, precision

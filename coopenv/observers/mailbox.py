@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, Received, check_message, check_received
 from coopenv.observers.recording import Briefing, sealed
 

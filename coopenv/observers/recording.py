@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import DataError, shown
 from coopenv.base.format import LARGEST
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_covariances, are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.contract import Received, Setup, Tick
 from coopenv.scenario.learning import MOST, PARAMETERS

@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.metrics import orientation_error_deg
 from coopenv.estimation.outcomes import UNIFORM_ROTATION
+from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, SensorNoise, Setup
 from coopenv.observers.group import Answer, Group, ObserverError, Tamper
 from coopenv.observers.recording import Briefing, Recording, Truth

@@ -31,10 +31,9 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from coopenv.estimation.arrays import Array, cholesky
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
-from coopenv.estimation.compiled_matrices import eliminated, place, product, transformed
-from coopenv.estimation.rotations import skew
+from coopenv.estimation.compiled_algebra import eliminated, place, product, transformed
+from coopenv.estimation.poses import Array, cholesky, skew
 from coopenv.observers.bearing_measurements import LEFT, Lines, Sight, corrected, dense, linearise, moved, recentring
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import FRAME, Frame, frame_of, gain, joseph

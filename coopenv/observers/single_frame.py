@@ -13,7 +13,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array, solve
+from coopenv.estimation.poses import Array, solve
 from coopenv.observers.bearing_measurements import Sight, ahead, linearised, normalised, sight_of
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.error_state_filters import LeftError, PoseObserver

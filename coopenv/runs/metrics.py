@@ -10,9 +10,8 @@ import warp as wp
 
 from coopenv.api.arguments import outcome_words
 from coopenv.base.installation import version
-from coopenv.estimation.guaranteed_rate import Rates, convergence_rates, least_mean
 from coopenv.estimation.metrics import CONVERGED, observability_of, summarise
-from coopenv.estimation.observability import Observability
+from coopenv.estimation.observability import Observability, Rates, convergence_rates, least_mean
 from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.rollouts import Ending, Rollout

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.base.files import replace_text, writing
-from coopenv.estimation.metrics import quaternion_wxyz
+from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.estimation.trajectory import Trajectory
 
 

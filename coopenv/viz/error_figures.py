@@ -14,14 +14,13 @@ from scipy.stats import chi2
 from coopenv.estimation.metrics import (
     CONVERGED,
     STEADY_SHARE,
-    error_rotation,
     live_ticks,
     observability_of,
-    roll_pitch_yaw_deg,
     settling_times,
     steady_mean,
 )
 from coopenv.estimation.observability import Observability
+from coopenv.estimation.poses import error_rotation, roll_pitch_yaw_deg
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import exp_so3
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.so3 import exp_so3
 from coopenv.world.model import BLIND, IDEAL
 from coopenv.world.random import (
     BEARING,

@@ -12,8 +12,8 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
 from coopenv.estimation.outcomes import Outcome
-from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
 from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
 from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
 from coopenv.world.warp_internals import device_function

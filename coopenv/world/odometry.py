@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import exp_so3, identity3, increment
+from coopenv.estimation.linalg import exp_so3, identity3, increment
 from coopenv.world.dynamics import segment_at
 from coopenv.world.model import DRIVEN
 from coopenv.world.random import (

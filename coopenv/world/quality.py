@@ -4,8 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
-from coopenv.estimation.so3 import identity3, quaternion_vector, skew
+from coopenv.estimation.linalg import block3, cholesky6, identity3, join6, quaternion_vector, skew, smallest_eigenvalue6
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function

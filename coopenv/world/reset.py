@@ -7,8 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import join6
-from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
+from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
 from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
 from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
 from coopenv.world.model import DRIVEN, PRESCRIBED

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import exp_so3
+from coopenv.estimation.linalg import exp_so3
 from coopenv.world.random import NEXT_ROUTE, ROUTE, ROUTE_SHAPE, WANDER, on_cells, random_words, signed_uniform, uniform
 from coopenv.world.warp_internals import device_function
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import join6
+from coopenv.estimation.linalg import exp_so3, identity3, join6
 from coopenv.estimation.outcomes import COLLUDE, DRIFT, HONEST, JUMP, REPLAY
-from coopenv.estimation.so3 import exp_so3, identity3
 from coopenv.world.camera import marker_position
 from coopenv.world.random import (
     CLOCK,

@@ -13,8 +13,7 @@ from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.dataset import Truth
 from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, recording_of
 from coopenv.base.errors import DataError
-from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.robust import PlanarRobust
+from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.mrclam_files import LANDMARKS, pose, real_folder, write
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.estimation.arrays import cholesky, solve
+from coopenv.estimation.poses import cholesky, solve
 
 
 @pytest.mark.parametrize("n", [1, 2, 6, 24])

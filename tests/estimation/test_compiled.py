@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation import compiled, compiled_matrices, compiled_rotations, rotations
+from coopenv.estimation import compiled, compiled_algebra, poses
 
 LAYOUTS = {
     "rows first": np.ascontiguousarray,
@@ -29,11 +29,11 @@ LAYOUTS = {
 def test_products_and_equations(layout: str) -> None:
     rng = np.random.default_rng(0)
     A, B, S = (LAYOUTS[layout](rng.normal(size=shape)) for shape in ((4, 5), (5, 3), (5, 5)))
-    assert_allclose(compiled_matrices.product(A, B), A @ B, atol=1e-14)
-    assert_allclose(compiled_matrices.transformed(A, B[:, 1]), A @ B[:, 1], atol=1e-14)
-    assert_allclose(compiled_matrices.congruent(A, S), A @ S @ A.T, atol=1e-13)
+    assert_allclose(compiled_algebra.product(A, B), A @ B, atol=1e-14)
+    assert_allclose(compiled_algebra.transformed(A, B[:, 1]), A @ B[:, 1], atol=1e-14)
+    assert_allclose(compiled_algebra.congruent(A, S), A @ S @ A.T, atol=1e-13)
     before = S.copy()
-    assert_allclose(S @ compiled_matrices.eliminated(S, B), B, atol=1e-12)
+    assert_allclose(S @ compiled_algebra.eliminated(S, B), B, atol=1e-12)
     assert_allclose(S, before, atol=0.0)
 
 
@@ -43,33 +43,31 @@ def test_elimination_is_as_good_as_lapack(seed: int, size: int, scale: float) ->
     A = rng.normal(size=(size, size)) * 10.0 ** rng.uniform(-scale, scale, (size, 1))
     x = rng.normal(size=(size, 2))
     b = A @ x
-    mine, lapack = (
-        np.abs(A @ found - b).max() for found in (compiled_matrices.eliminated(A, b), np.linalg.solve(A, b))
-    )
+    mine, lapack = (np.abs(A @ found - b).max() for found in (compiled_algebra.eliminated(A, b), np.linalg.solve(A, b)))
     assert mine <= 100.0 * lapack + 1e-13 * np.abs(A).max() * np.abs(x).max()
 
 
 def test_a_pivot_that_is_zero_is_not_the_end() -> None:
     A = np.array([[0.0, 1.0], [1.0, 0.0]])
-    assert_allclose(compiled_matrices.eliminated(A, np.eye(2)), A)
+    assert_allclose(compiled_algebra.eliminated(A, np.eye(2)), A)
 
 
 @pytest.mark.parametrize("A", [np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 4.0]])])
 def test_a_singular_matrix(A: np.ndarray) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="singular"):
-        compiled_matrices.eliminated(A, np.eye(2))
+        compiled_algebra.eliminated(A, np.eye(2))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.3, 3.0])
 def test_rotations(angle: float) -> None:
     w, v = angle * np.array([0.6, -0.48, 0.64]), np.array([1.0, -2.0, 0.5])
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(compiled_rotations.exp_so3(w), R, atol=1e-14)
-    assert_allclose(compiled_rotations.cross_matrix(w) @ v, np.cross(w, v), atol=1e-14)
-    assert_allclose(compiled_rotations.exp_translation(w, v), rotations.exp_se3(np.concatenate([w, v]))[1], atol=1e-12)
+    assert_allclose(compiled_algebra.exp_so3(w), R, atol=1e-14)
+    assert_allclose(compiled_algebra.cross_matrix(w) @ v, np.cross(w, v), atol=1e-14)
+    assert_allclose(compiled_algebra.exp_translation(w, v), poses.exp_se3(np.concatenate([w, v]))[1], atol=1e-12)
     bent = R + 1e-5 * np.arange(9.0).reshape(3, 3)
     assert (
-        np.abs(compiled_rotations.orthonormalised(bent) @ compiled_rotations.orthonormalised(bent).T - np.eye(3)).max()
+        np.abs(compiled_algebra.orthonormalised(bent) @ compiled_algebra.orthonormalised(bent).T - np.eye(3)).max()
         < 1e-7
     )
 
@@ -124,7 +122,7 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path) -> None:
 
 
 def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
-    show = "from coopenv.estimation.compiled_matrices import product, np; print(product(np.eye(2), np.eye(2)))"
+    show = "from coopenv.estimation.compiled_algebra import product, np; print(product(np.eye(2), np.eye(2)))"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     for _ in range(2):
         done = subprocess.run([sys.executable, "-c", show], env=environment, capture_output=True, text=True, check=True)
@@ -136,7 +134,7 @@ def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
 
 
 def test_functions_run_as_python_where_compilation_is_off() -> None:
-    show = "from coopenv.observers import lines; print(lines.across(0.0, 0.0, 1.0)[0])"
+    show = "from coopenv.observers.bearing_measurements import across; print(across(0.0, 0.0, 1.0)[0])"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", show], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[", "1.", "-0.", "-0.]"]

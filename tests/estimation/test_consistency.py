@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
-from coopenv.estimation.consistency import diverged, mean_bounds, position_std, wilson_interval
-from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.metrics import diverged, mean_bounds, position_std, wilson_interval
+from coopenv.estimation.poses import Coordinates
 
 
 def test_bounds_of_a_reference() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation import metrics
+from coopenv.estimation import metrics, poses
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Trajectory
 from tests.helpers.synthetic import INITIAL_ERROR, RATE, make_trajectory
@@ -29,7 +29,7 @@ def rotation(axis: tuple[float, ...], angle_deg: float) -> np.ndarray:
 
 @given(unit_vectors, angles_deg)
 def test_quaternion_is_axis_sine_of_half_the_angle(axis: tuple[float, ...], angle: float) -> None:
-    q = metrics.quaternion_wxyz(rotation(axis, angle))
+    q = poses.quaternion_wxyz(rotation(axis, angle))
     half = math.radians(angle) / 2
     expected = np.array([math.cos(half), *(math.sin(half) * np.array(axis) / np.linalg.norm(axis))])
     if angle > 180 - 1e-6:  # q and -q are one rotation, and which one rounding decides
@@ -40,37 +40,37 @@ def test_quaternion_is_axis_sine_of_half_the_angle(axis: tuple[float, ...], angl
 
 @given(unit_vectors, angles_deg)
 def test_orientation_error_is_accurate_at_both_ends(axis: tuple[float, ...], angle: float) -> None:
-    error = float(metrics.orientation_error_deg(np.eye(3), rotation(axis, angle)))
+    error = float(poses.orientation_error_deg(np.eye(3), rotation(axis, angle)))
     assert error == pytest.approx(angle, rel=1e-12, abs=1e-13)
 
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-9, 1e-6, 1e-3])
 def test_orientation_error_resolves_tiny_angles_where_acos_does_not(angle: float) -> None:
     R = Rotation.from_euler("zyx", [0.3, -0.7, 1.1]).as_matrix()
-    error = float(metrics.orientation_error_deg(R, R @ rotation((1, 2, 3), angle)))
+    error = float(poses.orientation_error_deg(R, R @ rotation((1, 2, 3), angle)))
     assert error == pytest.approx(angle, abs=3e-14)
 
 
 def test_orientation_error_of_half_turns_is_180() -> None:
     half_turns = np.array([np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
-    assert_allclose(metrics.orientation_error_deg(half_turns, np.eye(3)), 180.0, rtol=1e-14)
+    assert_allclose(poses.orientation_error_deg(half_turns, np.eye(3)), 180.0, rtol=1e-14)
 
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_orientation_error_is_symmetric_and_independent_of_the_frames(seed: int) -> None:
     R, R_hat, Q = Rotation.random(3, np.random.default_rng(seed)).as_matrix()
-    error = metrics.orientation_error_deg(R, R_hat)
-    assert_allclose(metrics.orientation_error_deg(R_hat, R), error, atol=1e-10)
-    assert_allclose(metrics.orientation_error_deg(Q @ R, Q @ R_hat), error, atol=1e-10)
-    assert_allclose(metrics.orientation_error_deg(R @ Q, R_hat @ Q), error, atol=1e-10)
+    error = poses.orientation_error_deg(R, R_hat)
+    assert_allclose(poses.orientation_error_deg(R_hat, R), error, atol=1e-10)
+    assert_allclose(poses.orientation_error_deg(Q @ R, Q @ R_hat), error, atol=1e-10)
+    assert_allclose(poses.orientation_error_deg(R @ Q, R_hat @ Q), error, atol=1e-10)
 
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_roll_pitch_yaw_agrees_with_scipy(seed: int) -> None:
     R = Rotation.random(20, np.random.default_rng(seed))
-    assert_allclose(metrics.roll_pitch_yaw_deg(R.as_matrix()), R.as_euler("xyz", degrees=True), atol=1e-9)
+    assert_allclose(poses.roll_pitch_yaw_deg(R.as_matrix()), R.as_euler("xyz", degrees=True), atol=1e-9)
 
 
 def test_error_coordinates_to_first_order() -> None:
@@ -84,7 +84,7 @@ def test_error_coordinates_to_first_order() -> None:
     )
     R_hat = R @ Rotation.from_rotvec(theta).as_matrix().T  # Rtilde = Exp(theta)
     position_estimate = R_hat @ (R.T @ position - delta)
-    error = metrics.error_coordinates(position, R, position_estimate, R_hat)
+    error = poses.error_coordinates(position, R, position_estimate, R_hat)
     assert_allclose(error, np.concatenate([theta, delta]), atol=1e-12)
 
 
@@ -92,9 +92,9 @@ def test_synthetic_errors_and_nees_are_recovered() -> None:
     run = make_trajectory(ticks=200, noise=0.02, yaw_rate=0.4)
     distance = np.linalg.norm(run.position - run.position_estimate, axis=-1)
     assert_allclose(distance, run.position_error, rtol=1e-10)
-    angle = metrics.orientation_error_deg(run.rotation, run.rotation_estimate)
+    angle = poses.orientation_error_deg(run.rotation, run.rotation_estimate)
     assert_allclose(angle, run.orientation_error, rtol=1e-9)
-    error = metrics.error_coordinates(run.position, run.rotation, run.position_estimate, run.rotation_estimate)
+    error = poses.error_coordinates(run.position, run.rotation, run.position_estimate, run.rotation_estimate)
     assert_allclose(metrics.nees(error, run.covariance), run.nees, rtol=1e-8)
 
 

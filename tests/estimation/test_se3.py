@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from coopenv.estimation.rotations import adjoint, exp_se3, rigid_exp
+from coopenv.estimation.poses import adjoint, exp_se3, rigid_exp
 
 
 def hat(xi: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation import so3
+from coopenv.estimation import linalg
 from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, Calls
 
 ANGLES = np.concatenate(
@@ -24,8 +24,8 @@ ANGLES = np.concatenate(
 )
 call = Calls(
     __name__,
-    {so3.exp_so3: "3 > 33", so3.rigid_motion: "3 3 > 33 3", so3.rotation_angle: "33 > 1"},
-    {so3.quaternion_vector: "33 > 3", so3.orthonormalise: "33 > 33"},
+    {linalg.exp_so3: "3 > 33", linalg.rigid_motion: "3 3 > 33 3", linalg.rotation_angle: "33 > 1"},
+    {linalg.quaternion_vector: "33 > 3", linalg.orthonormalise: "33 > 33"},
 )
 LARGE = np.array([3.5, 2 * np.pi - 1e-3, 2 * np.pi, 9.0, 40.0])
 component = st.floats(-1.0, 1.0, allow_subnormal=False)
@@ -52,13 +52,13 @@ def test_exponential_is_scipys(dtype: str) -> None:
     w, _ = turns(np.concatenate([ANGLES, LARGE]))
     w = w.astype(dtype).astype(float)
     tolerance = 8 * EPSILON[dtype] * np.maximum(1.0, np.linalg.norm(w, axis=1))
-    error = np.abs(call(so3.exp_so3, dtype, w) - Rotation.from_rotvec(w).as_matrix()).max(axis=(1, 2))
+    error = np.abs(call(linalg.exp_so3, dtype, w) - Rotation.from_rotvec(w).as_matrix()).max(axis=(1, 2))
     assert (error <= tolerance).all()
 
 
 def test_small_turns_keep_their_relative_accuracy() -> None:
     w = np.array([[1e-9, -2e-9, 3e-9]])
-    R = call(so3.exp_so3, "float64", w)[0]
+    R = call(linalg.exp_so3, "float64", w)[0]
     assert_allclose((R - R.T)[[2, 0, 1], [1, 2, 0]] / 2, w[0], rtol=1e-14)
 
 
@@ -66,7 +66,7 @@ def test_small_turns_keep_their_relative_accuracy() -> None:
 @settings(max_examples=100, deadline=None)
 def test_a_rigid_motion_turns_and_goes_as_far_as_its_mean_rotation(w: np.ndarray, u: np.ndarray) -> None:
     mean, _ = quad_vec(lambda s: Rotation.from_rotvec(s * w).as_matrix(), 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)
-    turn, way = call(so3.rigid_motion, "float64", w[None], u[None])
+    turn, way = call(linalg.rigid_motion, "float64", w[None], u[None])
     assert_allclose(turn[0], Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
     assert_allclose(way[0], mean @ u, atol=1e-12)
 
@@ -74,16 +74,16 @@ def test_a_rigid_motion_turns_and_goes_as_far_as_its_mean_rotation(w: np.ndarray
 def test_a_rigid_motion_in_float32_follows_float64() -> None:
     w = turns(np.concatenate([ANGLES, LARGE]))[0].astype(np.float32)
     u = np.broadcast_to(np.float32([1.0, -0.5, 0.3]), w.shape)
-    _, single = call(so3.rigid_motion, "float32", w, u)
-    _, double = call(so3.rigid_motion, "float64", w, u)
+    _, single = call(linalg.rigid_motion, "float32", w, u)
+    _, double = call(linalg.rigid_motion, "float64", w, u)
     assert_allclose(single, double, atol=1e-6)
 
 
 @given(rotation_vectors, vectors)
 @settings(max_examples=100, deadline=None)
 def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray) -> None:
-    turn, way = call(so3.rigid_motion, "float64", w[None], u[None])
-    half_turn, half_way = call(so3.rigid_motion, "float64", w[None] / 2, u[None] / 2)
+    turn, way = call(linalg.rigid_motion, "float64", w[None], u[None])
+    half_turn, half_way = call(linalg.rigid_motion, "float64", w[None] / 2, u[None] / 2)
     assert_allclose(half_turn[0] @ half_turn[0], turn[0], atol=1e-13)
     assert_allclose(half_way[0] + half_turn[0] @ half_way[0], way[0], atol=1e-13)
 
@@ -91,13 +91,13 @@ def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray
 def test_angle_to_a_picoradian_everywhere() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(so3.rotation_angle, "float64", R), angle, atol=1e-12, rtol=0)
+    assert_allclose(call(linalg.rotation_angle, "float64", R), angle, atol=1e-12, rtol=0)
 
 
 def test_angle_in_float32() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(so3.rotation_angle, "float32", R), angle, atol=1e-6, rtol=0)
+    assert_allclose(call(linalg.rotation_angle, "float32", R), angle, atol=1e-6, rtol=0)
 
 
 def test_angle_between_near_rotations() -> None:
@@ -105,7 +105,7 @@ def test_angle_between_near_rotations() -> None:
     base = Rotation.random(200, np.random.default_rng(1)).as_matrix()
     for angle in (1e-10, 1e-6, np.pi - 1e-10, np.pi - 1e-6):
         other = base @ Rotation.from_rotvec(angle * axes(174)[:200]).as_matrix()
-        between = call(so3.rotation_angle, "float64", np.swapaxes(base, 1, 2) @ other)
+        between = call(linalg.rotation_angle, "float64", np.swapaxes(base, 1, 2) @ other)
         assert_allclose(between, angle, atol=1e-14 if angle < 1 else 1e-12, rtol=1e-5)
 
 
@@ -114,7 +114,7 @@ def test_quaternion_vector_near_half_turns(dtype: str) -> None:
     angles = np.concatenate([ANGLES, 2 * np.arccos([0.1 + 1e-9, 0.1 - 1e-9, 0.09, 0.11])])
     w, angle = turns(angles)
     expected = np.sin(angle / 2)[:, None] * w / np.where(angle > 0, angle, 1.0)[:, None]
-    lam = call(so3.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix())
+    lam = call(linalg.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix())
     sign = np.ones(len(w))
     tiny = angle > np.pi - 20 * EPSILON[dtype]  # the two signs are one rotation there
     sign[tiny] = np.where((lam * expected).sum(axis=1)[tiny] < 0, -1.0, 1.0)
@@ -128,7 +128,7 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
     if np.linalg.norm(q) < 1e-3:
         return
     rotation = Rotation.from_quat(q)
-    lam = call(so3.quaternion_vector, "float64", rotation.as_matrix()[None])[0]
+    lam = call(linalg.quaternion_vector, "float64", rotation.as_matrix()[None])[0]
     scalar, *vector = rotation.as_quat(canonical=True, scalar_first=True)
     near = min(np.abs(lam - vector).max(), np.abs(lam + vector).max() + (np.inf if scalar > 1e-15 else 0.0))
     assert near < 1e-14
@@ -139,7 +139,7 @@ def test_orthonormalise_removes_the_first_order(dtype: str) -> None:
     rng = np.random.default_rng(2)
     R = Rotation.random(100, rng).as_matrix()
     dent = 1e-4 * rng.uniform(-1, 1, (100, 3, 3))
-    mended = call(so3.orthonormalise, dtype, R + dent)
+    mended = call(linalg.orthonormalise, dtype, R + dent)
     gram = np.swapaxes(mended, 1, 2) @ mended - np.eye(3)
     assert np.abs(gram).max() < 5e-7
     u, _, vt = np.linalg.svd(R + dent)

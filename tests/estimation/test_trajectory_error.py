@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.trajectory_error import absolute_error, relative_error
+from coopenv.estimation.metrics import absolute_error, relative_error
 
 Path = tuple[np.ndarray, np.ndarray]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from coopenv.cars import codec
 from coopenv.estimation.lens import distort
-from coopenv.estimation.rotations import log_so3
+from coopenv.estimation.poses import log_so3
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario

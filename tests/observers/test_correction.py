@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.rotations import right_jacobian
+from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Coordinates
 from coopenv.observers.correction import halfway, iterated, kalman
 from coopenv.observers.error_state_filters import InvariantError, LeftError, RightError

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.rotations import right_jacobian
+from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Message, Received, Recording, run
 from coopenv.observers.bearing_measurements import linearise
 from coopenv.observers.schmidt_kalman import Pairwise, SchmidtKalman

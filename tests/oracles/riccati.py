@@ -6,9 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array, cholesky
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, skew
+from coopenv.estimation.poses import IDENTITY, Array, Coordinates, cholesky, exp_so3, orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 
 MOST_SUBSTEPS = 200

@@ -10,7 +10,7 @@ import pytest
 from coopenv.base.installation import list_agents, list_envs
 from coopenv.cars.deployment import Car, Deployment, GateLink, Network, Remote, Safety, Security, Sensors, Tls
 from coopenv.cars.profile import SVEA
-from coopenv.observers.zoo import ZOO
+from coopenv.observers.registry import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from sitegen import links, mirror, pages, reference
 from tests.helpers.sessions import ROOT

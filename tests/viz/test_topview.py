@@ -19,9 +19,8 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.format import fixed
-from coopenv.estimation.map_covariance import position_covariance
-from coopenv.estimation.metrics import error_coordinates
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.poses import error_coordinates, position_covariance
 from coopenv.scenario import load_scenario
 from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera

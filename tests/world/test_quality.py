@@ -10,8 +10,8 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation import metrics
-from coopenv.observers.riccati_coordinates import left_covariance
+from coopenv.estimation import metrics, poses
+from coopenv.estimation.poses import left_covariance
 from coopenv.world import quality
 from tests.helpers.warp_calls import DTYPES, Calls
 
@@ -77,7 +77,7 @@ def test_error_coordinates_and_nees(angle: float | None) -> None:
     P = covariances(np.random.default_rng(2))
     e1, e2, value = call(judged, "float64", P, R, position, R_hat, p_hat)
     estimate = np.einsum("nij,nj->ni", R_hat, p_hat)
-    expected = metrics.error_coordinates(position, R, estimate, R_hat)
+    expected = poses.error_coordinates(position, R, estimate, R_hat)
     assert_allclose(np.concatenate([e1, e2], axis=1), expected, atol=1e-13)
     assert_allclose(value, metrics.nees(expected, P), rtol=1e-8)
 

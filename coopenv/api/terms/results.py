@@ -32,7 +32,7 @@ from coopenv.api.terms.values import (
     target_values,
     vehicle_values,
 )
-from coopenv.estimation.so3 import rotation_angle
+from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.world.dynamics import UNDER_WAY

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import DataError, DataWarning, suggest
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot
 from coopenv.base.errors import DataError, suggest
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, Truth, check_recording
 

@@ -16,9 +16,8 @@ from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.consistency import Interval, wilson_interval
-from coopenv.estimation.metrics import CONVERGED, settling_time
+from coopenv.estimation.metrics import CONVERGED, Interval, settling_time, wilson_interval
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable

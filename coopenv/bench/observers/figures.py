@@ -26,8 +26,8 @@ from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import Sample
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import FAILED, mean_of, short_name
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.consistency import mean_bounds, wilson_interval
+from coopenv.estimation.metrics import mean_bounds, wilson_interval
+from coopenv.estimation.poses import Array
 from coopenv.viz import style
 from coopenv.viz.drawing import contrast, place_names
 from coopenv.viz.style import (

@@ -11,11 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.bench.observers.sources import Source
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.consistency import diverged, position_std
-from coopenv.estimation.metrics import CONVERGED, SETTLED, SettlingTolerance, fit_exponential_rate, settling_time
+from coopenv.estimation.metrics import (
+    CONVERGED,
+    SETTLED,
+    SettlingTolerance,
+    absolute_error,
+    diverged,
+    fit_exponential_rate,
+    position_std,
+    relative_error,
+    settling_time,
+)
 from coopenv.estimation.observability import analyse_observability
-from coopenv.estimation.trajectory_error import absolute_error, relative_error
+from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording

@@ -19,8 +19,8 @@ from coopenv.bench.observers.rows import (
     totals_of,
     window_rows,
 )
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.metrics import SETTLED
+from coopenv.estimation.poses import Array
 
 BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in tables."""

@@ -18,9 +18,16 @@ from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import in_parentheses, number
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample, Window
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
-from coopenv.estimation.metrics import CONVERGED, SETTLED
+from coopenv.estimation.metrics import (
+    CONVERGED,
+    DIVERGED_ORIENTATION,
+    DIVERGED_POSITION,
+    LEVEL,
+    SETTLED,
+    Interval,
+    mean_bounds,
+)
+from coopenv.estimation.poses import Array
 
 
 def _column(meaning: str) -> Any:

@@ -24,7 +24,7 @@ from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Detections, Pose, Report, Sample, Twist
 from coopenv.cars.transport.base import Arrival
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
 from coopenv.scenario.sensing import Camera
 

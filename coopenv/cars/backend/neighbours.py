@@ -13,10 +13,8 @@ from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make
 from coopenv.cars.profile import Role
 from coopenv.cars.samples import Pose, Report
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import skew
+from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.observers.robust.messages import from_six
 from coopenv.scenario.base import rotation_of
 from coopenv.scenario.starts import neighbour_sets

@@ -7,8 +7,7 @@ from itertools import islice
 import numpy as np
 
 from coopenv.cars.samples import Detections, Pose, Twist
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import exp_so3, log_so3, rigid_exp
+from coopenv.estimation.poses import Array, exp_so3, log_so3, rigid_exp
 
 MOST_SAMPLES = 512
 """Of which the car has been told no time yet: five seconds of an IMU."""

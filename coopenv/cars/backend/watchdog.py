@@ -15,7 +15,7 @@ from coopenv.cars.deployment import Safety
 from coopenv.cars.limits import inside
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.samples import Pose, Report, Sample
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 

@@ -13,7 +13,7 @@ from coopenv.cars.fake.world import Room
 from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import Calibration
 from coopenv.cars.transport.base import Transport
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 GRAVITY = 9.81  # m/s^2
 

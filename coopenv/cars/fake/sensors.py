@@ -8,8 +8,8 @@ import numpy as np
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import Room
 from coopenv.cars.samples import Calibration
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.lens import distort
+from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Camera, Noise
 from coopenv.world.random import ODOMETRY_NOISE
 

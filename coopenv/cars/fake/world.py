@@ -14,8 +14,8 @@ from coopenv.cars.codec import decode
 from coopenv.cars.profile import NEUTRAL, Drive, Role
 from coopenv.cars.samples import rotation_of
 from coopenv.cars.transport.base import Arrival, Transport
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import drive, prescribe

@@ -30,7 +30,7 @@ from typing import Self
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.planar.model import (
     ARC,
     BIAS,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Received, Tick
 from coopenv.observers.planar.model import PlanarPose, misfit
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.planar.filter import PlanarFilter
 from coopenv.observers.planar.model import HEADING, STATES, PlanarPose, Step, Tuning, picked, wrapped
 

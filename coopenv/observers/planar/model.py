@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 
 X, Y, HEADING, TURN_SCALE, SPEED_SCALE, TURN_OFFSET, SPEED_OFFSET, SLOWDOWN, LEAD, BIAS, SHARE, DRIFT = range(12)
 STATES = 12

@@ -1,21 +1,34 @@
-"""The textbook filter for planar robots whose odometry is their commands, as a plug-in.
+"""The filters for planar robots whose odometry is their commands, as plug-ins: textbook and robust.
 
 In the LEFT coordinates of its covariance only yaw, forward and left count. Roll, pitch and height
 have a millimetre's and milliradian's variance, independent of the rest.
 """
 
 import math
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.fusion import LOWER, Sightings, place_of, sightings_of
+from coopenv.observers.planar.fusion import LOWER, Circle, Sightings, place_of, sightings_of
 from coopenv.observers.planar.mixture import Mixture
-from coopenv.observers.planar.model import TEXTBOOK, PlanarPose, Step, Tuning, X, Y
+from coopenv.observers.planar.model import (
+    BIAS,
+    CALIBRATING,
+    HEADING,
+    TEXTBOOK,
+    TURN_SCALE,
+    PlanarPose,
+    Step,
+    Tuning,
+    X,
+    Y,
+)
+from coopenv.observers.planar.search import Known, LossTest, Memory, find_pose
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m
@@ -137,3 +150,178 @@ def _from_body(heading: float) -> Array:
     """Return (3, 3) which takes (yaw, forward, left) to (x, y, heading); its transpose is its inverse."""
     c, s = math.cos(heading), math.sin(heading)
     return np.array([[0.0, c, -s], [0.0, s, c], [1.0, 0.0, 0.0]])
+
+
+CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
+LOST_HEADING_STD = math.pi / math.sqrt(3)  # rad, of a heading that may be any
+LEAST_LOST_STD = 5.0  # m
+SPANS_S = (10.0, 30.0)  # of what is searched: the shortest one that gives an answer counts
+SEARCH_PERIOD_S = 0.4
+ENOUGH = 8  # bearings, which contradict what was known before
+SWAYED_STD = (0.5, 0.5, 0.3)  # m, m, rad, by which who has believed a liar may be off
+MOST_FAILED = 15  # searches with so many bearings, after which what was known before does not count
+
+
+class PlanarRobust(PlanarEkf):
+    """Calibrates its odometry online, tells others that it saw them, and fuses by split covariance intersection.
+
+    It notices when it is lost: when bearings do not fit any more, or when it has become so uncertain that a single
+    bearing cannot correct it. Then it states a large covariance, sends nothing, and searches for the pose that the
+    bearings of the last half minute agree on.
+
+    Messages hold position and covariance (72 bytes), and after a sighting a pose with its covariance in single
+    precision (36 bytes), whether landmarks were seen lately (1), and 5 bytes for each robot seen.
+    """
+
+    tuning: ClassVar[Tuning] = CALIBRATING
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self._site = LEAST_LOST_STD
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick."""
+        if len(tick.landmarks):
+            self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
+        self._now = tick.time
+        self._circle.hear(tick)
+        self._unsettle(tick.time)
+        estimate = super().update(tick)
+        if self.lost:  # in a later tick than the one that showed it: bearings that misled do not at once say where
+            if not (self._news and tick.time >= self._next_search):
+                return estimate
+            self._search(tick.time)
+        elif self._test.lost:
+            self._memory.forget(self._test.since)  # until then it may have been elsewhere
+            self._give_up()
+        elif self._unclear():
+            self._memory.forget(math.inf)  # what it saw is in the estimate
+            self._lose()
+        else:
+            return estimate
+        return self._estimate()
+
+    def message(self) -> Message:
+        """Return nothing while lost."""
+        if self.lost:
+            self._sightings.clear()
+            return Message()
+        message = super().message()
+        if "seen" not in message.extra:
+            return message
+        extra: dict[str, Any] = {**message.extra, "sure": np.array([self._test.sure(self._now)], np.uint8)}
+        return replace(message, extra=extra)
+
+    def tampered(self, message: Message) -> Message:
+        """Return a message about another place than this robot's with sightings that agree with it."""
+        if message.position is None or "from" not in message.extra:
+            return message
+        told = np.array(message.extra["from"])
+        told[:2] += (message.position[:2] - self.filter.state[:2]).astype(told.dtype)
+        return replace(message, extra={**message.extra, "from": told})
+
+    def _begin(self, pose: Array, covariance: Array) -> None:
+        self.filter: Mixture = Mixture(self.tuning, pose, covariance)
+        self._test, self._memory = LossTest(), Memory()
+        self._circle = Circle(self.tuning.bearing_std)
+        self._now, self._next_search, self._failed, self._news = 0.0, 0.0, 0, False
+        self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
+        if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
+            self._lose()
+
+    def _advance(self, dt: float, turn: float, path: float) -> Step:
+        step = self.filter.advance(dt, turn, path)
+        self._memory.move(step)
+        self._news = False
+        if self.lost:
+            self._drift(step)
+        else:
+            self.filter.split()
+        return step
+
+    def _drift(self, step: Step) -> None:
+        """Widen the pose by what was turned and driven since the loss: errors of scale and heading last."""
+        state, covariance = self.filter.state, self.filter.covariance
+        before = self._turned
+        self._adrift, self._turned = self._adrift + abs(step.driven), before + abs(step.turned)
+        by_scale = float(covariance[TURN_SCALE, TURN_SCALE]) * (self._turned**2 - before**2)
+        heading = min(float(covariance[HEADING, HEADING]) + by_scale, LOST_HEADING_STD**2)
+        variance = self._from + self._adrift**2 * min(heading, 1.0)
+        self.filter.place(state[:3].copy(), np.diag([variance, variance, heading]))
+
+    def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
+        self._remember(tick.time, target, bearing, True, PlanarPose(np.array([x, y, 0.0]), np.zeros((3, 3))))
+        if not self.lost:
+            self._test.take(tick.time, self.filter.landmark(bearing, x, y))
+
+    def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
+        if self._believes(tick, target, bearing, place, seen=False):
+            self._remember(tick.time, target, bearing, True, place)
+            if not self.lost:
+                self._test.take_of_robot(tick.time, self.filter.robot(bearing, place))
+
+    def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
+        if self._believes(tick, target, bearing, by, seen=True):
+            self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
+            if not self.lost:
+                self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
+
+    def _believes(self, tick: Tick, target: int, bearing: float, place: PlanarPose, seen: bool) -> bool:
+        """Return whether a robot is believed, now that it was seen or saw this one."""
+        if not self.lost:
+            self._circle.of(target).see(*self.filter.misfit(bearing, place, seen), self._test.sure(tick.time))
+        return self._circle.believes(target, tick.time)
+
+    def _witness(self, tick: Tick, by: int, told: Sightings) -> None:
+        self._circle.witness(tick, by, told)
+        self._unsettle(tick.time)
+
+    def _unsettle(self, now: float) -> None:
+        """Be less sure of one's own place where others have led it astray."""
+        if self._circle.misled(now) and not self.lost and not self._test.sure(now):
+            state, covariance = self.filter.state, self.filter.covariance
+            self.filter.place(state[:3].copy(), covariance[:3, :3] + np.diag(np.square(SWAYED_STD)))
+
+    def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
+        """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""
+        self._news = True
+        angle -= float(self.filter.state[BIAS]) if own else 0.0
+        noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
+        point = (float(there.pose[0]), float(there.pose[1]))
+        variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
+        self._memory.see(time, target, angle, own, point, variance, noise)
+
+    def _unclear(self) -> bool:
+        variance = np.diag(self.filter.covariance)
+        return bool(variance[X] + variance[Y] > CLEAR_STD[0] ** 2)
+
+    def _lose(self) -> None:
+        """State that the pose is unknown."""
+        covariance = self.filter.covariance
+        self.lost, self._adrift, self._turned, self._failed = True, 0.0, 0.0, 0
+        self._from = float(covariance[X, X] + covariance[Y, Y])
+        self._test.clear()
+
+    def _give_up(self) -> None:
+        """State that nothing is known of the pose; what the wheels were found to be is doubtful, too."""
+        self.filter.place(self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD])))
+        self.filter.doubt()
+        self._lose()
+
+    def _search(self, now: float) -> None:
+        """Look for a pose that agrees with what was seen."""
+        self._next_search = now + SEARCH_PERIOD_S
+        state, covariance = self.filter.state, self.filter.covariance
+        information: Array = np.asarray(np.linalg.inv(covariance[:3, :3]), dtype=np.float64)
+        before = Known(state[:3].copy(), information)
+        for span in SPANS_S:
+            lines = self._memory.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
+            found, contradicted = find_pose(lines, before)
+            if found is not None:
+                left = np.asarray(np.linalg.inv(found.information + information), dtype=np.float64)
+                self.filter.place(found.pose, left)
+                self.lost = False
+                return
+        self._failed += contradicted and len(lines.angle) >= ENOUGH
+        if self._failed >= MOST_FAILED:
+            self._give_up()  # what was known before is wrong

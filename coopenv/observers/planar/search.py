@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.planar.model import Step
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit

@@ -13,8 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, join6, symmetric_part
-from coopenv.estimation.so3 import SIXTH, identity3, skew
+from coopenv.estimation.linalg import SIXTH, cholesky6, eigen_symmetric6, identity3, join6, skew, symmetric_part
 
 
 @wp.func

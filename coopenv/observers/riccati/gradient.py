@@ -18,8 +18,7 @@ import warp as wp
 
 from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning
 from coopenv.base.seeds import world_keys
-from coopenv.estimation.linalg import block3, cholesky6, join6
-from coopenv.estimation.so3 import exp_so3, increment, orthonormalise
+from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
 from coopenv.observers.riccati.equations import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.starts import neighbour_sets, processing_order

@@ -1,8 +1,12 @@
-"""The paper's decentralised Riccati observer on the measurements of one vehicle.
+"""The paper's decentralised Riccati observer on the measurements of one vehicle, and dead reckoning on its state.
 
 Source: Wong et al., Beyond Line-of-Sight: Cooperative Localization Using Vision and V2X Communication. P is over
-(2 lambda, p) and no covariance: V and Q are gains. It reads bearings, odometry increments and received messages only;
-truth enters through landmarks alone, whose positions are known to everybody.
+(2 lambda, p). It is no covariance: V and Q are gains. The observer reads bearings, odometry increments and received
+messages only. Truth enters through the known positions of landmarks alone.
+
+Dead reckoning is the lower reference: odometry alone, with the covariance that the odometry's noise produces. Its P is
+over e = (2 lambda, p - phat), positions in the body frame. An error (theta, rho) in LEFT coordinates is
+(theta, rho + S(phat) theta) there.
 """
 
 from dataclasses import replace
@@ -10,14 +14,14 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, join6
-from coopenv.estimation.so3 import exp_so3, orthonormalise
+from coopenv.estimation.linalg import block3, cholesky6, exp_so3, join6, orthonormalise, sheared, skew, symmetric_part
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.observers.riccati import equations
 from coopenv.world.camera import body_bearing
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.quality import known_position, usable
+from coopenv.world.v2x import start_covariance
 
 MOST_SUBSTEPS = wp.constant(200)  # re-linearisations per tick; the last one takes what remains of the tick
 
@@ -177,3 +181,31 @@ KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_s
 def riccati(setup: Setup) -> Observer:
     """The paper's observer, with the scenario's gains."""
     return KernelObserver(RICCATI, setup)
+
+
+@wp.func
+def start_dead_reckoning(model: Any, state: Any, memory: Any, world: int, vehicle: int):
+    """Start with the covariance of the initial estimate, in the coordinates of the state."""
+    P = sheared(start_covariance(model, state, world, vehicle), skew(wp.vec3d(state.estimate_position[world, vehicle])))
+    state.covariance[world, vehicle] = type(state.covariance[world, vehicle])(symmetric_part(P))
+
+
+@wp.func
+def estimate_dead_reckoning(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+    """Run one tick: the estimate follows odometry, and P grows by the noise of odometry."""
+    noise = model.noise[vehicle]
+    density = type(noise.velocity)(model.odometry_period * now.period)
+    turn = noise.angular_velocity * noise.angular_velocity * density
+    predict(state, world, vehicle, turn, noise.velocity * noise.velocity * density)
+    S = skew(state.estimate_position[world, vehicle])
+    P = state.covariance[world, vehicle]
+    B = block3(P, 0, 3) - turn * S
+    D = block3(P, 3, 3) - turn * symmetric_part(S * S)
+    state.covariance[world, vehicle] = join6(block3(P, 0, 0), B, wp.transpose(B), D)
+    # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
+    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
+    if now.due:
+        state.corrected_tick[world, vehicle] = now.tick
+
+
+DEAD_RECKONING = Embedded("dead_reckoning", estimate_dead_reckoning, start_dead_reckoning, send_nothing, fused=True)

@@ -4,14 +4,16 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
-from coopenv.estimation.so3 import (
+from coopenv.estimation.linalg import (
+    block3,
+    cholesky6,
     exp_so3,
     orthonormalise,
     quaternion_vector,
     rodrigues,
     rotation_vector_sine,
     skew,
+    symmetric_part,
     turn_by,
 )
 from coopenv.observers.robust.constants import (

@@ -16,8 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, sheared, symmetric_part
-from coopenv.estimation.so3 import exp_so3, skew
+from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Correlation, Known, Pose, Report, mat66d, mat66f, vec3d
 from coopenv.observers.robust.tracklets import arrived, clear_messages, depends_on_own, marker_jacobian, receive, send

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.robust import joint_messages
 from coopenv.observers.robust.algebra import (

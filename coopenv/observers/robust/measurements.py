@@ -7,8 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3
-from coopenv.estimation.so3 import exp_so3, skew
+from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise
 from coopenv.observers.robust.belief import index_of

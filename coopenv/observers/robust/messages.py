@@ -7,8 +7,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.format import LARGEST
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import exp_so3, log_so3
+from coopenv.estimation.poses import Array, exp_so3, log_so3
 from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_TOLD, MIN_VARIANCE, STEPS
 from coopenv.world.embedded import Messages

@@ -15,9 +15,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.linalg import sheared, symmetric_part
-from coopenv.estimation.so3 import orthonormalise, skew
+from coopenv.estimation.linalg import orthonormalise, sheared, skew, symmetric_part
+from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.robust import constants

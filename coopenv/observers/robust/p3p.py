@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.poses import Array
 from coopenv.observers.robust.constants import THIRD
 from coopenv.observers.robust.memory import mat33d, vec2d, vec3d
 from coopenv.world import launch

@@ -4,8 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
-from coopenv.estimation.so3 import exp_so3, orthonormalise, skew
+from coopenv.estimation.linalg import exp_so3, orthonormalise, skew, symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import moved, odometry_noise, with_noise
 from coopenv.observers.robust.belief import propagate

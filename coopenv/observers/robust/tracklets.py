@@ -11,8 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import sheared
-from coopenv.estimation.so3 import skew
+from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d

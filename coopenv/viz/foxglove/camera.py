@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap.format import codec
 from coopenv.base.format import jsonable
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.lens import distort
-from coopenv.estimation.map_covariance import covariance_in_map
+from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.foxglove.scene import MAP, Shown, colour, colour_of, short
 from coopenv.viz.style import DARK_BLUE

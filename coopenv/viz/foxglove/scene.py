@@ -14,8 +14,7 @@ from matplotlib.colors import to_rgba
 from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap.format import Clock
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.map_covariance import covariance_in_map
+from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.observers import Run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body

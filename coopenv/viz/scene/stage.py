@@ -6,8 +6,8 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from coopenv.estimation.map_covariance import position_covariance
 from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.poses import position_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.viz import topview_geometry as geometry

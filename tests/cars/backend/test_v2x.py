@@ -14,7 +14,7 @@ from coopenv.cars.codec import decode, encode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Sample
-from coopenv.estimation.rotations import exp_so3
+from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
 from tests.cars.backend.test_assembler import MS, START, binding
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mrclam import recording_of
 from coopenv.observers.contract import Message
-from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.robust import PlanarRobust
+from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.barrier_robots import barrier_robots, carried_off
 

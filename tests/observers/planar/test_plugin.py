@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Setup, Tick
-from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.robust import PlanarRobust
+from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 
 LIMIT_BYTES = 224  # pose and covariance in space
 LANDMARKS = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])

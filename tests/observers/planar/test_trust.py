@@ -10,7 +10,7 @@ from benchmarks.planar.lies import Drifting
 from coopenv.backends.mrclam import recording_of
 from coopenv.observers.planar.fusion import ENOUGH, Trust
 from coopenv.observers.planar.model import PlanarPose, misfit
-from coopenv.observers.planar.robust import PlanarRobust
+from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.barrier_robots import barrier_robots
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
-from coopenv.estimation.map_covariance import position_covariance
+from coopenv.estimation.poses import position_covariance
 from coopenv.observers import registry
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario import load_scenario

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.rotations import exp_so3
+from coopenv.estimation.poses import exp_so3
 from tests.helpers.robust_observers import OpenRobust
 from tests.helpers.robust_ticks import (
     LANDMARKS,

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
-from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.poses import Coordinates
 from coopenv.observers import run
 from coopenv.observers.robust.constants import SEPARATION_GATE
 from coopenv.observers.robust.solution_separation import consistent_cost

@@ -7,7 +7,7 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.poses import Coordinates
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
 from tests.observers.robust.test_driving import estimates, nees_of

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.cli import main
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.map_covariance import covariance_in_map
+from coopenv.estimation.poses import Coordinates, covariance_in_map
 from coopenv.observers import Run, run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.sensing import Camera

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.sound import is_covariance, is_plain, is_position, is_rotation
+from coopenv.estimation.compiled_validity import is_covariance, is_plain, is_position, is_rotation
 
 STRANGE = [np.nan, np.inf, -np.inf, 1e200, -1e200]
 R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
@@ -36,14 +36,14 @@ def test_a_strange_entry_anywhere(value: float) -> None:
         assert not is_covariance(lopsided, 0.0, 1e12)
 
 
-def test_what_is_sound() -> None:
+def test_what_is_valid() -> None:
     assert is_position(np.array([1.0, -2.0, 3.0]), 3.0) and not is_position(np.array([1.0, -2.0, 3.1]), 3.0)
     assert is_rotation(R) and not is_rotation(-R) and not is_rotation(R * (1.0 + 1e-5))
     assert is_covariance(P, 0.0, 1e3) and not is_covariance(P, 1e3, 1e12) and not is_covariance(P, 0.0, 1.0)
     assert not is_covariance(-P, 0.0, 1e3) and not is_covariance(P - 2.0 * np.eye(6), 0.0, 1e3)
 
 
-def test_other_shapes_are_not_sound() -> None:
+def test_other_shapes_are_not_valid() -> None:
     assert not is_position(np.zeros(2), 1.0) and not is_position(np.zeros(4), 1.0)
     assert not is_rotation(np.eye(2)) and not is_rotation(np.eye(4)) and not is_rotation(np.ones((3, 2)))
     assert not is_covariance(np.ones((6, 5)), 0.0, 1e3)

@@ -1,14 +1,14 @@
-"""Whether arrays are what they claim to be, compiled: observers' estimates and messages are asked at every tick.
+"""Validity of poses and covariances, compiled: observers' estimates and messages are tested at every tick.
 
-What passes here is sound; of the rest observers/checks.py says what is wrong with it, or that it is sound after all.
+A value that passes is valid. For any other value `coopenv.observers.contract` decides, and names what is wrong.
 """
 
 from typing import Any
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, compiled
+from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED
 
 

@@ -1,12 +1,13 @@
-"""Products and linear equations of small matrices for compiled functions: up to about ten rows BLAS takes longer.
+"""Small matrices and rotations for compiled functions: up to about ten rows BLAS takes longer.
 
 LAPACK by way of Numba is no slower, but takes seconds to compile in every function that uses it.
 """
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation import poses
 from coopenv.estimation.compiled import MATRIX, TARGET, VECTOR, WHOLE, compiled
+from coopenv.estimation.poses import Array
 
 
 @compiled(TARGET, WHOLE, WHOLE, MATRIX)
@@ -70,3 +71,20 @@ def eliminated(A: Array, B: Array) -> Array:
         for j in range(X.shape[1]):
             X[i, j] /= A[i, i]
     return X
+
+
+exp_so3 = compiled(VECTOR)(poses.exp_so3)
+right_jacobian = compiled(VECTOR)(poses.right_jacobian)
+exp_translation = compiled(VECTOR, VECTOR)(poses.exp_translation)
+
+
+@compiled(MATRIX)
+def orthonormalised(R: Array) -> Array:
+    """Return the rotation nearest to an almost orthogonal R (3, 3), see `poses.orthonormalise`."""
+    return 1.5 * R - product(0.5 * R, product(R.T, R))
+
+
+@compiled(VECTOR)
+def cross_matrix(v: Array) -> Array:
+    """Return S(v) (3, 3) with S(v) y = v x y."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
