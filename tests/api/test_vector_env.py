@@ -39,7 +39,8 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
         there = batch.engine.view("alive")[world]
         assert list(first) == [agent for agent, alive in zip(single.possible_agents, there, strict=True) if alive]
         assert np.array_equal(batch.world_major(observations)[world][there], np.stack(list(first.values())))
-    for _ in range(60):
+    slow = batch.scenario.backend == "highway"  # which steps cars in Python
+    for _ in range(20 if slow else 60):
         actions = batch.world_major(actions_for(batch, rng))
         observations, rewards, terminated, truncated, infos = batch.step(actions.reshape(-1, 2))
         for world, single in enumerate(singles):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 import urllib.request
@@ -25,6 +26,20 @@ SHORT = ("overtaking", "--set", "horizon=1.0")
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with files that are cut off, or no recordings at all, and with a run without its scene."""
+    place = tmp_path_factory.mktemp("broken")
+    (place / "others.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
+    log, run = place / "cut.mcap", place / "run"
+    assert main(["record", *SHORT, "--no-scene", "--no-replay", "--out", str(log)]) == 0
+    assert main(["run", *SHORT, "--no-figures", "--out", str(run)]) == 0
+    log.write_bytes(log.read_bytes()[:5000])
+    (place / "cut.npz").write_bytes((run / "scene.npz").read_bytes()[:5000])
+    (run / "scene.npz").unlink()
+    return place
 
 
 def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,18 +106,11 @@ def test_without_the_extra_runs_say_what_is_missing(
         (["export", "run", "--format", "foxglove-layout"], "run: a folder; expected a log file (.mcap)"),
     ],
 )
-def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("others.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
-    if arguments[1].startswith("cut"):
-        assert main(["record", *SHORT, "--no-scene", "--no-replay", "--out", "whole.mcap"]) == 0
-        Path("cut.mcap").write_bytes(Path("whole.mcap").read_bytes()[:5000])
-        assert main(["run", *SHORT, "--no-figures", "--out", "run"]) == 0
-        Path("cut.npz").write_bytes(Path("run/scene.npz").read_bytes()[:5000])
-        capsys.readouterr()
-    if arguments[1] == "run":
-        assert main(["run", *SHORT, "--no-figures", "--out", "run"]) == 0
-        Path("run/scene.npz").unlink()
-        capsys.readouterr()
+def test_bad_input_is_one_line(
+    arguments: list[str], message: str, broken: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(broken, ".", dirs_exist_ok=True)
+    capsys.readouterr()
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -118,13 +126,13 @@ def test_without_a_display_no_browser_is_opened(
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr("webbrowser.open", lambda url: pytest.fail(f"opened {url}"))
     assert not has_display()
-    assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
+    assert main(["run", "crossing_path", *SHORT[1:], "--out", "there", "--open"]) == 0
     monkeypatch.setenv("DISPLAY", ":0")
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or len(opened) == 1)
     capsys.readouterr()
     for said in ("", "note: there is no browser to open there/replay.html\n"):
-        assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
+        assert main(["run", "crossing_path", *SHORT[1:], "--out", "there", "--open"]) == 0
         assert capsys.readouterr().err == said
     assert opened == 2 * [(Path.cwd() / "there" / "replay.html").as_uri()]
 

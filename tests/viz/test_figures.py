@@ -47,7 +47,7 @@ def test_every_figure_says_what_it_is_of(run: Trajectory, monkeypatch: pytest.Mo
     assert len(drawn) == len(NAMES)
 
 
-@pytest.mark.parametrize("ticks", [1, 2, 40])
+@pytest.mark.parametrize("ticks", [1, 2])
 def test_short_runs_are_drawn(ticks: int, tmp_path: Path) -> None:
     assert len(save_figures(make_trajectory(ticks=ticks), tmp_path)) == len(NAMES)
 
@@ -66,13 +66,16 @@ def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
     assert "no covariance declared" in texts(error_figures.consistency_figure(run))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
-def test_an_observer_that_is_lost_from_the_start_is_drawn(value: float, tmp_path: Path) -> None:
+def test_observers_that_are_lost_from_the_start_are_drawn(tmp_path: Path) -> None:
     run = make_trajectory(ticks=90)
+    values = np.array([np.nan, np.inf, 1e300, np.nan, 1e300])
     fields = ("position_estimate", "rotation_estimate", "position_error", "orientation_error", "covariance", "nees")
-    run = dataclasses.replace(run, **{name: np.full_like(getattr(run, name), value) for name in fields})
+    lost = {name: np.empty_like(getattr(run, name)) for name in fields}
+    for array in lost.values():
+        np.moveaxis(array, 1, -1)[:] = values
+    run = dataclasses.replace(run, **lost)
     assert len(save_figures(run, tmp_path, ends=[0.0, 0.5, np.nan, 1.0, 1.5])) == len(NAMES)
-    assert "no rate to fit" in summarise(run, 0.5)[0]["rate_remark"]
+    assert all("no rate to fit" in row["rate_remark"] for row in summarise(run, 0.5))
 
 
 def test_a_place_that_cannot_be_written_is_one_clear_error(run: Trajectory, tmp_path: Path) -> None:
