@@ -25,7 +25,7 @@ from coopenv.world.v2x import transmit
 
 
 @cache
-def moved_struct(p: Precision) -> Any:
+def cosimulation_struct(p: Precision) -> Any:
     """Return the Warp struct of what a program says of the present tick, in one precision."""
     scalar, vec3, mat33 = p.scalar, p.vec3, p.mat33
 
@@ -129,7 +129,7 @@ def sense_moved(model: Any, state: Any, moved: Any, world: int, tick: int):
     transmit(model, state, world, tick)
 
 
-MOVED = Source("moved", begin_moved, sense_moved, moved_struct)
+COSIMULATED = Source("moved", begin_moved, sense_moved, cosimulation_struct)
 """Ticks of vehicles that a program on the host moves."""
 
 
@@ -148,10 +148,10 @@ class Poses:
     traffic_half: Array  # (Z, 3) half of their edges, m; zero: absent
 
 
-class MovedWorld(SimulatedWorld):
+class CosimulatedWorld(SimulatedWorld):
     """Worlds on the CPU whose vehicles stand where `place` and `move` put them; all else is as in the simulation."""
 
-    source = MOVED
+    source = COSIMULATED
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """Build the arrays; arguments and errors as for `World`, and CoopenvError: not on the CPU."""
@@ -160,7 +160,7 @@ class MovedWorld(SimulatedWorld):
             raise CoopenvError(f"device '{self.device}': these worlds are moved on the host, use device='cpu'")
 
     def _build_record(self) -> Any:
-        struct, model = moved_struct(self.precision), self.model
+        struct, model = cosimulation_struct(self.precision), self.model
         record = allocate(struct, {"W": self.worlds, "N": model.vehicles, "Z": model.traffic}, self.device)
         self._moved = {name: getattr(record, name).numpy() for name in fields(struct)}
         self._xy, self._heading = np.zeros((self.worlds, model.vehicles, 2)), np.zeros((self.worlds, model.vehicles))

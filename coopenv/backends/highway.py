@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.cosimulation import MovedWorld, Poses
+from coopenv.backends.cosimulation import CosimulatedWorld, Poses
 from coopenv.backends.simulated import Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
 from coopenv.estimation.poses import Array
@@ -17,7 +17,7 @@ from coopenv.scenario.highway import Highway
 from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
 
 
-class FollowedWorld(MovedWorld):
+class FollowedWorld(CosimulatedWorld):
     """One world whose vehicles stand where `present` says."""
 
     present: Poses
@@ -270,7 +270,7 @@ def flipped(xy: Array) -> Array:
     return np.array([xy[0], -xy[1]])
 
 
-class HighwayWorld(MovedWorld):
+class HighwayWorld(CosimulatedWorld):
     """Worlds of which each has an environment of highway-env, stepped one after the other."""
 
     def __init__(self, scenario: Scenario, *arguments: Any, **options: Any) -> None:
