@@ -12,9 +12,9 @@ from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import (
     Array,
     Calibration,
+    CarStatus,
     Pose,
-    Report,
-    Status,
+    RobustReport,
     Twist,
     Value,
     covariance_of,
@@ -45,24 +45,24 @@ def calibration_of(message: Any) -> Calibration:
     return Calibration(size, focal, centre, (k1, k2, p1, p2, k3))
 
 
-def state_of(message: Any) -> Status:
+def state_of(message: Any) -> CarStatus:
     """Return whether a car's autopilot is armed and connected, and in which mode."""
-    return Status(armed=bool(message.armed and message.connected), mode=str(message.mode)[:LONGEST_MODE])
+    return CarStatus(armed=bool(message.armed and message.connected), mode=str(message.mode)[:LONGEST_MODE])
 
 
-def remote_of(message: Any) -> Status:
+def remote_of(message: Any) -> CarStatus:
     """Return the pulses of a car's remote control; none with a signal strength of 0, and 255 says: not known."""
-    return Status(pulses=tuple(int(pulse) for pulse in message.channels[:MOST_CHANNELS]) if message.rssi else ())
+    return CarStatus(pulses=tuple(int(pulse) for pulse in message.channels[:MOST_CHANNELS]) if message.rssi else ())
 
 
-def battery_of(message: Any) -> Status:
+def battery_of(message: Any) -> CarStatus:
     """Return the share that is left; NaN and -1 say: not known."""
     share = float(message.percentage)
     if np.isnan(share) or share == -1.0:
-        return Status()
+        return CarStatus()
     if not 0.0 <= share <= 1.0:
         raise CoopenvError(f"percentage: {share:g} is not in 0..1")
-    return Status(battery=share)
+    return CarStatus(battery=share)
 
 
 FARTHEST, FASTEST, SPINNING = 1e7, 200.0, 100.0
@@ -157,10 +157,10 @@ def _point(message: Any) -> Pose:
     return Pose(vector(message.point, "point", FARTHEST))
 
 
-def _report(message: Any) -> Report:
+def _report(message: Any) -> RobustReport:
     """Return what `robust` sent; `extra` as its messages have it."""
     if not message.valid:
-        return Report(None, None, None, {})
+        return RobustReport(None, None, None, {})
     pose, odometry = _placed(message.pose), message.odometry
     moved = vector(odometry.position, "odometry.position", FARTHEST)
     turned = rotation_vector_of(odometry.orientation, "odometry.orientation")
@@ -171,7 +171,7 @@ def _report(message: Any) -> Report:
         "ages": np.zeros(0, np.float32),
         "correlations": np.zeros((0, 6, 6), np.int8),
     }
-    return Report(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
+    return RobustReport(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
 
 
 POSES: dict[str, Callable[[Any], Value]] = {

@@ -40,7 +40,7 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class RobustReport:
     """What `robust` sends, see `coopenv.observers.robust.messages`."""
 
     position: Array | None  # None: the sender does not know where it is
@@ -60,7 +60,7 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class CarStatus:
     """What a car says of itself."""
 
     armed: bool | None = None
@@ -69,7 +69,7 @@ class Status:
     battery: float | None = None  # share that is left
 
 
-Value = Detections | Twist | Pose | Report | Calibration | Status
+Value = Detections | Twist | Pose | RobustReport | Calibration | CarStatus
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from coopenv.cars.bags.log import Row
+    from coopenv.cars.bags.log import TopicRow
 
 
 WIDTH = 100
@@ -78,7 +78,7 @@ def _check(out: Path, force: bool) -> None:
         raise OutputError(f"{out}: exists already; --force replaces it")
 
 
-def _topics(bags: Sequence[Path]) -> tuple[Row, ...]:
+def _topics(bags: Sequence[Path]) -> tuple[TopicRow, ...]:
     """Return what bags hold, without knowing what it is."""
     from coopenv.cars.bags.files import BagFile
     from coopenv.cars.bags.log import rows_of
@@ -87,7 +87,7 @@ def _topics(bags: Sequence[Path]) -> tuple[Row, ...]:
         return rows_of([stack.enter_context(BagFile(path)) for path in bags])
 
 
-def _print(rows: Sequence[Row], as_json: bool) -> None:
+def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
     if as_json:
         options.print_json([*rows])
         return
@@ -97,7 +97,7 @@ def _print(rows: Sequence[Row], as_json: bool) -> None:
     printed.print(_table(rows))
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[TopicRow]) -> Table:
     from coopenv.runs.table import number_table
 
     read = any(row.role for row in rows)

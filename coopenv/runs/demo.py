@@ -108,9 +108,9 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> bool:
     with ExitStack() as stack:
         with compile_notice(log), Progress(log, "starting a router and fake cars"):
             router = stack.enter_context(fakes(fleet, port, demo.seed))
-        tape = stack.enter_context(replacing_file(demo.drive))
+        record = stack.enter_context(replacing_file(demo.drive))
         environment = None if demo.deployment else demo.environment
-        backend = open_svea(fleet, environment, demo.overrides, record=tape, connect=router)
+        backend = open_svea(fleet, environment, demo.overrides, record=record, connect=router)
         stack.callback(backend.close)
         try:
             whole = _drive_or_keep(demo, backend, kept, driven, log, out)
@@ -141,7 +141,7 @@ def _drive_or_keep(demo: Demo, backend: Svea, kept: Punctuality, driven: Episode
     try:
         _drive(demo, backend, kept, driven, log, out)
     except KeyboardInterrupt:
-        if demo.drive.exists() or backend.tape is None or not backend.tape.begun:
+        if demo.drive.exists() or backend.recorder is None or not backend.recorder.begun:
             raise
         also_kept(lambda: f"the drive up to here: coopenv run {demo.drive}" if demo.drive.exists() else "")
         return False

@@ -27,7 +27,7 @@ def links_line(backend: Svea) -> str:
 
 def kept_drive(path: Path | None, backend: Svea) -> str:
     """Return what is told of a drive's record when the drive is interrupted; empty where there is nothing to replay."""
-    if path is None or backend.tape is None or not backend.tape.begun:
+    if path is None or backend.recorder is None or not backend.recorder.begun:
         return ""
     return f"kept: {path}, the drive up to here: coopenv run {path}"
 

@@ -16,7 +16,7 @@ from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.gate.codec import read_drive
-from coopenv.cars.gate.core import PERIOD, Clock, Gate
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock
 from coopenv.cars.gate.process import Link
 from coopenv.cars.limits import USUAL
 from coopenv.cars.profile import FOLDER, CarProfile, Drive, Role, load_profile
@@ -63,7 +63,7 @@ def test_a_second_make_drives_a_fake_and_is_read(rover: CarProfile) -> None:
 def test_its_gate_sends_its_own_command_message(rover: CarProfile) -> None:
     hub, sent, now = Hub(), list[Arrival](), [time.time_ns()]
     hub.connect().subscribe("robots/svea7/drive", sent.append)
-    clock = Clock(lambda: now[0], lambda: now[0])
+    clock = GateClock(lambda: now[0], lambda: now[0])
     link = Link(Gate("svea7", USUAL, clock, profile=rover), "svea7", hub.connect(), None, rover)
     now[0] += PERIOD
     link.tick()

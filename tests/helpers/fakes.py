@@ -10,7 +10,7 @@ from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.gate.codec import write_drive
-from coopenv.cars.gate.core import Clock
+from coopenv.cars.gate.core import GateClock
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Drive, Role
 from coopenv.cars.transport.base import Arrival, Hub
 from coopenv.scenario import Scenario, load_scenario
@@ -46,7 +46,7 @@ class Stage:
         self.network = self.hub.connect()
         self.network.subscribe("**", lambda arrival: self._said[arrival.topic].append(arrival))
         binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
-        clock = Clock(lambda: self.wall + self.now, lambda: self.now)
+        clock = GateClock(lambda: self.wall + self.now, lambda: self.now)
         self.cars = {
             car.name: Fake(
                 self.fleet,

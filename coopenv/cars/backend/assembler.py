@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.backend.neighbours import Hearsay
+from coopenv.cars.backend.neighbours import NeighbourInbox
 from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, Detections, Pose, Report, Sample, Twist
+from coopenv.cars.samples import Calibration, Detections, Pose, RobustReport, Sample, Twist
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.poses import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
@@ -63,7 +63,7 @@ class Assembler:
         self._begin = 0
         self.refused: Counter[str] = Counter()
         """Samples that were not used, by reason."""
-        self._hearsay = Hearsay(binding, self.refused)
+        self._inbox = NeighbourInbox(binding, self.refused)
 
     def put(self, sample: Sample) -> None:
         """Take a sample."""
@@ -73,7 +73,7 @@ class Assembler:
         elif sample.car in self.binding.leaders:
             if isinstance(value, Pose) and sample.role in (Role.ESTIMATE, Role.POINT):
                 landmark = self.binding.leaders[sample.car]
-                self._hearsay.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
+                self._inbox.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
         elif sample.car not in self.binding.cars:
             self.refused["unknown car"] += 1
         else:
@@ -87,10 +87,10 @@ class Assembler:
             self.refused["detections left out"] += value.dropped
             car.frames.put(stamp, value)
         elif role is Role.TRUTH and isinstance(value, Pose):
-            if not car.track.put(stamp, self._hearsay.on_map(value)):
+            if not car.track.put(stamp, self._inbox.on_map(value)):
                 self.refused["motion capture out of order"] += 1
-        elif isinstance(value, Pose | Report) and vehicle not in self.binding.local:
-            self._hearsay.put_vehicle(vehicle, role, stamp, value)
+        elif isinstance(value, Pose | RobustReport) and vehicle not in self.binding.local:
+            self._inbox.put_vehicle(vehicle, role, stamp, value)
 
     def _count(self) -> None:
         """Count what odometers and queues of frames have left out since the last call."""
@@ -113,7 +113,7 @@ class Assembler:
             car.frames.skipped = 0  # nobody has asked for frames since the last episode
             car.moment, car.lag, car.exposed = now - self._period, 0, None
             car.odometer.increment(now - self._period, now - self._period)
-        self._hearsay.forget()
+        self._inbox.forget()
         return self._sensed(0, now)
 
     def tick(self, index: int, now: int) -> Sensed:
@@ -168,14 +168,14 @@ class Assembler:
             angular_velocity=angular_velocity,
             bearings=bearings,
             visible=visible,
-            landmarks=sealed(self._hearsay.places(now, self._middle())),
+            landmarks=sealed(self._inbox.places(now, self._middle())),
             odometry_age=odometry_age,
             bearing_age=bearing_age,
             missing=missing,
             late=late,
             truth=truth if np.isfinite(truth.position).any() else None,
             inbox_tick=np.full((N, N), -1, dtype=np.int64) if self.binding.remote else None,
-            messages=self._hearsay.messages(now),
+            messages=self._inbox.messages(now),
         )
 
     def _advance(
@@ -200,7 +200,7 @@ class Assembler:
             target = self.binding.targets.get(marker)
             if target is None or target == len(self.binding.scenario.landmarks) + i:
                 self.refused["unknown marker"] += 1
-            elif self._hearsay.is_lost(target, now):
+            elif self._inbox.is_lost(target, now):
                 self.refused["landmark of unknown position"] += 1
             else:
                 bearings[target], visible[target] = self._to_body[i] @ ray, True

@@ -10,14 +10,14 @@ import numpy as np
 
 from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, Told
 from coopenv.cars.backend.assembler import SPOKEN, VELOCITY, Assembler, Intake
-from coopenv.cars.backend.binding import Binding, wishes_of
-from coopenv.cars.backend.drive import Tape
+from coopenv.cars.backend.binding import Binding, reset_options
+from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.backend.gates import Gates
 from coopenv.cars.backend.neighbours import checked, estimate_message, report_message
 from coopenv.cars.backend.start import Fleet, Start
 from coopenv.cars.backend.station import Pacer, Station
 from coopenv.cars.backend.status import StatusBoard
-from coopenv.cars.backend.watchdog import Trip, Vitals, Watchdog
+from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog
 from coopenv.cars.codec import encode, warm_up
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.keys import Signer, Verifier
@@ -51,7 +51,7 @@ class Svea:
         transport: Transport,
         signer: Signer | None = None,
         verifier: Verifier | None = None,
-        tape: Tape | None = None,
+        recorder: DriveRecorder | None = None,
     ) -> None:
         """Listen to the cars.
 
@@ -61,11 +61,11 @@ class Svea:
             transport: how it is reached; closed with the backend.
             signer: signs what is sent (None: nothing is signed).
             verifier: knows the cars' keys (None: signatures do not count).
-            tape: writes down what ticks are made of, and why the cars were stopped.
+            recorder: records the messages of the ticks, and the reasons of stops.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
         self._transport, self._signer = transport, signer
-        self.tape = tape
+        self.recorder = recorder
         names = binding.names
         self._local = {names[i]: i for i in binding.local}
         self.capabilities = Capabilities(
@@ -91,14 +91,14 @@ class Svea:
         self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
         self._assembler = Assembler(binding)
         self._origin = np.array(self.scenario.map.origin)
-        safety, self.vitals = deployment.safety, Vitals(deployment.safety.judge)
+        safety, self.monitor = deployment.safety, LinkMonitor(deployment.safety.judge)
         self._odometry = VELOCITY[deployment.sensors.odometry]
         self._others = tuple(name for name in heard if name not in self._local)
         self.watchdog = Watchdog(
             safety,
             self.station,
             self.gates,
-            self.vitals,
+            self.monitor,
             tuple(self._local),
             self._others,
             self._odometry,
@@ -106,7 +106,7 @@ class Svea:
             binding.profile,
         )
         calibrations = {name: self.intake.calibrations[name] for name in self._local}
-        fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
+        fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.monitor, self._others)
         self._start = Start(fleet, transport, self.gates, self.watchdog, self._odometry, self._drain)
         transport.watch(presence_of("*"), self._presence)
         self.watchdog.happened = self.board.happened
@@ -135,9 +135,9 @@ class Svea:
             CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
         """
         self._stop("reset")
-        wishes = wishes_of(options)
+        wishes = reset_options(options)
         self._start.prepare(0 if seed is None else seed)
-        self.vitals.begin(self._pacer.now())
+        self.monitor.begin(self._pacer.now())
         self._start.listen(wishes.arm)
         self.station.dropped.clear()
         if wishes.arm:
@@ -146,8 +146,8 @@ class Svea:
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
-        if self.tape is not None:
-            self.tape.begin(self._began, self._key % 2**64, self._episode)
+        if self.recorder is not None:
+            self.recorder.begin(self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
 
     def advance(self, command: Command) -> Iterator[Sensed]:
@@ -167,8 +167,8 @@ class Svea:
             now = self._pacer.wait()
             self._drain()
             self._index += 1
-            if self.tape is not None:
-                self.tape.tick(self._index, now)
+            if self.recorder is not None:
+                self.recorder.tick(self._index, now)
             yield self._counted(self._assembler.tick(self._index, now))
 
     def _drain(self) -> None:
@@ -176,14 +176,14 @@ class Svea:
         self.health.received += len(arrivals)
         for arrival in arrivals:
             self._take(arrival)
-        self.vitals.looked = self._pacer.now()
+        self.monitor.looked = self._pacer.now()
 
     def _take(self, arrival: Arrival) -> None:
-        if self.tape is not None:
-            self.tape.write(arrival.topic, arrival.payload, arrival.received)
+        if self.recorder is not None:
+            self.recorder.write(arrival.topic, arrival.payload, arrival.received)
         for sample in self.intake.samples(arrival):
             self._assembler.put(sample)
-            self.vitals.put(sample)
+            self.monitor.put(sample)
 
     def _counted(self, tick: Sensed) -> Sensed:
         local = list(self.binding.local)
@@ -205,7 +205,7 @@ class Svea:
             if not checked(each):
                 continue
             if self.deployment.safety.judge == "estimate":
-                self.vitals.place(name, each.position + self._origin, moment)
+                self.monitor.place(name, each.position + self._origin, moment)
             self._publish(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
             report = report_message(each, moment, self._origin)
             if report is not None:
@@ -244,8 +244,8 @@ class Svea:
         return self._pacer.late(share)
 
     def _write_down(self, trip: Trip) -> None:
-        if self.tape is not None:
-            self.tape.stopped(trip.reason, trip.car or "", self._pacer.now())
+        if self.recorder is not None:
+            self.recorder.stopped(trip.reason, trip.car or "", self._pacer.now())
 
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""
@@ -266,8 +266,8 @@ class Svea:
         self._stop("closed")
         self.watchdog.close()
         try:
-            if self.tape is not None:
-                self.tape.close()
+            if self.recorder is not None:
+                self.recorder.close()
         finally:
             self._transport.close()
             gc.unfreeze()

@@ -1,4 +1,4 @@
-"""Who is who: cars and markers of a fleet, and vehicles and targets of its scenario."""
+"""Binding of a fleet to its scenario: cars and markers of a fleet, and vehicles and targets of its scenario."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ def bind(
     only: str | None,
     profile: CarProfile = SVEA,
 ) -> Binding:
-    """Return who is who.
+    """Return the binding.
 
     Args:
         scenario: what the cars are vehicles of.
@@ -106,17 +106,17 @@ OPTIONS = ("arm", "release")
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What is asked for."""
+class ResetOptions:
+    """Options of a reset."""
 
     arm: bool = False
-    """Whether cars are to drive."""
+    """Whether the cars drive."""
     release: bool = False
-    """Whether that holds for cars, too, that somebody else has stopped."""
+    """Whether cars that another station has stopped drive as well."""
 
 
-def wishes_of(options: Mapping[str, Any]) -> Wishes:
-    """Return what is asked for.
+def reset_options(options: Mapping[str, Any]) -> ResetOptions:
+    """Return the checked options of a reset.
 
     Raises:
         CoopenvError: an option is not known, or not what it must be.
@@ -128,4 +128,4 @@ def wishes_of(options: Mapping[str, Any]) -> Wishes:
     for name, value in found.items():
         if not isinstance(value, bool):
             raise CoopenvError(f"option '{name}' must be true or false, got {shown(value)}")
-    return Wishes(**found)
+    return ResetOptions(**found)

@@ -23,7 +23,7 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputErro
 from coopenv.base.files import writing
 from coopenv.base.installation import version
 from coopenv.cars.backend.assembler import Assembler, Intake
-from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
+from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, ros2, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC
@@ -42,8 +42,8 @@ FLUSH = 0.5
 """s after which at the latest the system has what was written: so much is lost if the process is killed."""
 
 
-class Tape:
-    """A file under way; a thread of its own writes, so that no tick waits for a disk."""
+class DriveRecorder:
+    """Writes a drive into a file, in a thread of its own, so that no tick waits for the disk."""
 
     def __init__(self, path: Path, head: bytes, types: Mapping[str, str]) -> None:
         """Open a file.
@@ -81,7 +81,7 @@ class Tape:
             self._stream.flush()
         _stopped("", "", 0)  # the first message of a type takes long, and this one must not
         self._queue: queue.SimpleQueue[tuple[str, bytes, int] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write_all, name="coopenv tape", daemon=True)
+        self._thread = threading.Thread(target=self._write_all, name="coopenv recorder", daemon=True)
         self._thread.start()
 
     def begin(self, now: int, key: int, episode: int) -> None:
@@ -164,7 +164,7 @@ def _stopped(reason: str, car: str, now: int) -> bytes:
 
 
 def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes:
-    """Return what a tape says of the fleet: JSON."""
+    """Return the description of the fleet in a recorded drive: JSON."""
     head = {
         "deployment": deployment.model_dump(mode="json", exclude={"security", "network"}),
         "scenario": binding.scenario.model_dump(mode="json"),
@@ -292,7 +292,7 @@ class Drive(TickGenerator):
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the messages from the begin, giving the ticks of one episode; `arm` moves nobody."""
-        wishes_of(options)
+        reset_options(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes
         intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
         number, self.stopped = -1, ""
@@ -317,28 +317,27 @@ class Drive(TickGenerator):
 
 
 PRESENCE = "std_msgs/msg/Bool"
-"""Type of what a tape says of who is there, under the names of their tokens."""
+"""Type of messages of presence in a recorded drive, under the names of the tokens."""
 
 
-class Taped:
-    """A transport whose messages are written to a tape, by whatever thread sends or receives them.
+class RecordedTransport:
+    """A transport whose messages are recorded, in the thread that sends or receives them.
 
-    What ticks are made of is left to those who make them, as it has to stand on the tape in the order in which they
-    take it.
+    Messages of which ticks are made are recorded by the backend, in the order in which it takes them.
     """
 
     def __init__(
-        self, transport: Transport, tape: Tape, aside: Collection[str] = (), unread: Collection[str] = ()
+        self, transport: Transport, recorder: DriveRecorder, aside: Collection[str] = (), unread: Collection[str] = ()
     ) -> None:
         """Wrap a transport.
 
         Args:
             transport: the network.
-            tape: where everything that is sent is written, and who comes and goes.
+            recorder: records all messages that are sent, and presence.
             aside: topics of which no ticks are made: what comes on them is written at once.
-            unread: topics that nobody here listens to and that belong on the tape all the same.
+            unread: topics without a subscriber here that are recorded as well.
         """
-        self._transport, self._tape, self._aside = transport, tape, frozenset(aside)
+        self._transport, self._recorder, self._aside = transport, recorder, frozenset(aside)
         self.announce, self.close = transport.announce, transport.close
         for topic in unread:
             transport.subscribe(topic, self._write)
@@ -348,7 +347,7 @@ class Taped:
     ) -> None:
         """Send, see `Transport`, and write down."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        self._tape.write(topic, payload, time.time_ns())
+        self._recorder.write(topic, payload, time.time_ns())
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
@@ -363,10 +362,10 @@ class Taped:
         """Watch, see `Transport`, and write down who comes and goes."""
 
         def change(name: str, there: bool) -> None:
-            self._tape.write(name, encode(make(PRESENCE, data=there)), time.time_ns())
+            self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())
             callback(name, there)
 
         self._transport.watch(pattern, change)
 
     def _write(self, arrival: Arrival) -> None:
-        self._tape.write(arrival.topic, arrival.payload, arrival.received)
+        self._recorder.write(arrival.topic, arrival.payload, arrival.received)

@@ -1,4 +1,4 @@
-"""What cars say of where they are: moving landmarks, and vehicles that are estimated elsewhere."""
+"""Messages of other cars: moving landmarks, and vehicles that are estimated elsewhere."""
 
 from collections import Counter
 from dataclasses import replace
@@ -12,7 +12,7 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make
 from coopenv.cars.profile import Role
-from coopenv.cars.samples import Pose, Report
+from coopenv.cars.samples import Pose, RobustReport
 from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six
@@ -20,12 +20,12 @@ from coopenv.scenario.base import rotation_of
 from coopenv.scenario.starts import neighbour_sets
 
 
-def message_of(value: Pose | Report, marker: Array) -> Message:
+def message_of(value: Pose | RobustReport, marker: Array) -> Message:
     """Return what an observer reads of a sender whose marker is at `marker` (3,) in its body, m.
 
     A position without an orientation gives the marker's height alone.
     """
-    if isinstance(value, Report):
+    if isinstance(value, RobustReport):
         return Message(value.position, value.rotation, value.covariance, cast(dict[str, Array], value.extra))
     if value.rotation is None:
         return Message(value.position + np.array([0.0, 0.0, marker[2]]))
@@ -94,18 +94,18 @@ def checked(told: Told) -> bool:
 
 NS = 1e-9
 
-Placed = TypeVar("Placed", bound=Pose | Report)
+Placed = TypeVar("Placed", bound=Pose | RobustReport)
 
 
-class Hearsay:
-    """Keeps what has been said; times in ns on the receiver's clock, positions on the scenario's map."""
+class NeighbourInbox:
+    """Received messages of other cars; times in ns on the receiver's clock, positions on the scenario's map."""
 
     def __init__(self, binding: Binding, refused: Counter[str]) -> None:
         """Begin with nothing.
 
         Args:
-            binding: who is who.
-            refused: where messages are counted that are not used, by reason.
+            binding: vehicles and markers of the cars.
+            refused: counts of messages that are not used, by reason.
         """
         self._binding, self._refused, scenario = binding, refused, binding.scenario
         self._max_age = binding.profile.topics[Role.ESTIMATE].max_age_ns
@@ -116,7 +116,7 @@ class Hearsay:
         self._hears = neighbour_sets(scenario)  # targets by vehicle
         markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]
         self._markers = [np.array(marker) for marker in markers]
-        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}  # since the last tick
+        self._heard: dict[int, dict[Role, tuple[int, Pose | RobustReport]]] = {}  # since the last tick
         self._said: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
 
     def on_map(self, told: Placed) -> Placed:
@@ -124,15 +124,15 @@ class Hearsay:
         return told if told.position is None else replace(told, position=told.position - self._origin)
 
     def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: Pose) -> None:
-        """Take what a moving landmark has said of itself; `age` is that with which it came."""
+        """Take a message of a moving landmark; `age` is its age at reception, ns."""
         position = message_of(self.on_map(pose), self._markers[landmark]).position
         if age > self._max_age:
             self._refused["stale message"] += 1
         elif position is not None and self._is_new(landmark, role, stamp):
             self._led[landmark].put(stamp, position)  # unless it has said so in another role
 
-    def put_vehicle(self, vehicle: int, role: Role, stamp: int, told: Pose | Report) -> None:
-        """Take what a vehicle that is estimated elsewhere has said."""
+    def put_vehicle(self, vehicle: int, role: Role, stamp: int, told: Pose | RobustReport) -> None:
+        """Take a message of a vehicle that is estimated elsewhere."""
         if self._is_new(len(self._landmarks) + vehicle, role, stamp):
             self._heard.setdefault(vehicle, {})[role] = stamp, self.on_map(told)
 
@@ -145,15 +145,15 @@ class Hearsay:
         return True
 
     def forget(self) -> None:
-        """Forget what vehicles have said."""
+        """Drop all messages of vehicles."""
         self._heard.clear()
 
     def is_lost(self, target: int, now: int) -> bool:
-        """Return whether a target is a moving landmark of which nobody knows where it is now."""
+        """Return whether a target is a moving landmark of unknown position."""
         return target in self._led and now - self._led[target].stamp > self._max_age
 
     def places(self, now: int, when: int) -> Array:
-        """Return (L, 3) where the landmarks were at a time `when`; who is lost by now is where it has been last."""
+        """Return (L, 3) the positions of the landmarks at a time `when`; the last one of a landmark that is lost."""
         places: Array = self._landmarks.copy()
         for landmark, track in self._led.items():
             if track.stamp >= 0:
@@ -161,9 +161,9 @@ class Hearsay:
         return places
 
     def messages(self, now: int) -> dict[tuple[int, int], Received]:
-        """Return what has come since the last call, by receiver and sender.
+        """Return the messages since the last call, by receiver and sender.
 
-        The environment says who hears whom; its delays and losses do not count, as the radio is a real one.
+        The neighbours are those of the environment. Its delays and losses do not apply, as the radio is real.
         """
         found, L = {}, len(self._landmarks)
         for sender, by_role in self._heard.items():

@@ -1,4 +1,4 @@
-"""From a deployment file to a backend: environment, network, keys and tape."""
+"""From a deployment file to a backend: environment, network, keys and recorder."""
 
 import warnings
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import Binding, bind
-from coopenv.cars.backend.drive import PRESENCE, Tape, Taped, head_of
+from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.status import ROLES
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
@@ -55,15 +55,15 @@ def open_svea(
     link = open_transport(deployment) if transport is None else transport
     try:
         types = _types(binding, deployment.security.identity)
-        tape = None if record is None else Tape(Path(record), head_of(deployment, binding, car), types)
+        recorder = None if record is None else DriveRecorder(Path(record), head_of(deployment, binding, car), types)
     except CoopenvError:
         link.close()
         raise
-    if tape is not None:
+    if recorder is not None:
         names = [binding.names[i] for i in binding.local]
         aside = {binding.profile.topic_of(name, role) for name in names for role in (Role.GATE, *ROLES)}
-        link = Taped(link, tape, aside, {binding.profile.topic_of(name, Role.STOP) for name in names})
-    return Svea(deployment, binding, link, signer, verifier, tape)
+        link = RecordedTransport(link, recorder, aside, {binding.profile.topic_of(name, Role.STOP) for name in names})
+    return Svea(deployment, binding, link, signer, verifier, recorder)
 
 
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:

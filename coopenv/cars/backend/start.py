@@ -12,7 +12,7 @@ from coopenv.cars.backend.assembler import VELOCITY, Intake
 from coopenv.cars.backend.gates import Gates
 from coopenv.cars.backend.station import Station
 from coopenv.cars.backend.status import StatusBoard
-from coopenv.cars.backend.watchdog import Vitals, Watchdog, misplaced
+from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import RESET_TOPIC, Role
@@ -33,7 +33,7 @@ class Fleet:
     station: Station
     intake: Intake
     board: StatusBoard
-    vitals: Vitals
+    monitor: LinkMonitor
     others: Collection[str]  # cars of the fleet that are not driven here
 
 
@@ -46,14 +46,14 @@ def problems_of(fleet: Fleet) -> Iterator[str]:
             topic = fleet.deployment.profile.topic_of(car, role)
             if (age := fleet.station.silence(topic)) > safety.odometry_age:
                 yield f"{car}: no odometry on {topic} {_since(age)}"
-            if (age := fleet.vitals.age(car, role)) > safety.odometry_age:
+            if (age := fleet.monitor.age(car, role)) > safety.odometry_age:
                 yield f"{car}: nothing new that could be used on {topic} {_since(age)}"
         camera = fleet.deployment.profile.topic_of(car, Role(sensors.detections))
         if (age := fleet.station.silence(camera)) > safety.odometry_age:
             yield f"{car}: no camera frames on {camera} {_since(age)}"
         yield from _about_itself(fleet, car)
     if safety.judge == "truth":  # what cars believe is not known before they drive
-        for car, wrong in misplaced(safety, fleet.vitals, fleet.calibrations, fleet.others):
+        for car, wrong in misplaced(safety, fleet.monitor, fleet.calibrations, fleet.others):
             yield f"{car}: {wrong}"
 
 

@@ -1,4 +1,4 @@
-"""What cars say of themselves besides what their sensors measure: armed, driven by remote control, battery, camera."""
+"""Conditions of the cars: armed, driven by remote control, battery, calibration of the camera."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, Status
+from coopenv.cars.samples import Calibration, CarStatus
 from coopenv.cars.transport.base import Arrival, Transport
 
 ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
@@ -17,30 +17,30 @@ ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
 
 @dataclass(frozen=True)
 class Condition:
-    """What a car has said last of itself."""
+    """Last condition of a car."""
 
-    said: Status = field(default_factory=Status)
+    said: CarStatus = field(default_factory=CarStatus)
     stamps: dict[Role, int] = field(default_factory=dict)  # ns, clock of the car
     since: dict[Role, float] = field(default_factory=dict)  # s, monotonic: when what was said held
 
     def age(self, role: Role) -> float:
-        """Return how old the last word is, s; inf: there has been none."""
+        """Return the age of the last message of a role, s; inf: none was received."""
         return time.monotonic() - self.since.get(role, float("-inf"))
 
 
 class StatusBoard:
-    """The last word of each car, and what has happened to it since arming."""
+    """Last condition of each car, and the reasons to stop it since arming."""
 
     def __init__(
         self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool, profile: CarProfile = SVEA
     ) -> None:
-        """Listen to the cars.
+        """Subscribe to the conditions of the cars.
 
         Args:
             transport: the network.
             cars: their names.
             remote: channels of their remote controls.
-            needed: whether silence of a car about itself counts against it.
+            needed: whether cars must send the conditions of their profile.
             profile: make of the cars.
         """
         self._lock = threading.Lock()
@@ -60,17 +60,17 @@ class StatusBoard:
             return self._conditions[car].said.battery
 
     def calibration(self, car: str) -> Calibration | None:
-        """Return what a car's camera says of itself; None: nothing yet."""
+        """Return the calibration that a car publishes; None: none was received."""
         with self._lock:
             return self._calibration.get(car)
 
     def begin(self) -> None:
-        """Take the cars as they are now for as they have to stay."""
+        """Take the present conditions as the reference for changes."""
         with self._lock:
             self._begun, self._happened = dict(self._conditions), {}
 
     def obstacle(self, car: str) -> str:
-        """Return why a car is not to be armed, by what it says of itself; empty: nothing stands against it."""
+        """Return the reason not to arm a car by its conditions; empty: none."""
         with self._lock:
             now = self._conditions[car]
         for role in self._conditions_needed:
@@ -84,7 +84,7 @@ class StatusBoard:
         return "its autopilot is not armed" if Role.STATE in self._conditions_needed and not now.said.armed else ""
 
     def happened(self, car: str) -> str:
-        """Return why a car that was armed is to be stopped, by what it has said of itself since; empty: no reason."""
+        """Return the reason to stop an armed car by its conditions since arming; empty: none."""
         with self._lock:
             now, happened = self._conditions[car], self._happened.get(car, "")
         return happened or (self._silent(now, car, Role.REMOTE) if Role.REMOTE in self._conditions_needed else "")
@@ -100,7 +100,7 @@ class StatusBoard:
         with self._lock:
             if isinstance(value, Calibration):
                 self._calibration[car] = value
-            elif isinstance(value, Status) and abs(delay) <= (self._profile.topics[role].max_age or 0.0):
+            elif isinstance(value, CarStatus) and abs(delay) <= (self._profile.topics[role].max_age or 0.0):
                 before = self._conditions[car]
                 if stamp > before.stamps.get(role, -1):
                     since = {**before.since, role: time.monotonic() - max(delay, 0.0)}
@@ -109,7 +109,7 @@ class StatusBoard:
                     if car in self._begun and (why := self._changed(self._begun[car].said, now.said)):
                         self._happened.setdefault(car, why)
 
-    def _changed(self, then: Status, now: Status) -> str:
+    def _changed(self, then: CarStatus, now: CarStatus) -> str:
         pulses, usual = now.pulses or (), self._profile.pulses
         if self._remote.drives(pulses, usual):
             return "is driven by remote control"
@@ -130,8 +130,8 @@ class StatusBoard:
         return f"nothing of use has {'ever come' if age == float('inf') else f'come for {age:.2f} s'} on {topic}"
 
 
-def _joined(before: Status, value: Status, role: Role) -> Status:
-    """Return what a car has said with what it says in one role in place of that before."""
+def _joined(before: CarStatus, value: CarStatus, role: Role) -> CarStatus:
+    """Return a condition with the values of one role replaced."""
     if role is Role.STATE:
         return replace(before, armed=value.armed, mode=value.mode)
     if role is Role.REMOTE:

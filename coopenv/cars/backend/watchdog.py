@@ -14,7 +14,7 @@ from coopenv.cars.backend.station import Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.limits import inside
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.samples import Pose, Report, Sample
+from coopenv.cars.samples import Pose, RobustReport, Sample
 from coopenv.estimation.poses import Array
 
 AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
@@ -28,7 +28,7 @@ class Place:
     time: int  # ns, when that was known
 
 
-class Vitals:
+class LinkMonitor:
     """Kept by the step loop, read by the watchdog's thread; times are in ns on the receiver's clock.
 
     Bytes that come are no sign of life: what counts is a message that can be read, with a stamp newer than all before.
@@ -58,7 +58,11 @@ class Vitals:
         # Motion capture has a clock of its own, of which nobody knows how late it is.
         self._told[key] = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
         judging = (Role.TRUTH,) if self._judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
-        if sample.role in judging and isinstance(sample.value, Pose | Report) and sample.value.position is not None:
+        if (
+            sample.role in judging
+            and isinstance(sample.value, Pose | RobustReport)
+            and sample.value.position is not None
+        ):
             self.place(sample.car, sample.value.position, self._told[key])
 
     def place(self, car: str, position: Array, time: int) -> None:
@@ -78,27 +82,27 @@ class Vitals:
 
 
 def misplaced(
-    safety: Safety, vitals: Vitals, cars: Collection[str], others: Collection[str]
+    safety: Safety, monitor: LinkMonitor, cars: Collection[str], others: Collection[str]
 ) -> Iterator[tuple[str, str]]:
     """Yield the car and what is wrong with where it is, in words.
 
     Args:
         safety: fence, separation, and how old a place may be.
-        vitals: knows where the cars are.
+        monitor: knows where the cars are.
         cars: those that are driven here: each has to be inside the fence.
         others: those that are not; the former have to be apart from all.
     """
     apart = safety.separation > 0.0
     watched = [*cars, *others] if apart else [*cars] if safety.geofence else []
     for car in watched:
-        never = car not in vitals.places
-        if vitals.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
-            since = "is not known" if never else f"has not been known for {vitals.lost(car):.2f} s"
+        never = car not in monitor.places
+        if monitor.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
+            since = "is not known" if never else f"has not been known for {monitor.lost(car):.2f} s"
             by = [
                 name for name, judged in (("fence", safety.geofence and car in cars), ("separation", apart)) if judged
             ]
             yield car, f"its place {since}: {' and '.join(by)} cannot be judged"
-    places = {car: vitals.places[car].position for car in watched if car in vitals.places}
+    places = {car: monitor.places[car].position for car in watched if car in monitor.places}
     for car in cars:
         if safety.geofence and car in places:
             x, y = float(places[car][0]), float(places[car][1])
@@ -141,7 +145,7 @@ class Watchdog:
         safety: Safety,
         station: Station,
         gates: Gates,
-        vitals: Vitals,
+        monitor: LinkMonitor,
         cars: Collection[str],
         others: Collection[str],
         odometry: Collection[Role],
@@ -154,14 +158,14 @@ class Watchdog:
             safety: what is allowed.
             station: where messages come.
             gates: of the cars.
-            vitals: what the messages have told.
+            monitor: what the messages have told.
             cars: those that are driven here.
             others: the other ones of the fleet.
             odometry: what each car has to measure.
             profile: make of the cars.
             decision: s between decisions.
         """
-        self._safety, self._station, self._gates, self._vitals = safety, station, gates, vitals
+        self._safety, self._station, self._gates, self._monitor = safety, station, gates, monitor
         self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
         self._profile = profile
         self._lock = threading.Lock()
@@ -258,7 +262,7 @@ class Watchdog:
             return
         if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
             yield Trip(f"no decision for {age:.2f} s")
-        for car, wrong in misplaced(self._safety, self._vitals, self._cars, self._others):
+        for car, wrong in misplaced(self._safety, self._monitor, self._cars, self._others):
             yield Trip(f"{car}: {wrong}", car)
 
     def _of_car(self, car: str) -> Iterator[Trip]:
@@ -268,7 +272,7 @@ class Watchdog:
             if (age := self._station.silence(topic)) > longest:
                 yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
             # Only the step loop reads messages, so that this means nothing before the first step.
-            if self._beat is not None and (age := self._vitals.age(car, role)) > longest:
+            if self._beat is not None and (age := self._monitor.age(car, role)) > longest:
                 yield Trip(f"{car}: nothing new that could be used on {topic} for {age:.2f} s", car)
         if self._present.get(car) is False:
             yield Trip(f"{car}: is gone", car)

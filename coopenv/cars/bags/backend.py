@@ -8,7 +8,7 @@ from typing import Any
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
 from coopenv.cars.backend.assembler import Assembler
-from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
+from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import NS, Log, read_log
 from coopenv.cars.bags.topic_map import TopicMap, load_map
@@ -107,7 +107,7 @@ class Bag(TickGenerator):
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the bags tick by tick; the option `arm` moves nobody."""
-        wishes_of(options)
+        reset_options(options)
         assembler, feed = Assembler(self.binding), _Feed(self.log)
         for k in range(self.scenario.horizon_ticks + 1):
             now = self._begin + round(k * NS / self._rate)

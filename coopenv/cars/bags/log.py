@@ -22,7 +22,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import Chosen, Frame, TopicMap, select
+from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
@@ -127,9 +127,9 @@ def calibration_of(binding: Binding, vehicle: int) -> Calibration:
     return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
 
 
-def in_frame(pose: Pose, frame: Frame) -> Pose:
+def in_frame(pose: Pose, frame: MapFrame) -> Pose:
     """Return a pose of a frame in the environment's coordinates."""
-    if frame == Frame():
+    if frame == MapFrame():
         return pose
     R = rotation_of(frame.yaw, None)
     covariance = pose.covariance
@@ -146,7 +146,7 @@ WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its t
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class TimedValue:
     """A message that was read."""
 
     stamp: int  # ns, clock of its source; 0: none
@@ -159,7 +159,7 @@ class Track:
     """The messages of one topic, and why some were left out."""
 
     chosen: Chosen
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[TimedValue] = field(default_factory=list)
     refused: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -177,7 +177,7 @@ def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: Values, stamp
         try:
             message = raw.decode()
             stamp = stamp_of(message) if stamped else 0
-            track.entries.append(Entry(stamp, raw.received, values.read(track.chosen, message)))
+            track.entries.append(TimedValue(stamp, raw.received, values.read(track.chosen, message)))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
@@ -209,7 +209,7 @@ def _leave_out_wild(track: Track) -> None:
 
 
 @dataclass(frozen=True)
-class Row:
+class TopicRow:
     """A topic; what is not known is None."""
 
     topic: str
@@ -229,7 +229,7 @@ def rows_of(
     chosen: Mapping[str, Chosen] | None = None,
     samples: Sequence[Sample] = (),
     clocks: Clocks | None = None,
-) -> tuple[Row, ...]:
+) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
     names = sorted(
         {name for file in files for name in file.topics}, key=lambda name: (name not in (chosen or {}), name)
@@ -244,13 +244,13 @@ def rows_of(
         seconds = max(file.seconds for file in files if name in file.topics)
         entry = (chosen or {}).get(name)
         if entry is None or clocks is None:
-            rows.append(Row(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
+            rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
         stamps = np.array(times.get((entry.car, entry.told_as), []), dtype=np.int64)
         shift = clocks.shifts.get(entry.source)
         offset = None if shift is None or not shift.linked else shift.offset * 1e-9
         rate, gap, gaps = regularity(stamps)
-        rows.append(Row(name, kind, count, rate, entry.car, entry.role.value, len(stamps), gap, gaps, offset))
+        rows.append(TopicRow(name, kind, count, rate, entry.car, entry.role.value, len(stamps), gap, gaps, offset))
     return tuple(rows)
 
 
@@ -270,7 +270,7 @@ class Log:
     """What was read."""
 
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
-    rows: tuple[Row, ...]  # what there is, by topic
+    rows: tuple[TopicRow, ...]  # what there is, by topic
     notes: tuple[str, ...]  # what a user should know
 
     def span(self, car: str, role: Role) -> tuple[int, int]:

@@ -97,7 +97,7 @@ class BagCar(Car):
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
 
 
-class Clocks(Section):
+class ClockSettings(Section):
     """How times are read."""
 
     mode: Literal["auto", "stamps", "received"] = "auto"
@@ -109,7 +109,7 @@ class Clocks(Section):
     """Time added to the stamps of a car, or of `truth`, instead of the estimated offset, s."""
 
 
-class Frame(Section):
+class MapFrame(Section):
     """Where the frame of positions in a bag is in the environment's coordinates."""
 
     position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -121,9 +121,9 @@ class Frame(Section):
 class Frames(Section):
     """Frames of the bag's positions."""
 
-    map: Frame = Frame()
+    map: MapFrame = MapFrame()
     """Of the cars' messages."""
-    truth: Frame | None = None
+    truth: MapFrame | None = None
     """Of motion capture (default: the same)."""
 
 
@@ -151,7 +151,7 @@ class TopicMap(Section):
     """Time left out after all needed topics have begun, s."""
     duration: Positive | None = None
     """Time used after that, s (default: all)."""
-    clocks: Clocks = Clocks()
+    clocks: ClockSettings = ClockSettings()
     frames: Frames = Frames()
     path: Path = Field(default=Path("topics.toml"), exclude=True)
     """The file; set by `load_map`."""

@@ -1,4 +1,4 @@
-"""A fake car: its room, sensors and wheels on one clock, and its end of the network."""
+"""A fake car: its world, sensors and wheels on one clock, and its end of the network."""
 
 import time
 from collections import deque
@@ -12,12 +12,12 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, warm_up
 from coopenv.cars.deployment import Deployment
-from coopenv.cars.fake.faults import Fault, Faults, Wire, end_process, fault_topic, parse_fault
-from coopenv.cars.fake.messages import Act, DriverVoice, Voice
+from coopenv.cars.fake.faults import FakeFault, Faults, Wire, end_process, fault_topic, parse_fault
+from coopenv.cars.fake.messages import Act, SensorPublisher, VehicleSensorPublisher
 from coopenv.cars.fake.sensors import Pixy, Sensors, calibration_of
-from coopenv.cars.fake.world import Actuators, Neighbours, Room
+from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.codec import Malformed, read_drive
-from coopenv.cars.gate.core import PERIOD, Clock, Gate
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock
 from coopenv.cars.gate.process import Link
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
@@ -71,7 +71,7 @@ class Schedule:
         timer.due = int(timer.regular + timer.period * JITTER * self._rng.uniform(-1.0, 1.0))
 
 
-REAL = Clock(time.time_ns, time.monotonic_ns)
+REAL = GateClock(time.time_ns, time.monotonic_ns)
 
 
 class Fake:
@@ -85,11 +85,11 @@ class Fake:
         transport: Transport,
         *,
         seed: int = 0,
-        faults: Iterable[Fault] = (),
+        faults: Iterable[FakeFault] = (),
         gate: bool = True,
         signer: Signer | None = None,
         verifier: Verifier | None = None,
-        clock: Clock = REAL,
+        clock: GateClock = REAL,
         die: Callable[[], None] = end_process,
         complain: Callable[[str], None] = lambda _: None,
     ) -> None:
@@ -115,10 +115,10 @@ class Fake:
         leader = binding.leaders.get(name, 0)
         agent = len(scenario.landmarks) + binding.cars[name] if self._drives else leader
         self._profile = binding.profile
-        self.room = Room(scenario, agent)
+        self.world = CarWorld(scenario, agent)
         self._wire = Wire(transport, self._faults, clock.steady, seed)
         self._inbox: deque[Callable[[], None]] = deque()
-        self._others = Neighbours(self.room, binding, name, transport)
+        self._others = Neighbours(self.world, binding, name, transport)
         self._acts: dict[str, Act] = {}
         self._link: Link | None = None
         self._build(binding, transport, deployment.sensors.odometry)
@@ -126,10 +126,10 @@ class Fake:
         self._warm_up()
         transport.subscribe(RESET_TOPIC, self._hear_reset)
         transport.subscribe(fault_topic(name), self._hear_fault)
-        rates = {name: rate for name, (rate, _) in self._voice.acts.items()}
-        self._acts = {name: act for name, (_, act) in self._voice.acts.items()}
+        rates = {name: rate for name, (rate, _) in self._publisher.acts.items()}
+        self._acts = {name: act for name, (_, act) in self._publisher.acts.items()}
         if self._drives and gate:
-            car_clock = Clock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
+            car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
             identity = deployment.security.identity
             decides = Gate(name, deployment.limits, car_clock, verifier, identity, self._profile)
             self._link = Link(decides, name, self._wire, signer, self._profile)  # which lets others see the car
@@ -144,25 +144,25 @@ class Fake:
 
     def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
         """Put sensors and wheels on the car; the wheels tell a turn rate only where there is no other one."""
-        whose = (self.name, self.room, self._wire, self._stamp, transport, self._profile)
-        self._voice = Voice(*whose)
+        whose = (self.name, self.world, self._wire, self._stamp, transport, self._profile)
+        self._publisher = SensorPublisher(*whose)
         if self._drives:
-            vehicle, scenario = self.room.vehicle, self.room.scenario
+            vehicle, scenario = self.world.vehicle, self.world.scenario
             carriers = {target: marker for marker, target in binding.targets.items()}
             self._pixy = Pixy(
-                self.room, calibration_of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
+                self.world, calibration_of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
             )
-            self._sensors = Sensors(self.room, differential=odometry == "wheel")
+            self._sensors = Sensors(self.world, differential=odometry == "wheel")
             self._wheels = Actuators(scenario.limits[vehicle].latency, binding.profile.command.timeout)
-            voice = DriverVoice(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
-            voice.before_frame = self._others.place
-            self._voice = voice
+            publisher = VehicleSensorPublisher(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
+            publisher.before_frame = self._others.place
+            self._publisher = publisher
 
     def begin(self, seed: int) -> None:
         """Go to the start of a seed; wheels and commands are as if nothing had been."""
         self._began = self._moved = self._clock.steady()
-        self._rng = np.random.default_rng([seed % 2**64, self.room.agent])
-        self.room.begin(seed)
+        self._rng = np.random.default_rng([seed % 2**64, self.world.agent])
+        self.world.begin(seed)
         self._others.begin()
         if self._drives:
             self._wheels.clear()
@@ -173,10 +173,10 @@ class Fake:
         """Do once what takes long at the first time: kernels and codecs are compiled, or loaded."""
         warm_up(self._profile)
         if not self._drives:
-            self.room.follow(0.0)
+            self.world.follow(0.0)
             return
-        self.room.drive(0.0, 0.0, 0.0)
-        self.room.look(0)
+        self.world.drive(0.0, 0.0, 0.0)
+        self.world.look(0)
 
     @property
     def next(self) -> int:
@@ -217,10 +217,10 @@ class Fake:
     def _move(self, to: int) -> None:
         """Carry the body to a time, unless it is there already."""
         if not self._drives:
-            self.room.follow(max(to - self._began, 0) * 1e-9)
+            self.world.follow(max(to - self._began, 0) * 1e-9)
         elif to > self._moved:
             for duration, drive in self._wheels.pieces(self._moved, to):
-                self.room.drive(duration, drive.speed, drive.steering)
+                self.world.drive(duration, drive.speed, drive.steering)
             self._moved = to
 
     def _tick_gate(self, due: int, _stamp: int) -> None:

@@ -44,7 +44,7 @@ FORM = re.compile(r"(?P<kind>\w+)(=(?P<value>[^@]+))?(@(?P<start>[^+]+)(\+(?P<du
 
 
 @dataclass(frozen=True)
-class Fault:
+class FakeFault:
     """One fault."""
 
     kind: str
@@ -53,7 +53,7 @@ class Fault:
     duration: float = float("inf")  # s
 
 
-def parse_fault(text: str) -> Fault:
+def parse_fault(text: str) -> FakeFault:
     """Read a fault, for example `loss=0.2@5+10`.
 
     Raises:
@@ -71,7 +71,7 @@ def parse_fault(text: str) -> Fault:
     value = kind.default if found["value"] is None else _number(name, "value", found["value"], kind.low, kind.high)
     start = _number(name, "start", found["start"] or "0", 0.0, 1e6)
     duration = float("inf") if found["duration"] is None else _number(name, "duration", found["duration"], 0.0, 1e6)
-    return Fault(name, float(value or 0.0), start, duration)
+    return FakeFault(name, float(value or 0.0), start, duration)
 
 
 def _number(name: str, what: str, text: str, low: float, high: float) -> float:
@@ -98,13 +98,13 @@ class Faults:
     """The faults of a car; times in ns on one clock."""
 
     def __init__(self) -> None:
-        self._known: list[tuple[int, int | None, Fault]] = []
+        self._known: list[tuple[int, int | None, FakeFault]] = []
 
     def __bool__(self) -> bool:
         """Whether any has been asked for."""
         return bool(self._known)
 
-    def add(self, fault: Fault, now: int) -> None:
+    def add(self, fault: FakeFault, now: int) -> None:
         """Let a fault happen, its start counted from now."""
         begin = now + round(fault.start * 1e9)
         end = None if fault.duration == float("inf") else begin + round(fault.duration * 1e9)
@@ -124,7 +124,7 @@ class Faults:
         drifted = next((f.value * (now - begin) for begin, f in self._active("clock_drift", now)), 0.0)
         return round(offset + drifted)
 
-    def _active(self, kind: str, now: int) -> list[tuple[int, Fault]]:
+    def _active(self, kind: str, now: int) -> list[tuple[int, FakeFault]]:
         return [
             (begin, fault)
             for begin, end, fault in reversed(self._known)

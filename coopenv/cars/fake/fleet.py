@@ -19,8 +19,8 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.opening import scenario_of
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import REAL, Fake
-from coopenv.cars.fake.faults import Fault
-from coopenv.cars.gate.process import Settings
+from coopenv.cars.fake.faults import FakeFault
+from coopenv.cars.gate.process import GateSettings
 from coopenv.cars.transport.base import Transport
 
 READY = 300.0
@@ -167,7 +167,7 @@ def open_fake(
     transport: Transport,
     *,
     seed: int = 0,
-    faults: Iterable[Fault] = (),
+    faults: Iterable[FakeFault] = (),
     gate: bool = True,
     station: str | None = None,
     complain: Callable[[str], None] = lambda _: None,
@@ -194,7 +194,7 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
     if scenario.backend != "simulated":
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
     binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None, fleet.profile)
-    given = Settings.of(car, Path(path)).changed({}, station=station)
+    given = GateSettings.of(car, Path(path)).changed({}, station=station)
     signer, verifier = given.identities() if gate else (None, None)
     trusting = fleet.security.model_copy(update={"identity": given.station})
     fleet = fleet.model_copy(update={"security": trusting})

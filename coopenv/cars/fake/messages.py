@@ -9,7 +9,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, Pixy, Sensors, bearings_of
-from coopenv.cars.fake.world import Room
+from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import Calibration
 from coopenv.cars.transport.base import Transport
@@ -168,45 +168,45 @@ def _vector(values: Any) -> Any:
 
 
 TRUTH_RATE, LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 100.0, 60.0, 5.0, 1.0
-"""Hz: of motion capture, of what a moving landmark says, of what a car says of itself, and of its camera."""
+"""Hz: motion capture, poses of a moving landmark, conditions of a car, calibration of its camera."""
 FULL = 0.9  # share of the battery that is left
 
 Act = Callable[[int, int], None]
 """Called with when it was due, steady clock, and the stamp by the car's clock; ns."""
 
 
-class Voice:
-    """The messages of any car: motion capture, and those of a moving landmark."""
+class SensorPublisher:
+    """Publishes the messages of any car: motion capture, and those of a moving landmark."""
 
     def __init__(
         self,
         name: str,
-        room: Room,
+        world: CarWorld,
         wire: Transport,
-        room_clock: Callable[[int], int],
+        shared_clock: Callable[[int], int],
         outside: Transport,
         profile: CarProfile,
     ):
-        """Say whose they are.
+        """Prepare the messages of a car.
 
         Args:
             name: of the car.
-            room: where it is.
+            world: its world.
             wire: its own link.
-            room_clock: returns the stamp of motion capture for a time of the steady clock.
+            shared_clock: returns the stamp of motion capture for a time of the steady clock.
             outside: the network of motion capture, which has nothing to do with the car's.
             profile: make of the car.
         """
-        self.name, self.room, self.wire = name, room, wire
-        self._room_clock, self._outside, self._profile = room_clock, outside, profile
-        self._origin = np.array(room.scenario.map.origin)
+        self.name, self.world, self.wire = name, world, wire
+        self._shared_clock, self._outside, self._profile = shared_clock, outside, profile
+        self._origin = np.array(world.scenario.map.origin)
 
     @property
     def acts(self) -> dict[str, tuple[float, Act]]:
-        """Rates in Hz, and what is said, by name."""
+        """Rates in Hz, and what is published, by name."""
         return {"truth": (TRUTH_RATE, self._truth), "leader": (LEADER_RATE, self._leader)}
 
-    def say(self, role: Role, message: Any) -> None:
+    def publish(self, role: Role, message: Any) -> None:
         """Publish on the car's link."""
         topic, name = self._profile.topics[role], self._profile.topic_of(self.name, role)
         self.wire.publish(name, self._encoded(role, message), urgent=topic.urgent, reliable=topic.reliable)
@@ -217,21 +217,21 @@ class Voice:
         return encode(message)
 
     def _truth(self, due: int, _stamp: int) -> None:
-        R, p = self.room.pose(self.room.agent)
+        R, p = self.world.pose(self.world.agent)
         frames = ("mocap", self.name)
-        message = odometry(self._room_clock(due), frames, (R, p + self._origin), self.room.twist)
+        message = odometry(self._shared_clock(due), frames, (R, p + self._origin), self.world.twist)
         self._outside.publish(self._profile.topic_of(self.name, Role.TRUTH), self._encoded(Role.TRUTH, message))
 
     def _leader(self, _due: int, stamp: int) -> None:
-        R, p = self.room.pose(self.room.agent)
-        self.say(Role.ESTIMATE, estimate(stamp, R, p + self._origin))
+        R, p = self.world.pose(self.world.agent)
+        self.publish(Role.ESTIMATE, estimate(stamp, R, p + self._origin))
 
 
-class DriverVoice(Voice):
-    """The messages of a car that is a vehicle."""
+class VehicleSensorPublisher(SensorPublisher):
+    """Publishes the messages of a car that is a vehicle."""
 
     def __init__(self, *arguments: Any, pixy: Pixy, sensors: Sensors, rng: Callable[[], np.random.Generator]) -> None:
-        """Say whose they are, and what measures; `rng` returns the generator of the episode's noise."""
+        """Add camera and sensors; `rng` returns the generator of the episode's noise."""
         super().__init__(*arguments)
         self._pixy, self._sensors, self._rng = pixy, sensors, rng
         self.before_frame: Callable[[], None] = lambda: None
@@ -239,10 +239,10 @@ class DriverVoice(Voice):
 
     @property
     def acts(self) -> dict[str, tuple[float, Act]]:
-        """Rates in Hz, and what is said, by name."""
+        """Rates in Hz, and what is published, by name."""
         return {
             "truth": (TRUTH_RATE, self._truth),
-            "camera": (self.room.scenario.rates.camera, self._camera),
+            "camera": (self.world.scenario.rates.camera, self._camera),
             "wheel": (WHEEL_RATE, self._wheel),
             "imu": (IMU_RATE, self._imu),
             "odometry": (FILTER_RATE, self._odometry),
@@ -253,18 +253,18 @@ class DriverVoice(Voice):
     def _camera(self, due: int, stamp: int) -> None:
         self.before_frame()
         blocks = self._pixy.frame(due, self._rng())
-        self.say(Role.DETECTIONS, detections(stamp, blocks))
-        self.say(Role.BEARINGS, bearings(stamp, blocks, self._pixy.calibration))
+        self.publish(Role.DETECTIONS, detections(stamp, blocks))
+        self.publish(Role.BEARINGS, bearings(stamp, blocks, self._pixy.calibration))
 
     def _wheel(self, due: int, stamp: int) -> None:
         s = self._sensors
         speed, turn = s.wheel(due, self._rng())
         variances = (s.wheel_std**2, s.wheel_turn_std**2)
-        self.say(Role.WHEEL, wheel(stamp, self.name, speed, turn, variances))
+        self.publish(Role.WHEEL, wheel(stamp, self.name, speed, turn, variances))
 
     def _imu(self, due: int, stamp: int) -> None:
         rates = self._sensors.gyro(due, self._rng())
-        self.say(Role.IMU, imu(stamp, self.name, rates, self._sensors.gyro_std**2))
+        self.publish(Role.IMU, imu(stamp, self.name, rates, self._sensors.gyro_std**2))
 
     def _odometry(self, due: int, stamp: int) -> None:
         (x, y, heading), speed, turn = self._sensors.filtered(due)
@@ -272,12 +272,12 @@ class DriverVoice(Voice):
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         twist = np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, turn])
         frames = (f"{self.name}/odom", f"{self.name}/base_link")
-        self.say(Role.ODOMETRY, odometry(stamp, frames, (R, np.array([x, y, 0.0])), twist))
+        self.publish(Role.ODOMETRY, odometry(stamp, frames, (R, np.array([x, y, 0.0])), twist))
 
     def _camera_info(self, _due: int, stamp: int) -> None:
-        self.say(Role.CAMERA_INFO, camera_info(stamp, self._pixy.calibration))
+        self.publish(Role.CAMERA_INFO, camera_info(stamp, self._pixy.calibration))
 
     def _condition(self, _due: int, stamp: int) -> None:
-        self.say(Role.STATE, state(stamp, armed=True))
-        self.say(Role.REMOTE, remote(stamp))
-        self.say(Role.BATTERY, battery(stamp, FULL))
+        self.publish(Role.STATE, state(stamp, armed=True))
+        self.publish(Role.REMOTE, remote(stamp))
+        self.publish(Role.BATTERY, battery(stamp, FULL))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coopenv.cars.fake.faults import Faults
-from coopenv.cars.fake.world import Room
+from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.samples import Calibration
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import Array
@@ -18,12 +18,12 @@ WHEEL_RATE, IMU_RATE, FILTER_RATE = 50.0, 100.0, 20.0
 
 
 class Sensors:
-    """The odometry of one car. Lasting errors are those that the room has drawn."""
+    """The odometry of one car. Lasting errors are those that the world has drawn."""
 
-    def __init__(self, room: Room, *, differential: bool = True) -> None:
-        """Put them on the car of a room; `differential`: the wheels tell a turn rate, else 0."""
+    def __init__(self, world: CarWorld, *, differential: bool = True) -> None:
+        """Put them on the car of a world; `differential`: the wheels tell a turn rate, else 0."""
         self._differential = differential
-        self._room, self._noise = room, room.scenario.noises[room.vehicle]
+        self._world, self._noise = world, world.scenario.noises[world.vehicle]
         self.wheel_std = deviation(self._noise.velocity, self._noise, WHEEL_RATE)
         """m/s, of a sample."""
         self.wheel_turn_std = deviation(self._noise.angular_velocity, self._noise, WHEEL_RATE)
@@ -37,13 +37,13 @@ class Sensors:
         """Of the filter, x and y in m and the heading in rad, from where the car began."""
         self.speed, self.turn_rate = 0.0, 0.0  # last samples
         self._since = 0
-        self._factor = float(self._room.view("parameter")[0, int(ODOMETRY_NOISE)])
+        self._factor = float(self._world.view("parameter")[0, int(ODOMETRY_NOISE)])
 
     def wheel(self, now: int, rng: np.random.Generator) -> tuple[float, float]:
         """Return the speed, m/s, and the turn rate, rad/s, by the wheels at a time in ns."""
-        velocity, turn = self._room.twist
-        slip = self._room.view("slip")[0, self._room.vehicle]
-        scale = (1.0 + self._room.view("odometry_scale")[0, self._room.vehicle]) * (1.0 + slip[0])
+        velocity, turn = self._world.twist
+        slip = self._world.view("slip")[0, self._world.vehicle]
+        scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
         self._dead_reckon(now)
         self.speed = float(velocity[0] * scale * math.cos(slip[1]) + rng.normal() * self._factor * self.wheel_std)
         turned = float(turn[2] * scale + rng.normal() * self._factor * self.wheel_turn_std)
@@ -51,8 +51,8 @@ class Sensors:
 
     def gyro(self, now: int, rng: np.random.Generator) -> Array:
         """Return the turn rates about the body's axes, (3,) rad/s."""
-        _, turn = self._room.twist
-        bias = self._room.view("gyro_bias")[0, self._room.vehicle]
+        _, turn = self._world.twist
+        bias = self._world.view("gyro_bias")[0, self._world.vehicle]
         read: Array = turn + bias + rng.normal(size=3) * self._factor * self.gyro_std
         self._dead_reckon(now)
         self.turn_rate = float(read[2])
@@ -99,18 +99,23 @@ class Pixy:
     """The camera of one car."""
 
     def __init__(
-        self, room: Room, calibration: Calibration, markers: dict[int, int], faults: Faults, numbers: tuple[int, int]
+        self,
+        world: CarWorld,
+        calibration: Calibration,
+        markers: dict[int, int],
+        faults: Faults,
+        numbers: tuple[int, int],
     ) -> None:
         """Put it on the car.
 
         Args:
-            room: what it looks at.
+            world: what it looks at.
             calibration: of its lens.
             markers: numbers of markers by the agent that carries them.
             faults: that it may have.
             numbers: smallest and largest marker that it identifies.
         """
-        self._room, self._markers, self._faults = room, markers, faults
+        self._world, self._markers, self._faults = world, markers, faults
         self._numbers = range(numbers[0], numbers[1] + 1)
         self.calibration = calibration
         """Of its lens."""
@@ -124,7 +129,7 @@ class Pixy:
     def frame(self, now: int, rng: np.random.Generator) -> list[Block]:
         """Take a frame at a time in ns, the largest block first."""
         self._frames += 1
-        seen = {agent: ray for agent, ray in self._room.look(self._frames).items() if agent in self._markers}
+        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
         self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
         blocks = self._blocks(seen) if seen else []
         blocks.sort(key=lambda block: -block.width * block.height)
@@ -136,7 +141,7 @@ class Pixy:
         pixels = np.rint(flat * c.focal_length + c.principal_point).clip(0, np.array(c.image_size) - 1)
         blocks = []
         for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
-            number, near = self._markers[agent], MARKER / max(self._room.distance(agent), MARKER)
+            number, near = self._markers[agent], MARKER / max(self._world.distance(agent), MARKER)
             width, height = (max(1, round(f * near)) for f in c.focal_length)
             blocks.append(Block(number, x, y, width, height, index=number - 1, age=self._ages[agent]))
         return blocks
@@ -153,7 +158,7 @@ class Pixy:
                 for b in doubled
             ]
         if rate := faults.value("false_blocks", now):
-            for _ in range(rng.poisson(rate / self._room.scenario.rates.camera)):
+            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
                 x, y = int(rng.integers(width)), int(rng.integers(height))
                 blocks = [*blocks, Block(int(rng.choice(self._numbers)), x, y, 2, 2)]
         return blocks

@@ -1,4 +1,4 @@
-"""The room as one fake car has it: it moves itself by the simulation's kernels, others are where they are heard."""
+"""The world of one fake car: the simulation's kernels move the car, other cars are where motion capture puts them."""
 
 import math
 from collections import deque
@@ -44,8 +44,8 @@ def look_once(model: Any, state: Any, frame: wp.array(dtype=wp.int32), vehicle: 
     observe(model, state, world, vehicle, frame[world])
 
 
-class Room(World):
-    """One world, in which one agent is at home. Poses are in the map, from its origin."""
+class CarWorld(World):
+    """World of one agent. Poses are in the map, from its origin."""
 
     def __init__(self, scenario: Scenario, agent: int) -> None:
         """Build it.
@@ -123,24 +123,24 @@ class Room(World):
 
 
 class Neighbours:
-    """Hears of the other cars; they are in the room from their first message on."""
+    """Places the other cars by motion capture; they are in the world from their first message on."""
 
-    def __init__(self, room: Room, binding: Binding, name: str, transport: Transport) -> None:
+    def __init__(self, world: CarWorld, binding: Binding, name: str, transport: Transport) -> None:
         """Listen.
 
         Args:
-            room: where they are put.
+            world: where they are put.
             binding: who is who.
             name: of the own car.
             transport: the network.
         """
-        L = room.model.landmarks
+        L = world.model.landmarks
         agents = {**binding.leaders, **{car: L + vehicle for car, vehicle in binding.cars.items()}}
-        self._room, self._origin = room, np.array(room.scenario.map.origin)
+        self._world, self._origin = world, np.array(world.scenario.map.origin)
         self._truth_type, topic_of = binding.profile.topics[Role.TRUTH].type, binding.profile.topic_of
         self._agents = {topic_of(car, Role.TRUTH): agent for car, agent in agents.items() if car != name}
         self._heard: dict[str, bytes] = {}
-        self._moving = np.flatnonzero(room.model.motion.kind.numpy()[:L] == int(PRESCRIBED))
+        self._moving = np.flatnonzero(world.model.motion.kind.numpy()[:L] == int(PRESCRIBED))
         transport.subscribe(topic_of("*", Role.TRUTH), self._hear)  # one, as every subscription costs a thread
 
     def _hear(self, arrival: Arrival) -> None:
@@ -148,14 +148,14 @@ class Neighbours:
             self._heard[arrival.topic] = arrival.payload  # read when the camera looks: many are never looked at
 
     def begin(self) -> None:
-        """Forget where they are; moving landmarks are cars as well, and not there without one."""
+        """Drop their poses. A moving landmark is a car as well, and absent without it."""
         self._heard.clear()
         for landmark in self._moving:
-            if landmark != self._room.agent:
-                self._room.view("present")[0, landmark] = 0
+            if landmark != self._world.agent:
+                self._world.view("present")[0, landmark] = 0
 
     def place(self) -> None:
-        """Put them where they have been last."""
+        """Put them at their last poses."""
         while self._heard:
             try:
                 topic, payload = self._heard.popitem()
@@ -164,11 +164,11 @@ class Neighbours:
                 R = rotation_of(message.pose.pose.orientation, "orientation")
             except CoopenvError:
                 continue  # whatever somebody else has sent
-            self._room.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
+            self._world.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
 
 
 class Actuators:
-    """Commands in the order of time; times in ns on one clock. Lag, limits and dead band are the room's."""
+    """Commands in the order of time; times in ns on one clock. Lag, limits and dead band are the world's."""
 
     def __init__(self, latency: float, timeout: float) -> None:
         """Build them for a dead time, and a time without a command after which they go to neutral; both in s."""

@@ -102,7 +102,7 @@ KINDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class DriveCommand:
     """ackermann_msgs/AckermannDriveStamped."""
 
     stamp: int  # ns
@@ -126,7 +126,7 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class GateStatus:
     """coopenv_msgs/GateStatus."""
 
     stamp: int  # ns
@@ -138,11 +138,11 @@ class Status:
     rejections: Mapping[str, int]  # how often, by reason
 
 
-def read_command(payload: bytes) -> Command:
+def read_command(payload: bytes) -> DriveCommand:
     """Return a command; may hold numbers that are not finite. Raises Malformed: the bytes are none."""
     reader = Reader(payload)
     stamp, frame = reader.stamp(), reader.text()
-    command = Command(stamp, frame, *(reader.take("f") for _ in range(5)))
+    command = DriveCommand(stamp, frame, *(reader.take("f") for _ in range(5)))
     reader.end()
     return command
 
@@ -189,7 +189,7 @@ def read_drive(payload: bytes, message: CommandMessage) -> Drive:
     return message.drive(values)
 
 
-def write_status(status: Status) -> bytes:
+def write_status(status: GateStatus) -> bytes:
     """Return the bytes of what the gate says of itself."""
     writer = Writer()
     writer.header(status.stamp)

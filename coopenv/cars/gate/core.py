@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from coopenv.cars.gate.codec import (
-    Command,
+    DriveCommand,
+    GateStatus,
     Malformed,
-    Status,
     read_arm,
     read_bool,
     read_command,
@@ -34,7 +34,7 @@ from coopenv.cars.limits import Limits
 from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Drive, Role
 
 
-class State(StrEnum):
+class GateMode(StrEnum):
     """Of the gate."""
 
     DISARMED = "disarmed"
@@ -68,7 +68,7 @@ class Rejected(Exception):  # noqa: N818
 
 
 @dataclass(frozen=True)
-class Clock:
+class GateClock:
     """What time it is."""
 
     wall: Callable[[], int]  # ns, that of stamps
@@ -89,7 +89,7 @@ class Gate:
         self,
         car: str,
         limits: Limits,
-        clock: Clock,
+        clock: GateClock,
         verifier: Verifier | None = None,
         station: str = "station",
         profile: CarProfile = SVEA,
@@ -108,7 +108,7 @@ class Gate:
         self._verifier, self._station, self._profile = verifier, station, profile
         self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
         self._counts = dict.fromkeys(Reason, 0)
-        self._state, self._nonce = State.DISARMED, secrets.token_hex(8)
+        self._state, self._nonce = GateMode.DISARMED, secrets.token_hex(8)
         self._session, self._sequence, self._accepted = "", -1, 0
         self._wanted: Drive | None = None  # by the last valid command, while it counts
         self._commanded = self._ticked = clock.steady()
@@ -125,10 +125,10 @@ class Gate:
         return self._commanded
 
     @property
-    def state(self) -> State:
+    def state(self) -> GateMode:
         """The state at this instant."""
         if self._wanted is not None and self._clock.steady() - self._commanded > TIMEOUT:
-            self._come_to_a_stand(State.TIMED_OUT)
+            self._come_to_a_stand(GateMode.TIMED_OUT)
         return self._state
 
     def arrive(self, role: Role, payload: bytes, attachment: bytes = b"") -> Reason | None:
@@ -146,7 +146,7 @@ class Gate:
     def tick(self) -> bytes:
         """Return the message for the car now; to be called every 50 ms."""
         now = self._clock.steady()
-        if self.state is State.ARMED and self._wanted is not None:
+        if self.state is GateMode.ARMED and self._wanted is not None:
             # After a late call it is as if it had been in time: no jump.
             dt = min(now - self._ticked, PERIOD) / 1e9
             before, wanted = self._output, self._wanted
@@ -159,19 +159,19 @@ class Gate:
 
     def neutral(self) -> bytes:
         """Close for good and return the message of a car that stands."""
-        self._come_to_a_stand(State.STOPPED)
+        self._come_to_a_stand(GateMode.STOPPED)
         return write_drive(self._clock.wall(), self._profile.command, NEUTRAL)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
         state = self.state
-        session = self._session if state in (State.ARMED, State.TIMED_OUT) else ""
+        session = self._session if state in (GateMode.ARMED, GateMode.TIMED_OUT) else ""
         last, counts = max(self._sequence, 0), {str(reason): count for reason, count in self._counts.items()}
-        return write_status(Status(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts))
+        return write_status(GateStatus(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts))
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
         command = read_command(payload)
-        if self.state not in (State.ARMED, State.TIMED_OUT):
+        if self.state not in (GateMode.ARMED, GateMode.TIMED_OUT):
             raise Rejected(Reason.NOT_ARMED)
         session, _, digits = command.frame.rpartition(":")
         if session != self._session:
@@ -185,15 +185,15 @@ class Gate:
         self._check_values(command)
         self._sequence, self._accepted = int(digits), self._accepted + 1
         self._wanted, self._commanded = Drive(command.steering, command.speed), self._clock.steady()
-        self._state = State.ARMED
+        self._state = GateMode.ARMED
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
         message = read_arm(payload)
         self._check_stamp(message.stamp)
         self._check_signature(Role.ARM, payload, attachment)
         if not message.armed:
-            if self.state is not State.STOPPED:
-                self._come_to_a_stand(State.DISARMED)
+            if self.state is not GateMode.STOPPED:
+                self._come_to_a_stand(GateMode.DISARMED)
             return
         if message.nonce != self._nonce:
             raise Rejected(Reason.NONCE)
@@ -201,16 +201,16 @@ class Gate:
             raise Rejected(Reason.SESSION)
         if message.session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
             self._session, self._sequence = message.session, -1
-        self._come_to_a_stand(State.ARMED)
+        self._come_to_a_stand(GateMode.ARMED)
 
     def _stop(self, payload: bytes, _attachment: bytes) -> None:
-        if read_bool(payload) and self._state is not State.STOPPED:
-            self._come_to_a_stand(State.STOPPED)
+        if read_bool(payload) and self._state is not GateMode.STOPPED:
+            self._come_to_a_stand(GateMode.STOPPED)
 
-    def _come_to_a_stand(self, state: State) -> None:
+    def _come_to_a_stand(self, state: GateMode) -> None:
         """Go on in a state with neutral output; unless it is a mere time-out, earlier armings are worth nothing."""
         self._state, self._wanted, self._output = state, None, NEUTRAL
-        if state is not State.TIMED_OUT:
+        if state is not GateMode.TIMED_OUT:
             self._nonce = secrets.token_hex(8)
 
     def _check_stamp(self, stamp: int) -> None:
@@ -228,10 +228,10 @@ class Gate:
         ):
             raise Rejected(Reason.SIGNATURE)
 
-    def _check_values(self, command: Command) -> None:
+    def _check_values(self, command: DriveCommand) -> None:
         numbers = (command.steering, command.steering_rate, command.speed, command.acceleration, command.jerk)
         if not all(map(math.isfinite, numbers)):
-            self._come_to_a_stand(State.TIMED_OUT)  # the station itself has lost its way
+            self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
             raise Rejected(Reason.NOT_FINITE)
         if not self._limits.permit(command.speed, command.steering):
             raise Rejected(Reason.LIMITS)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.cars.gate.codec import write_bool
-from coopenv.cars.gate.core import PERIOD, Clock, Gate, State
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode
 from coopenv.cars.keys import LONGEST_IDENTITY, Signer, is_identity
 from coopenv.cars.limits import USUAL, Limits
 from coopenv.cars.profile import SVEA, CarProfile, Role, presence_of
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from coopenv.cars.keys import Signer, Verifier
     from coopenv.cars.transport.base import Transport
 
-CLOCK = Clock(time.time_ns, time.monotonic_ns)
+CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz
 LAST_NEUTRALS = 5  # that the car gets before the gate goes
 
@@ -80,7 +80,7 @@ class Link:
             state, status = self._gate.state, self._gate.status()
         signature = b"" if self._signer is None else self._signer.sign(self._topics[Role.GATE], status)
         self._send(Role.GATE, status, signature)
-        if state is State.STOPPED:
+        if state is GateMode.STOPPED:
             self._send(Role.STOP, write_bool(True), self._own)
 
     def neutral(self) -> bytes:
@@ -124,7 +124,7 @@ def run(link: Link) -> None:
 
 
 @dataclass(frozen=True)
-class Settings:
+class GateSettings:
     """Of one gate."""
 
     car: str
@@ -140,7 +140,7 @@ class Settings:
         return SVEA if self.fleet is None else self.fleet.profile
 
     @classmethod
-    def of(cls, car: str, path: Path | None) -> Settings:
+    def of(cls, car: str, path: Path | None) -> GateSettings:
         """Return the settings for a car by a deployment file, or the usual ones.
 
         Raises:
@@ -156,7 +156,7 @@ class Settings:
         keys = None if read.security.keys is None else read.folder / read.security.keys
         return cls(read.car(car).name, read.gate_connect, read.limits, keys, read.security.identity, read)
 
-    def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
+    def changed(self, limits: Mapping[str, Any], **values: Any) -> GateSettings:
         """Return these settings with others in place of some; None leaves one as it is.
 
         Raises:

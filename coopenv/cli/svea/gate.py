@@ -46,10 +46,10 @@ def gate(
     """
     from coopenv.base import interrupts
     from coopenv.cars.gate.core import Gate
-    from coopenv.cars.gate.process import CLOCK, Link, Settings, run
+    from coopenv.cars.gate.process import CLOCK, GateSettings, Link, run
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
-    given = Settings.of(car, deployment).changed(
+    given = GateSettings.of(car, deployment).changed(
         connect=connect and (connect,),
         keys=keys,
         station=station,

@@ -26,10 +26,10 @@ def health(
     On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
     """
     from coopenv.base.errors import CoopenvError
-    from coopenv.cars.gate.process import Settings
+    from coopenv.cars.gate.process import GateSettings
     from coopenv.cars.profile import Role
 
-    given = Settings.of(car, deployment).changed({}, connect=connect and (connect,))
+    given = GateSettings.of(car, deployment).changed({}, connect=connect and (connect,))
     given.check_place(off_board)
     topic, transport = given.profile.topic_of(given.car, Role.GATE), given.open()
     try:

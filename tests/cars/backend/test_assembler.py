@@ -15,7 +15,7 @@ from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.tracks import LONGEST_GAP
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.samples import Detections, Pose, Report, Sample, Twist, Value
+from coopenv.cars.samples import Detections, Pose, RobustReport, Sample, Twist, Value
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -234,7 +234,7 @@ def test_the_observers_own_message_counts_before_the_pose() -> None:
     assembler = Assembler(binding(2, only="car1"))
     assembler.begin(START)
     assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), "car0"))
-    report = Report(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
+    report = RobustReport(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
     assembler.put(sample(Role.REPORT, START + MS, report, "car0"))
     assert set(assembler.tick(1, START + 5 * MS).messages[1, 0].message.extra) == {"odometry"}
 

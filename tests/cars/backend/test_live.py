@@ -47,8 +47,8 @@ def drive(env: Env, steps: int, action: np.ndarray = AHEAD) -> dict[str, Any]:
 
 
 def place(made: dict[str, Fake], car: str) -> np.ndarray:
-    room = made[car].room
-    return np.array(room.pose(room.agent)[1])
+    world = made[car].world
+    return np.array(world.pose(world.agent)[1])
 
 
 def listen(hub: Hub, topic: str) -> list[Arrival]:

@@ -12,10 +12,10 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.gates import LATE, Gates
 from coopenv.cars.backend.station import Station
-from coopenv.cars.backend.watchdog import Vitals, Watchdog, misplaced
+from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import Safety
-from coopenv.cars.gate.core import Clock, Gate
+from coopenv.cars.gate.core import Gate, GateClock
 from coopenv.cars.gate.process import Link
 from coopenv.cars.limits import USUAL
 from coopenv.cars.profile import SVEA, Role
@@ -37,30 +37,30 @@ def at(x: float, y: float = 0.0) -> Pose:
 
 
 def test_only_newer_messages_are_signs_of_life() -> None:
-    vitals, still = Vitals("truth"), Twist(np.zeros(3), np.zeros(3))
-    assert vitals.age("a", Role.WHEEL) == float("inf")
-    vitals.put(sample("a", Role.WHEEL, BEGIN, still))
+    monitor, still = LinkMonitor("truth"), Twist(np.zeros(3), np.zeros(3))
+    assert monitor.age("a", Role.WHEEL) == float("inf")
+    monitor.put(sample("a", Role.WHEEL, BEGIN, still))
     for k in range(1, 20):  # the same bytes again and again, and one from far in the future
-        vitals.put(sample("a", Role.WHEEL, BEGIN, still, received=BEGIN + 10 * k * MS))
-    vitals.put(sample("a", Role.WHEEL, BEGIN + 10_000 * MS, still, received=BEGIN + 200 * MS))
-    vitals.looked = BEGIN + 200 * MS
-    assert vitals.age("a", Role.WHEEL) == pytest.approx(0.2)
-    vitals.put(sample("a", Role.WHEEL, BEGIN + 190 * MS, still, received=BEGIN + 195 * MS))
-    assert vitals.age("a", Role.WHEEL) == pytest.approx(0.01)
-    assert vitals.age("a", Role.IMU) == float("inf") and vitals.age("b", Role.WHEEL) == float("inf")
+        monitor.put(sample("a", Role.WHEEL, BEGIN, still, received=BEGIN + 10 * k * MS))
+    monitor.put(sample("a", Role.WHEEL, BEGIN + 10_000 * MS, still, received=BEGIN + 200 * MS))
+    monitor.looked = BEGIN + 200 * MS
+    assert monitor.age("a", Role.WHEEL) == pytest.approx(0.2)
+    monitor.put(sample("a", Role.WHEEL, BEGIN + 190 * MS, still, received=BEGIN + 195 * MS))
+    assert monitor.age("a", Role.WHEEL) == pytest.approx(0.01)
+    assert monitor.age("a", Role.IMU) == float("inf") and monitor.age("b", Role.WHEEL) == float("inf")
 
 
 def test_places_come_from_what_judges() -> None:
     for judge, role in (("truth", Role.TRUTH), ("estimate", Role.ESTIMATE)):
-        vitals = Vitals(judge)  # type: ignore[arg-type]
-        vitals.begin(BEGIN)
-        vitals.put(sample("a", Role.TRUTH, BEGIN + MS, at(1.0)))
-        vitals.put(sample("a", Role.ESTIMATE, BEGIN + MS, at(2.0)))
-        vitals.put(sample("a", role, BEGIN, at(9.0)))  # older
-        assert vitals.places["a"].position[0] == (1.0 if role is Role.TRUTH else 2.0)
-        vitals.place("a", np.array([np.nan, 0.0, 0.0]), BEGIN + 400 * MS)
-        vitals.looked = BEGIN + 401 * MS
-        assert vitals.lost("a") == pytest.approx(0.4), "not a number is no place"
+        monitor = LinkMonitor(judge)  # type: ignore[arg-type]
+        monitor.begin(BEGIN)
+        monitor.put(sample("a", Role.TRUTH, BEGIN + MS, at(1.0)))
+        monitor.put(sample("a", Role.ESTIMATE, BEGIN + MS, at(2.0)))
+        monitor.put(sample("a", role, BEGIN, at(9.0)))  # older
+        assert monitor.places["a"].position[0] == (1.0 if role is Role.TRUTH else 2.0)
+        monitor.place("a", np.array([np.nan, 0.0, 0.0]), BEGIN + 400 * MS)
+        monitor.looked = BEGIN + 401 * MS
+        assert monitor.lost("a") == pytest.approx(0.4), "not a number is no place"
 
 
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
@@ -79,15 +79,15 @@ CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
     ],
 )
 def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[str]) -> None:
-    vitals = Vitals(judge)
-    vitals.begin(BEGIN)
-    vitals.looked = BEGIN + 100 * MS
+    monitor = LinkMonitor(judge)
+    monitor.begin(BEGIN)
+    monitor.looked = BEGIN + 100 * MS
     for car, x in places.items():
-        vitals.place(car, np.array([x, 0.0, 0.0]), BEGIN + 90 * MS)
+        monitor.place(car, np.array([x, 0.0, 0.0]), BEGIN + 90 * MS)
     safety = Safety(geofence=CORNERS, separation=0.3, judge=judge)
-    assert [f"{car}: {wrong}" for car, wrong in misplaced(safety, vitals, ("a",), ("b",))] == found
-    vitals.looked = BEGIN + 700 * MS
-    lost = [wrong for _, wrong in misplaced(safety, vitals, ("a",), ("b",))]
+    assert [f"{car}: {wrong}" for car, wrong in misplaced(safety, monitor, ("a",), ("b",))] == found
+    monitor.looked = BEGIN + 700 * MS
+    lost = [wrong for _, wrong in misplaced(safety, monitor, ("a",), ("b",))]
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
 
 
@@ -113,7 +113,7 @@ class Yard:
 
     def __init__(self) -> None:
         self.hub = Hub()
-        self.clock = Clock(time.time_ns, time.monotonic_ns)
+        self.clock = GateClock(time.time_ns, time.monotonic_ns)
         self.links = {car: Link(Gate(car, USUAL, self.clock), car, self.hub.connect(), None) for car in ("a", "b")}
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
         self.tell()
@@ -222,41 +222,41 @@ def refuse(role: Role, payload: bytes, attachment: bytes) -> None:
 
 
 @pytest.fixture
-def guard(yard: Yard) -> Iterator[tuple[Yard, Watchdog, Vitals]]:
-    vitals, station = Vitals("truth"), Station(yard.hub.connect(), [WHEEL], None, {})
-    made = Watchdog(Safety(odometry_age=0.3), station, yard.gates, vitals, ("a",), (), (Role.WHEEL,), 10.0)
-    yield yard, made, vitals
+def guard(yard: Yard) -> Iterator[tuple[Yard, Watchdog, LinkMonitor]]:
+    monitor, station = LinkMonitor("truth"), Station(yard.hub.connect(), [WHEEL], None, {})
+    made = Watchdog(Safety(odometry_age=0.3), station, yard.gates, monitor, ("a",), (), (Role.WHEEL,), 10.0)
+    yield yard, made, monitor
     made.close()
 
 
-def live(yard: Yard, guard: Watchdog, vitals: Vitals, seconds: float, usable: bool) -> None:
+def live(yard: Yard, guard: Watchdog, monitor: LinkMonitor, seconds: float, usable: bool) -> None:
     """Let wheels be heard for a time, and be understood or not."""
     wire, until = yard.hub.connect(), time.monotonic() + seconds
     while time.monotonic() < until and guard.trip is None:
         wire.publish(WHEEL, b"whatever")
-        vitals.looked = time.time_ns()
+        monitor.looked = time.time_ns()
         if usable:
-            vitals.put(sample("a", Role.WHEEL, vitals.looked, Twist(np.zeros(3), None)))
+            monitor.put(sample("a", Role.WHEEL, monitor.looked, Twist(np.zeros(3), None)))
         yard.tell()
         guard.beat(0)
         time.sleep(0.01)
 
 
-def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, Vitals]) -> None:
-    yard, dog, vitals = guard
+def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMonitor]) -> None:
+    yard, dog, monitor = guard
     yard.gates.begin()
     yard.hub.connect().publish(WHEEL, b"whatever")
     dog.arm()
-    live(yard, dog, vitals, 0.6, usable=True)
+    live(yard, dog, monitor, 0.6, usable=True)
     assert dog.trip is None
-    live(yard, dog, vitals, 5.0, usable=False)
+    live(yard, dog, monitor, 5.0, usable=False)
     assert dog.trip is not None and "nothing new that could be used on fleet/a/mavros/wheel" in dog.trip.reason
     yard.tell()
     assert states(yard) == ["stopped", "stopped"]
 
 
 def test_a_network_that_fails_does_not_end_the_watchdog(
-    guard: tuple[Yard, Watchdog, Vitals], monkeypatch: pytest.MonkeyPatch
+    guard: tuple[Yard, Watchdog, LinkMonitor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     yard, dog, _ = guard
     yard.gates.begin()
@@ -275,7 +275,7 @@ def test_a_network_that_fails_does_not_end_the_watchdog(
     dog.arm()
 
 
-def test_nothing_is_armed_without_a_watchdog(guard: tuple[Yard, Watchdog, Vitals]) -> None:
+def test_nothing_is_armed_without_a_watchdog(guard: tuple[Yard, Watchdog, LinkMonitor]) -> None:
     guard[1].close()
     with pytest.raises(CoopenvError, match="not armed: the watchdog has ended"):
         guard[1].arm()

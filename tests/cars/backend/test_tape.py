@@ -1,4 +1,4 @@
-"""Drives on tape, as other tools read them."""
+"""Drives on recorder, as other tools read them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from coopenv.base.errors import OutputError
-from coopenv.cars.backend.drive import ATTACHMENT, NAME, PRESENCE, Tape, Taped
+from coopenv.cars.backend.drive import ATTACHMENT, NAME, PRESENCE, DriveRecorder, RecordedTransport
 from coopenv.cars.codec import TICK, empty, encode, header, make
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role
 from coopenv.cars.transport.base import Hub
@@ -30,20 +30,20 @@ TYPES = {WHEEL: SVEA.topics[Role.WHEEL].type, FRAMES: SVEA.topics[Role.DETECTION
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    tape = Tape(tmp_path / "drive.mcap", json.dumps({"cars": 1}).encode(), TYPES)
-    tape.begin(10**9, 2**64 - 1, 3)
+    recorder = DriveRecorder(tmp_path / "drive.mcap", json.dumps({"cars": 1}).encode(), TYPES)
+    recorder.begin(10**9, 2**64 - 1, 3)
     for k in range(20):
         now = 10**9 + k * 10**7
         twist = make(
             TYPES[WHEEL], header=header(now - 5, "base_link"), twist=empty("geometry_msgs/msg/TwistWithCovariance")
         )
         twist.twist.twist.linear.x = 0.1 * k
-        tape.write(WHEEL, encode(twist), now)
+        recorder.write(WHEEL, encode(twist), now)
         frame = make(TYPES[FRAMES], header=header(now), objects=[empty("pixy_camera/msg/ObjectInfo")] * (k % 3))
-        tape.write(FRAMES, encode(frame), now)
-        tape.write("fleet/nobody/knows", b"123", now)
-        tape.tick(k + 1, now)
-    tape.close()
+        recorder.write(FRAMES, encode(frame), now)
+        recorder.write("fleet/nobody/knows", b"123", now)
+        recorder.tick(k + 1, now)
+    recorder.close()
     return tmp_path / "drive.mcap"
 
 
@@ -84,12 +84,12 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
         stop: SVEA.topics[Role.STOP].type,
         "fleet/alive/svea7": PRESENCE,
     }
-    tape = Tape(tmp_path / "drive.mcap", b"{}", types)
-    taped = Taped(hub.connect(), tape, {state}, {stop})
+    recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", types)
+    recorded = RecordedTransport(hub.connect(), recorder, {state}, {stop})
     for topic in (state, wheels):
-        taped.subscribe(topic, read.append)
-    taped.watch("fleet/alive/*", lambda name, there: None)
-    tape.begin(1, 0, 0)
+        recorded.subscribe(topic, read.append)
+    recorded.watch("fleet/alive/*", lambda name, there: None)
+    recorder.begin(1, 0, 0)
     others = hub.connect()
     for name in ("svea7", "stranger"):
         others.announce(f"fleet/alive/{name}")
@@ -97,8 +97,8 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     others.publish(stop, encode(make(types[stop], data=True)))
     others.publish(WHEEL, encode(empty(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
     others.close()
-    taped.publish(WHEEL, encode(empty(TYPES[WHEEL])), b"signature")
-    tape.close()
+    recorded.publish(WHEEL, encode(empty(TYPES[WHEEL])), b"signature")
+    recorder.close()
     assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
     with AnyReader([tmp_path / "drive.mcap"]) as reader:
         messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
@@ -113,10 +113,10 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
 
 
 def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> None:
-    tape = Tape(tmp_path / "drive.mcap", b"{}", TYPES)
-    tape.begin(10**9, 0, 0)
-    tape.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
-    tape.close()
+    recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
+    recorder.begin(10**9, 0, 0)
+    recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
+    recorder.close()
     with AnyReader([tmp_path / "drive.mcap"]) as reader:
         (connection,) = (c for c in reader.connections if c.topic == f"/{STOPPED_TOPIC}")
         ((_, time, raw),) = reader.messages([connection])
@@ -126,22 +126,22 @@ def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> Non
 
 
 def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Path) -> None:
-    tape, each, writers = Tape(tmp_path / "drive.mcap", b"{}", TYPES), 500, 4
+    recorder, each, writers = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES), 500, 4
     frame = encode(empty(TYPES[FRAMES]))
 
     def write(number: int) -> None:
         for k in range(each):
-            tape.write(FRAMES, frame, number * each + k)
+            recorder.write(FRAMES, frame, number * each + k)
 
     threads = [threading.Thread(target=write, args=(number,)) for number in range(writers)]
     for thread in threads:
         thread.start()
-    tape.begin(1, 0, 0)
+    recorder.begin(1, 0, 0)
     for k in range(1, each):
-        tape.tick(k, k)
+        recorder.tick(k, k)
     for thread in threads:
         thread.join()
-    tape.close()
+    recorder.close()
     with (tmp_path / "drive.mcap").open("rb") as stream:
         found = [(c.topic, m.log_time) for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]
     frames = [time for topic, time in found if topic == f"/{FRAMES}"]
@@ -153,18 +153,18 @@ def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Pa
 WRITER = f"""
 import os, resource, sys, time
 from pathlib import Path
-from coopenv.cars.backend.drive import FLUSH, Tape
+from coopenv.cars.backend.drive import FLUSH, DriveRecorder
 from coopenv.cars.codec import encode
 from coopenv.cars.codec import empty
-tape = Tape(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
-tape.begin(1, 0, 0)
+recorder = DriveRecorder(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
+recorder.begin(1, 0, 0)
 frame = encode(empty("{TYPES[FRAMES]}"))
 """
 KILLED = """
-tape.write("frames", frame, 2)
+recorder.write("frames", frame, 2)
 time.sleep(4 * FLUSH)
-tape.tick(1, 3)
-tape.stopped("told at once", "", 4)
+recorder.tick(1, 3)
+recorder.stopped("told at once", "", 4)
 time.sleep(0.3)
 os.kill(os.getpid(), 9)
 """
@@ -172,10 +172,10 @@ FULL = """
 import os
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
 for k in range(3000):
-    tape.write("frames", frame + os.urandom(200), k)
+    recorder.write("frames", frame + os.urandom(200), k)
     time.sleep(0.001)
 try:
-    tape.close()
+    recorder.close()
 except Exception as error:
     print(type(error).__name__, error)
 """
@@ -209,20 +209,20 @@ def test_a_full_disk_is_one_line_and_what_is_written_can_be_read(tmp_path: Path)
 
 
 def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
-    tape = Tape(tmp_path / "drive.mcap", b"{}", TYPES)
-    tape.write(FRAMES, encode(empty(TYPES[FRAMES])), 1)
-    tape.close()
+    recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
+    recorder.write(FRAMES, encode(empty(TYPES[FRAMES])), 1)
+    recorder.close()
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("name", "why"), [("drive.bag", r"must end in \.mcap"), ("no/drive.mcap", "cannot write to")])
 def test_where_none_can_be_written_is_said(tmp_path: Path, name: str, why: str) -> None:
     with pytest.raises(OutputError, match=why):
-        Tape(tmp_path / name, b"{}", TYPES)
+        DriveRecorder(tmp_path / name, b"{}", TYPES)
 
 
 def test_nothing_is_overwritten(written: Path) -> None:
     before = written.read_bytes()
     with pytest.raises(OutputError, match="exists already"):
-        Tape(written, b"{}", TYPES)
+        DriveRecorder(written, b"{}", TYPES)
     assert written.read_bytes() == before

@@ -20,7 +20,7 @@ from coopenv.backends.sources import Kind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.log import Row
+from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.samples import Detections
 from coopenv.cli import main
@@ -181,7 +181,10 @@ def test_a_folder_that_is_no_bag_is_told_so(tmp_path: Path, capsys: pytest.Captu
 def test_tables_of_topics_are_folded_and_not_cut(capsys: pytest.CaptureFixture[str]) -> None:
     name = "/fleet/" + "a_car_with_a_long_name/" * 4 + "mavros/wheel_odometry/velocity"
     kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-    for row in (Row(name, kind, 12345, 59.9), Row(name, kind, 12345, 59.9, "a_car", "detections", 12300, 1.2, 3, 0.1)):
+    for row in (
+        TopicRow(name, kind, 12345, 59.9),
+        TopicRow(name, kind, 12345, 59.9, "a_car", "detections", 12300, 1.2, 3, 0.1),
+    ):
         _print([row], False)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= 100

@@ -16,7 +16,7 @@ from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import read_recording
 from coopenv.backends.sources import Kind, kind_of, open_recording
 from coopenv.base.errors import DataWarning
-from coopenv.cars.backend.drive import Tape
+from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags import Bag
 from coopenv.cli import main
 from coopenv.observers import run
@@ -269,12 +269,12 @@ def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path) -> None:
              "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
              "/agent7/riccatiPoint": "fleet/svea1/point"}  # fmt: skip
     drive = bags.messages(bags.drive())
-    path = tmp_path / "tape.mcap"
-    tape = Tape(path, b"{}", {names[m.topic]: m.kind for m in drive})
-    tape.begin(bags.BEGIN, 0, 0)  # a tape in which nothing begins leaves no file
+    path = tmp_path / "recorder.mcap"
+    recorder = DriveRecorder(path, b"{}", {names[m.topic]: m.kind for m in drive})
+    recorder.begin(bags.BEGIN, 0, 0)  # a recorder in which nothing begins leaves no file
     for number, m in enumerate(drive):
-        tape.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
-    tape.close()
+        recorder.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
+    recorder.close()
     assert kind_of(path) is Kind.LOG  # which is replayed as it was
     text = bags.MAP.replace('"authors"', '"svea"') + '[cars.topics]\npoint = "/fleet/svea1/point"\n'
     assert_same(ticks_of(open_bag(path, tmp_path, text)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))

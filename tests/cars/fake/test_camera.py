@@ -56,8 +56,8 @@ def places(stage: Stage) -> dict[int, np.ndarray]:
 
 
 def put(stage: Stage, car: str, x: float, y: float, yaw: float) -> None:
-    room = stage.cars[car].room
-    room.put(room.agent, turned(yaw), np.array([x, y, 0.0]))
+    world = stage.cars[car].world
+    world.put(world.agent, turned(yaw), np.array([x, y, 0.0]))
 
 
 def frame(stage: Stage, car: str) -> tuple[Any, Any]:

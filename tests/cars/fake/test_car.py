@@ -22,8 +22,8 @@ SEQUENCE = [(0.4, 0.3, 1.0), (0.25, -0.4, 1.5), (0.05, 0.2, 0.5), (0.5, 0.0, 1.0
 
 
 def pose(stage: Stage, car: str) -> tuple[np.ndarray, np.ndarray]:
-    room = stage.cars[car].room
-    return room.pose(room.agent)
+    world = stage.cars[car].world
+    return world.pose(world.agent)
 
 
 @pytest.mark.parametrize("seed", [0, 5, 2**40 + 1])

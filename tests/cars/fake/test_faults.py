@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.cars.codec import encode, make, stamp_of
-from coopenv.cars.fake.faults import KINDS, Fault, FaultError, Faults, fault_topic, parse_fault
+from coopenv.cars.fake.faults import KINDS, FakeFault, FaultError, Faults, fault_topic, parse_fault
 from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
@@ -22,7 +22,7 @@ from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 def test_what_is_written_is_read(kind: str, value: float, start: float, duration: float | None) -> None:
     text = f"{kind}={value!r}@{start!r}" + ("" if duration is None else f"+{duration!r}")
     found = parse_fault(text)
-    assert found == Fault(kind, value, start, float("inf") if duration is None else duration)
+    assert found == FakeFault(kind, value, start, float("inf") if duration is None else duration)
 
 
 @pytest.mark.parametrize(
@@ -145,4 +145,4 @@ def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage) -> None:
     stage.run(0.01)
     assert len(stage.complaints) == 3
     assert "unknown fault 'melt'" in stage.complaints[0]
-    assert np.isfinite(stage.cars["svea7"].room.pose(stage.cars["svea7"].room.agent)[1]).all()
+    assert np.isfinite(stage.cars["svea7"].world.pose(stage.cars["svea7"].world.agent)[1]).all()

@@ -13,7 +13,7 @@ from coopenv import CoopenvError
 from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, Detections, Pose, Report, Status, Twist
+from coopenv.cars.samples import Calibration, CarStatus, Detections, Pose, RobustReport, Twist
 from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
@@ -185,11 +185,11 @@ def test_reports() -> None:
         "depends_on": 2**63 + 1,
     }
     value = read(Role.REPORT, make("coopenv_msgs/msg/RobustReport", valid=True, **fields))
-    assert isinstance(value, Report) and value.rotation is not None
+    assert isinstance(value, RobustReport) and value.rotation is not None
     assert_allclose(value.extra["odometry"], [*turn.as_rotvec(), 4, 5, 6], atol=1e-12)
     assert value.extra["depends_on"].dtype == np.uint64 and int(value.extra["depends_on"][0]) == 2**63 + 1
     lost = read(Role.REPORT, make("coopenv_msgs/msg/RobustReport", valid=False, **fields))
-    assert lost == Report(None, None, None, {})
+    assert lost == RobustReport(None, None, None, {})
 
 
 def camera_info(ros: int, **other: Any) -> Any:
@@ -254,14 +254,14 @@ def test_status() -> None:
         mode="MANUAL",
         system_status=4,
     )
-    assert read(Role.STATE, state) == Status(armed=True, mode="MANUAL")
+    assert read(Role.STATE, state) == CarStatus(armed=True, mode="MANUAL")
     state.connected = False
-    assert read(Role.STATE, state) == Status(armed=False, mode="MANUAL")
+    assert read(Role.STATE, state) == CarStatus(armed=False, mode="MANUAL")
     for rssi, pulses, told in ((9, [1500, 1510], (1500, 1510)), (0, [1500, 1510], ()), (255, [], ()), (255, [0], (0,))):
         remote = make("mavros_msgs/msg/RCIn", header=head(), rssi=rssi, channels=np.array(pulses, dtype=np.uint16))
-        assert read(Role.REMOTE, remote) == Status(pulses=told)
-    assert read(Role.BATTERY, battery(0.5)) == Status(battery=0.5)
-    assert read(Role.BATTERY, battery(float("nan"))) == Status()
+        assert read(Role.REMOTE, remote) == CarStatus(pulses=told)
+    assert read(Role.BATTERY, battery(0.5)) == CarStatus(battery=0.5)
+    assert read(Role.BATTERY, battery(float("nan"))) == CarStatus()
 
 
 WRONG: list[tuple[Role, Any, str]] = [

@@ -8,7 +8,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.gate.codec import read_drive
-from coopenv.cars.gate.core import PERIOD, Clock, Gate, Reason
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, Reason
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.limits import Limits
 from coopenv.cars.profile import SVEA, Drive, Role
@@ -28,7 +28,7 @@ class Bench:
 
     def __init__(self, limits: Limits = LIMITS, signed: bool = True) -> None:
         self.wall, self.steady = START, 7
-        self.gate = Gate(CAR, limits, Clock(lambda: self.wall, lambda: self.steady), VERIFIER if signed else None)
+        self.gate = Gate(CAR, limits, GateClock(lambda: self.wall, lambda: self.steady), VERIFIER if signed else None)
         self.session, self.sequence = "", 0
 
     def wait(self, duration: int) -> None:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, encode, header, make
 from coopenv.cars.gate.codec import (
+    GateStatus,
     Malformed,
-    Status,
     read_arm,
     read_bool,
     read_command,
@@ -73,7 +73,7 @@ def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], but
 def test_the_status_is_that_of_rosbags(
     stamp: int, session: str, nonce: str, state: str, accepted: int, last: int, counts: dict[str, int]
 ) -> None:
-    payload = write_status(Status(stamp, session, nonce, state, accepted, last, counts))
+    payload = write_status(GateStatus(stamp, session, nonce, state, accepted, last, counts))
     fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
     fields |= {"accepted": accepted, "last_sequence": last}
     fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}

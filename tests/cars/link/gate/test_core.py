@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.gate.core import MOST_AHEAD, TIMEOUT, Reason, State
+from coopenv.cars.gate.core import MOST_AHEAD, TIMEOUT, GateMode, Reason
 from coopenv.cars.limits import Limits
 from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Role
 from tests.cars.link.gate import messages
@@ -39,7 +39,7 @@ def test_it_starts_disarmed_and_neutral() -> None:
 
 def test_commands_of_the_armed_session_move_the_car() -> None:
     bench = armed()
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.ARMED
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.ARMED
     told = bench.drive(10)
     assert (told.steering, told.speed) == pytest.approx((0.1, 0.2), abs=1e-6)
     status = bench.status()
@@ -74,13 +74,13 @@ def test_without_commands_the_car_gets_neutral_and_newer_commands_go_on_from_a_s
     bench = armed()
     assert bench.drive(10).speed > 0.19
     bench.wait(TIMEOUT - 100 * MS)
-    assert bench.tick().speed > 0.19 and bench.gate.state is State.ARMED
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.TIMED_OUT
+    assert bench.tick().speed > 0.19 and bench.gate.state is GateMode.ARMED
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
     assert bench.status().session == "s1"
     assert bench.command(age=MOST_AGE + MS) is Reason.STALE
     assert bench.tick() == NEUTRAL
     told = bench.drive(1)
-    assert told.speed == pytest.approx(0.05, abs=1e-6) and bench.gate.state is State.ARMED
+    assert told.speed == pytest.approx(0.05, abs=1e-6) and bench.gate.state is GateMode.ARMED
 
 
 def test_what_a_stalled_link_delivers_late_moves_nothing() -> None:
@@ -178,7 +178,7 @@ def test_a_station_that_commands_what_is_no_number_stops_its_car_at_once() -> No
     bench = armed()
     bench.drive(10)
     assert bench.command(speed=math.nan) is Reason.NOT_FINITE
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.TIMED_OUT
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
     bench.drive(10)
     assert bench.command(speed=math.nan, signer=OTHER) is Reason.SIGNATURE  # others cannot
     assert bench.tick().speed > 0.19
@@ -227,7 +227,7 @@ def test_an_arming_counts_once() -> None:
     assert bench.send(Role.ARM, payload) is Reason.NONCE
     assert bench.arm(armed=False) is None
     assert bench.send(Role.ARM, payload) is Reason.NONCE
-    assert bench.gate.state is State.DISARMED
+    assert bench.gate.state is GateMode.DISARMED
     assert Bench().status().nonce != Bench().status().nonce
 
 
@@ -235,7 +235,7 @@ def test_an_arming_counts_once() -> None:
 def test_a_session_has_a_plain_name(session: str) -> None:
     bench = Bench()
     assert bench.arm(session) is Reason.SESSION
-    assert bench.gate.state is State.DISARMED
+    assert bench.gate.state is GateMode.DISARMED
 
 
 def test_another_session_begins_from_a_stand_and_ends_the_first() -> None:
@@ -260,7 +260,7 @@ def test_disarming_needs_no_nonce() -> None:
     bench = armed()
     bench.drive(10)
     assert bench.arm("whatever", nonce="", armed=False) is None
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.DISARMED
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.DISARMED
     bench.session = "s1"
     assert bench.command() is Reason.NOT_ARMED
 
@@ -270,18 +270,18 @@ def test_a_stop_holds_until_the_next_arming() -> None:
     bench.drive(10)
     before = bench.status().nonce
     assert bench.stop() is None
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.STOPPED
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.STOPPED
     nonce = bench.status().nonce
     bench.stop(False)
     assert bench.command() is Reason.NOT_ARMED
     assert bench.arm(armed=False) is None
     assert bench.arm(nonce=before) is Reason.NONCE  # sent by one who could not know of the stop
     bench.stop()
-    assert bench.gate.state is State.STOPPED and bench.status().nonce == nonce
+    assert bench.gate.state is GateMode.STOPPED and bench.status().nonce == nonce
     bench.wait(10**10)
-    assert bench.gate.state is State.STOPPED
+    assert bench.gate.state is GateMode.STOPPED
     assert bench.arm() is None
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.ARMED
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.ARMED
     assert bench.drive(1).speed == pytest.approx(0.05, abs=1e-6)
 
 

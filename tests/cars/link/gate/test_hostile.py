@@ -6,7 +6,7 @@ import tracemalloc
 from collections import Counter
 from random import Random
 
-from coopenv.cars.gate.core import Reason, State
+from coopenv.cars.gate.core import GateMode, Reason
 from coopenv.cars.profile import NEUTRAL
 from tests.cars.link.gate.bench import OTHER, STATION, Bench
 from tests.cars.link.gate.hostile import messages_of_strangers
@@ -38,5 +38,5 @@ def test_no_bad_message_is_accepted_or_kept() -> None:
     assert (status.accepted, status.last_sequence) == (10, 10)
     assert grown < GROWTH
     # Not a number in a genuine command has closed it at the first; the station's next command goes on.
-    assert bench.tick() == NEUTRAL and bench.gate.state is State.TIMED_OUT
+    assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
     assert bench.drive(1).speed > 0.0
