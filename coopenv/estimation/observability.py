@@ -41,7 +41,7 @@ DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
 
 
-class Interval(NamedTuple):
+class ObservabilityInterval(NamedTuple):
     """A stretch [start, end] (s) of equal verdict."""
 
     start: float
@@ -49,7 +49,7 @@ class Interval(NamedTuple):
     observable: bool
 
 
-class Scene(Protocol):
+class RecordedGeometry(Protocol):
     """What of a record matters here; a `Trajectory` has it. Shapes and units as there."""
 
     @property
@@ -98,18 +98,21 @@ class Observability:
         """(M, N) bool: the verdict of each window."""
         return self.local_eigenvalue >= self.threshold
 
-    def intervals(self, vehicle: int) -> list[Interval]:
+    def intervals(self, vehicle: int) -> list[ObservabilityInterval]:
         """Return one vehicle's stretches of equal verdict in order; the last ends with its last window."""
         if not len(self.t):
             return []
         verdict = self.observable[:, vehicle]
         first = np.flatnonzero(np.diff(verdict, prepend=~verdict[0]))
         ends = [*self.t[first[1:]], self.t[-1] + self.window]
-        return [Interval(float(self.t[k]), float(end), bool(verdict[k])) for k, end in zip(first, ends, strict=True)]
+        return [
+            ObservabilityInterval(float(self.t[k]), float(end), bool(verdict[k]))
+            for k, end in zip(first, ends, strict=True)
+        ]
 
 
 def analyse_observability(
-    scene: Scene, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+    scene: RecordedGeometry, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
@@ -135,7 +138,7 @@ def analyse_observability(
     )
 
 
-def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 
     A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
@@ -151,7 +154,7 @@ def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.n
     return start, (total[end] - total[start]) / length, anchor
 
 
-def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
+def _information_rate(scene: RecordedGeometry, anchor: np.ndarray) -> np.ndarray:
     """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
     rate = np.empty((*scene.position.shape[:2], 6, 6))
     for i in range(scene.position.shape[1]):  # one by one: all pairs at once may be gigabytes
@@ -159,7 +162,7 @@ def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
     return rate
 
 
-def _information_of(scene: Scene, i: int, anchor: np.ndarray) -> np.ndarray:
+def _information_of(scene: RecordedGeometry, i: int, anchor: np.ndarray) -> np.ndarray:
     """Return C*^T C* (K, 6, 6) of one vehicle in map axes, about a point (3,)."""
     known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
     place = np.where(known[..., None], scene.target_position, 0.0)
@@ -199,7 +202,7 @@ WINDOW = 5.0
 """s, over which decay is measured."""
 
 
-class Rates(NamedTuple):
+class ConvergenceRates(NamedTuple):
     """Rates (K, N) in 1/s at every tick of a record; frozen ones are 0 where too little is seen."""
 
     t: Array  # (K,) s
@@ -208,8 +211,8 @@ class Rates(NamedTuple):
 
 
 def convergence_rates(
-    scene: Scene, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
-) -> Rates:
+    scene: RecordedGeometry, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
+) -> ConvergenceRates:
     """Return the rates of the paper's observer along a record.
 
     Args:
@@ -234,10 +237,10 @@ def convergence_rates(
         grown = np.linalg.solve(L, np.linalg.solve(L, drift).swapaxes(1, 2))  # L^-1 V L^-T
         guaranteed[n] = np.linalg.eigvalsh((gain - 0.5) * pulled + 0.5 * grown)[:, 0]
         frozen[n] = gain[:, 0, 0] * np.linalg.eigvalsh(pulled)[:, 0]
-    return Rates(scene.t, guaranteed, np.maximum(frozen, 0.0))
+    return ConvergenceRates(scene.t, guaranteed, np.maximum(frozen, 0.0))
 
 
-def weighted_information(scene: Scene, i: int, q: Array) -> Array:
+def weighted_information(scene: RecordedGeometry, i: int, q: Array) -> Array:
     """Return M = C*^T Q C* (K, 6, 6) of one vehicle in map axes, about the map's origin; q (T,) are the weights."""
     known = np.isfinite(scene.target_position).all(axis=-1)
     place = np.where(known[..., None], scene.target_position, 0.0)

@@ -11,7 +11,7 @@ import warp as wp
 from coopenv.api.arguments import outcome_words
 from coopenv.base.installation import version
 from coopenv.estimation.metrics import CONVERGED, observability_of, summarise
-from coopenv.estimation.observability import Observability, Rates, convergence_rates, least_mean
+from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
 from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.rollouts import Ending, Rollout
@@ -33,7 +33,7 @@ def vehicle_metrics(
     observability: Observability,
     endings: list[Ending],
     steady_from: float,
-    rates: Rates | None = None,
+    rates: ConvergenceRates | None = None,
 ) -> list[dict[str, Any]]:
     """Return one dict per vehicle: outcome, errors, rates, consistency and observability, units in the keys.
 
@@ -53,7 +53,7 @@ def vehicle_metrics(
     ]
 
 
-def theory_rates(run: Rollout, trajectory: Trajectory) -> Rates | None:
+def theory_rates(run: Rollout, trajectory: Trajectory) -> ConvergenceRates | None:
     """Return the rates of the paper's observer along the record of a run; None where another one runs."""
     if run.scenario.observer.name != "riccati":
         return None
@@ -62,7 +62,7 @@ def theory_rates(run: Rollout, trajectory: Trajectory) -> Rates | None:
     return convergence_rates(trajectory, [setup.gains.k for setup in setups], gains.q, gains.V, gains.P0)
 
 
-def rate_metrics(rates: Rates | None, vehicle: int, end: float) -> dict[str, Any]:
+def rate_metrics(rates: ConvergenceRates | None, vehicle: int, end: float) -> dict[str, Any]:
     """Return the guaranteed rate of one vehicle up to its end, s, the frozen one, and when they are least."""
     if rates is None:
         return dict.fromkeys(RATES, math.nan)
