@@ -1,16 +1,16 @@
 """The deployment file: which cars there are, how they are reached, and what they may do."""
 
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.limits import USUAL, Limits, Point, is_simple
-from coopenv.cars.profile import SVEA, CarProfile, Number, Positive, Pulses, Section, load_profile
+from coopenv.cars.profile import SVEA, CarProfile, Number, Positive, Pulses, load_profile
 from coopenv.cars.transport.endpoints import SECURE, address_of
 
 
@@ -363,14 +363,7 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
         DeploymentError: it cannot be read, or one line says which field is not what it must be.
     """
     path = Path(path)
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise DeploymentError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:
-        raise DeploymentError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise DeploymentError(f"{path}: lists or tables stand too deep in one another") from None
+    raw = read_toml(path, DeploymentError)
     network = raw.get("network", {})
     if connect is not None and isinstance(network, dict):
         raw["network"] = {**network, "connect": [connect]}
@@ -384,10 +377,5 @@ def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
             raw = {**raw, "profile": load_profile(given, path.parent)}
         except CoopenvError as error:
             raise DeploymentError(f"{path.name}: profile: {error}") from None
-    try:
-        made = Deployment.model_validate(raw)
-    except ValidationError as error:
-        from coopenv.scenario.base import one_line  # the gate of a car has no need of scenarios
-
-        raise DeploymentError(one_line(error, path.name, Deployment)) from None
+    made = validated(Deployment, raw, path.name, DeploymentError)
     return made.model_copy(update={"file": path})

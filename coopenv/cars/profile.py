@@ -3,16 +3,16 @@
 A profile is a TOML file; `coopenv/cars/profiles` holds those that are shipped. A deployment file names its profile.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.limits import Limits
 
 
@@ -71,12 +71,6 @@ NEUTRAL = Drive()
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 TopicPattern = Annotated[str, Field(max_length=256, pattern=r"^([A-Za-z0-9_/~]|\{car\}|\{body\})+$")]
-
-
-class Section(BaseModel):
-    """A section of a file; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class Topic(Section):
@@ -231,19 +225,7 @@ def load_profile(name: str, folder: Path = FOLDER) -> CarProfile:
         raise CoopenvError(
             f"unknown profile {shown(name)}{suggest(name, known)}; known: {listed(known)}, or a TOML file"
         )
-    try:
-        raw: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        return CarProfile.model_validate(raw)
-    except OSError as error:
-        raise CoopenvError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValidationError as error:
-        from coopenv.scenario.base import one_line  # the gate of a car has no need of scenarios
-
-        raise CoopenvError(one_line(error, path.name, CarProfile)) from None
-    except ValueError as error:
-        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise CoopenvError(f"{path}: lists or tables stand too deep in one another") from None
+    return validated(CarProfile, read_toml(path), path.name)
 
 
 SVEA = load_profile("svea")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coopenv.base import user_code
 from coopenv.base.errors import CoopenvError, suggest, told
 from coopenv.base.installation import data_directory, list_agents
+from coopenv.base.sections import one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ LATER_FIELDS = {"center", "settings"}
 """Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
 
 
-class Entry(BaseModel):
+class NetworkColumn(BaseModel):
     """A field of the observation or of the action that a network was trained with."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -61,8 +61,8 @@ class NetworkCard(BaseModel):
     """`layout_hash` of the three tables below."""
     clip: float
     """Normalised observations are clipped to it."""
-    observation: dict[str, Entry]
-    action: dict[str, Entry]
+    observation: dict[str, NetworkColumn]
+    action: dict[str, NetworkColumn]
     settings: dict[str, float]
     """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
 
@@ -133,20 +133,15 @@ def read_card(folder: Path) -> AgentCard:
         CoopenvError: the file is not valid.
     """
     path = folder / AGENT_FILE
-    raw: dict[str, Any] = {}
+    raw = read_toml(path)
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
         return AgentCard.model_validate(raw)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
         errors = error.errors(include_url=False)
         if all(each["type"] == "missing" and each["loc"][-1] in LATER_FIELDS for each in errors):
             renewal = _training_anew(folder, raw.get("training"))
             raise CoopenvError(f"{path}: saved by an earlier version of coopenv; train it anew: {renewal}") from None
-        raise CoopenvError(f"{path}: {'.'.join(map(str, errors[0]['loc']))}: {errors[0]['msg']}") from None
+        raise CoopenvError(one_line(error, str(path), AgentCard)) from None
 
 
 def _training_anew(folder: Path, training: Any) -> str:

@@ -13,27 +13,31 @@ from safetensors.numpy import load
 
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import CoopenvError
-from coopenv.policies.loader import Entry, NetworkCard
+from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
 """The `entry` of learned agents."""
 
 
-def layout_tables(layout: Layout) -> tuple[dict[str, Entry], dict[str, Entry]]:
+def layout_tables(layout: Layout) -> tuple[dict[str, NetworkColumn], dict[str, NetworkColumn]]:
     """Return what a network depends on: fields of the observation, and those of the action, by name in their order."""
     observation = {
-        name: Entry(start=f.start, stop=f.stop, low=f.low, high=1.0, scale=f.scale, center=f.center, unit=f.unit)
+        name: NetworkColumn(
+            start=f.start, stop=f.stop, low=f.low, high=1.0, scale=f.scale, center=f.center, unit=f.unit
+        )
         for name, f in layout.items()
     }
     action = {
-        f.name: Entry(start=i, stop=i + 1, low=f.low, high=f.high, scale=1.0, center=0.0, unit=f.unit)
+        f.name: NetworkColumn(start=i, stop=i + 1, low=f.low, high=f.high, scale=1.0, center=0.0, unit=f.unit)
         for i, f in enumerate(layout.action)
     }
     return observation, action
 
 
-def layout_hash(observation: Mapping[str, Entry], action: Mapping[str, Entry], settings: Mapping[str, float]) -> str:
+def layout_hash(
+    observation: Mapping[str, NetworkColumn], action: Mapping[str, NetworkColumn], settings: Mapping[str, float]
+) -> str:
     """Return the first 16 hexadecimal digits of SHA-256 over the three tables as JSON."""
     tables = [{name: entry.model_dump() for name, entry in table.items()} for table in (observation, action)]
     return sha256(json.dumps([*tables, dict(settings)]).encode()).hexdigest()[:16]
@@ -85,7 +89,7 @@ class Network:
         return actions
 
 
-def _compare(what: str, trained: Mapping[str, Entry], here: Mapping[str, Entry]) -> None:
+def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str, NetworkColumn]) -> None:
     """Name the first field that differs; where it stands does not matter, nor what else there is here."""
     for name, entry in trained.items():
         before = f"it was trained with another {what}: '{name}'"
@@ -104,7 +108,7 @@ def _compare_settings(trained: Mapping[str, float], here: Mapping[str, float]) -
             raise CoopenvError(f"it was trained with another {key}, {before!r}, and it is {now!r} here")
 
 
-def _check_order(trained: Mapping[str, Entry], here: Mapping[str, Entry]) -> None:
+def _check_order(trained: Mapping[str, NetworkColumn], here: Mapping[str, NetworkColumn]) -> None:
     if list(trained) != list(here):
         raise CoopenvError(f"it was trained with other actions: {', '.join(trained)} and not {', '.join(here)}")
 

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
+from coopenv.base.sections import Section
 from coopenv.scenario.base import (
     NonNegative,
     NonNegativeVector3,
     Number,
-    Part,
     Positive,
     PositiveVector2,
     PositiveVector3,
@@ -25,7 +25,7 @@ from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.sensing import Camera, Faults, Noise
 
 
-class Body(Part):
+class Body(Section):
     """An oriented box that occludes and collides."""
 
     size: PositiveVector3
@@ -34,7 +34,7 @@ class Body(Part):
     """Centre of the box in the body frame, m."""
 
 
-class Obstacle(Part):
+class Obstacle(Section):
     """A building: a box that stands still."""
 
     name: Word = Field(min_length=1, max_length=64)
@@ -46,7 +46,7 @@ class Obstacle(Part):
     """Rotation about z, rad."""
 
 
-class Road(Part):
+class Road(Section):
     """A straight strip drawn under the top view; it has no effect on the motion."""
 
     start: Vector2
@@ -56,13 +56,13 @@ class Road(Part):
     """Whether a dashed line marks its middle."""
 
 
-class StaticMotion(Part):
+class StaticMotion(Section):
     """Stands still."""
 
     kind: Literal["static"] = "static"
 
 
-class ConstantMotion(Part):
+class ConstantMotion(Section):
     """Keeps one body twist for ever."""
 
     kind: Literal["constant"] = "constant"
@@ -72,7 +72,7 @@ class ConstantMotion(Part):
     """Angular velocity in the body frame, rad/s."""
 
 
-class TwistSegment(Part):
+class TwistSegment(Section):
     """One body twist held for a while."""
 
     duration: Positive
@@ -83,7 +83,7 @@ class TwistSegment(Part):
     """Angular velocity in the body frame, rad/s."""
 
 
-class SegmentMotion(Part):
+class SegmentMotion(Section):
     """Drives a list of held body twists (straight lines and circular arcs), then stands still."""
 
     kind: Literal["segments"] = "segments"
@@ -93,7 +93,7 @@ class SegmentMotion(Part):
 FASTEST = 1e6  # m/s, on average from one waypoint to the next
 
 
-class Waypoint(Part):
+class Waypoint(Section):
     """A place to be at a time."""
 
     time: NonNegative
@@ -102,7 +102,7 @@ class Waypoint(Part):
     """In the coordinates of this file, m."""
 
 
-class WaypointMotion(Part):
+class WaypointMotion(Section):
     """Follows a monotone cubic (PCHIP) in time through waypoints, heading along the path, then stands still.
 
     Equal waypoints in a row mean waiting.
@@ -124,7 +124,7 @@ class WaypointMotion(Part):
         return self
 
 
-class DrivenMotion(Part):
+class DrivenMotion(Section):
     """Driven by the agent's actions through the kinematic bicycle of `[dynamics]`."""
 
     kind: Literal["driven"] = "driven"
@@ -134,7 +134,7 @@ class DrivenMotion(Part):
     """Half-width of a uniform deviation of it, m/s; what comes out is kept within what `[dynamics]` permits."""
 
 
-class TrafficMotion(Part):
+class TrafficMotion(Section):
     """Driven by the traffic of a backend that has one (`backend = "highway"`), not by actions."""
 
     kind: Literal["traffic"] = "traffic"
@@ -147,7 +147,7 @@ VehicleMotion = Annotated[
 ]
 
 
-class InitialPose(Part):
+class InitialPose(Section):
     """Where an agent starts, fixed or drawn anew at each reset; one with routes starts on that which it draws."""
 
     position: Vector3 | None = None
@@ -168,7 +168,7 @@ class InitialPose(Part):
         return self
 
 
-class InitialEstimate(Part):
+class InitialEstimate(Section):
     """What the observer believes at t = 0, fixed or drawn anew at each reset."""
 
     position: Vector3 | None = None
@@ -200,7 +200,7 @@ class InitialEstimate(Part):
         return self
 
 
-class Goal(Part):
+class Goal(Section):
     """Where a driven vehicle wants to go; one with routes to the end of that which it draws."""
 
     position: Vector3 | None = None
@@ -209,7 +209,7 @@ class Goal(Part):
     """The vehicle has arrived within this horizontal distance, m."""
 
 
-class Landmark(Part):
+class Landmark(Section):
     """A target whose position is known to everybody, static or moving."""
 
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
@@ -237,7 +237,7 @@ class Landmark(Part):
         return self.group is not None or any(self.position_spread) or self.presence < 1.0
 
 
-class Vehicle(Part):
+class Vehicle(Section):
     """A connected vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
 
     initial_pose: InitialPose | None = None
@@ -271,7 +271,7 @@ class Vehicle(Part):
         return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
 
     @field_serializer("camera", "noise", "dynamics", "faults")
-    def _given(self, part: Part | None) -> dict[str, Any] | None:
+    def _given(self, part: Section | None) -> dict[str, Any] | None:
         """Leave out what is the scenario's."""
         return None if part is None else part.model_dump(exclude_unset=True)
 
@@ -300,7 +300,7 @@ class Vehicle(Part):
             raise ValueError("goal.position: a vehicle with routes goes to the end of its route; leave this out")
 
 
-class Area(Part):
+class Area(Section):
     """A rectangle whose sides are parallel to the axes."""
 
     center: Vector2
@@ -309,7 +309,7 @@ class Area(Part):
     """Half of its sides along x and y, m."""
 
 
-class Line(Part):
+class Line(Section):
     """A straight line."""
 
     start: Vector2
@@ -317,7 +317,7 @@ class Line(Part):
     """In the coordinates of this file, m."""
 
 
-class LandmarkGroup(Part):
+class LandmarkGroup(Section):
     """Landmarks NAME_1, NAME_2, ..., each drawn uniformly over areas, or along lines, and over heights."""
 
     name: str = Field(min_length=1, max_length=56, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")

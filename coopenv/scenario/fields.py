@@ -4,7 +4,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from coopenv.scenario.base import Part, Positive, Text, Vector3, overlaid
+from coopenv.base.sections import Section
+from coopenv.scenario.base import Positive, Text, Vector3, overlaid
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.highway import Highway
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
@@ -12,14 +13,14 @@ from coopenv.scenario.routes import Route
 from coopenv.scenario.sensing import Camera, Faults, Noise, Observer, Rates, Topology, V2x
 
 
-class Map(Part):
+class Map(Section):
     """The frame in which vehicles know the landmarks."""
 
     origin: Vector3 = (0.0, 0.0, 0.0)
     """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
 
 
-class ScenarioFields(Part):
+class ScenarioFields(Section):
     """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
 
     title: Text

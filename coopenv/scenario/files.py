@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from coopenv.base.errors import ScenarioError, shown
 from coopenv.base.installation import is_scene, scenario_path
-from coopenv.scenario.base import TOO_DEEP, one_line
+from coopenv.base.sections import TOO_DEEP, read_toml, validated
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import scene_text
@@ -24,8 +23,6 @@ DEFAULTS_KEY = "vehicle_defaults"
 
 OVERRIDES = "overrides (--set)"
 """Where a field stands that an override has made wrong."""
-
-MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
 def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, Any] | None = None) -> Scenario:
@@ -46,7 +43,10 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
     made = is_scene(str(name_or_path))
     path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     try:
-        raw = tomllib.loads(scene_text(str(name_or_path))) if made else located(_read(path), path.parent)
+        if made:
+            raw = tomllib.loads(scene_text(str(name_or_path)))
+        else:
+            raw = located(read_toml(path, ScenarioError, path.name), path.parent)
         for key, value in (overrides or {}).items():
             override(raw, str(key), value)
         raw = located(raw, Path.cwd())  # those of overrides
@@ -55,7 +55,7 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
         raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
     except ScenarioError as error:
         of_file = f"{path.name}: "
-        if overrides and str(error).startswith(of_file) and _is_sound(name_or_path):
+        if overrides and str(error).startswith(of_file) and _is_valid(name_or_path):
             raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
         raise
 
@@ -70,7 +70,7 @@ def _changed(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
     return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
 
 
-def _is_sound(name_or_path: str | Path) -> bool:
+def _is_valid(name_or_path: str | Path) -> bool:
     """Return whether a file or scene by itself describes a world."""
     with warnings.catch_warnings(action="ignore"):
         try:
@@ -78,24 +78,6 @@ def _is_sound(name_or_path: str | Path) -> bool:
         except ScenarioError:
             return False
     return True
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Return the contents of a TOML file."""
-    try:
-        with path.open("rb") as stream:
-            text = stream.read(MOST_BYTES + 1)
-        if len(text) > MOST_BYTES:
-            raise ScenarioError(f"{path.name}: larger than {MOST_BYTES // 2**20} MiB")
-        return tomllib.loads(text.decode("utf-8-sig").replace("\r\n", "\n"))
-    except UnicodeDecodeError:
-        raise ScenarioError(f"{path}: not a text file, expected a scenario in TOML") from None
-    except OSError as error:
-        raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
-    except ScenarioError:
-        raise
-    except ValueError as error:  # of tomllib itself, or of numbers with thousands of digits
-        raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None
 
 
 def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
@@ -111,10 +93,7 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:
         raise ScenarioError(f"{where}: {TOO_DEEP}") from None
-    try:
-        return Scenario.model_validate_json(text, strict=True)
-    except ValidationError as error:
-        raise ScenarioError(one_line(error, where, Scenario)) from None
+    return validated(Scenario, text, where, ScenarioError)
 
 
 def _plain(value: Any) -> Any:

@@ -4,12 +4,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from coopenv.scenario.base import Number, Part, Word
+from coopenv.base.sections import Section
+from coopenv.scenario.base import Number, Word
 
 Setting = bool | int | Number | Word | tuple[Number, ...] | None
 
 
-class Highway(Part):
+class Highway(Section):
     """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]

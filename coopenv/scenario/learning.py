@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
 from coopenv.base.errors import listed, suggest
-from coopenv.scenario.base import NonNegative, Number, Part, Positive
+from coopenv.base.sections import Section
+from coopenv.scenario.base import NonNegative, Number, Positive
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -26,7 +27,7 @@ def _list_groups(schema: dict[str, Any]) -> None:
     schema["items"] = {"anyOf": [{"enum": list(GROUPS)}, {"type": "string"}]}
 
 
-class Observation(Part):
+class Observation(Section):
     """Contents and scales of the observation; every entry is (value - center) / scale, clipped to [-1, 1]."""
 
     include: tuple[str, ...] = Field(default=USUAL_GROUPS, min_length=1, json_schema_extra=_list_groups)
@@ -73,7 +74,7 @@ class Observation(Part):
         return self
 
 
-class Dynamics(Part):
+class Dynamics(Section):
     """Kinematic bicycle with its actuators; the defaults are a SVEA car's."""
 
     wheelbase: Positive = 0.324
@@ -107,7 +108,7 @@ class Dynamics(Part):
         return self
 
 
-class Pan(Part):
+class Pan(Section):
     """A camera that turns about its own centre and the body's z axis; the vehicle knows the angle."""
 
     limit: float = Field(gt=0.0, le=math.pi)
@@ -116,7 +117,7 @@ class Pan(Part):
     """Largest angular rate, rad/s."""
 
 
-class Action(Part):
+class Action(Section):
     """Meaning of the entries of an action in [-1, 1]; with `[action.pan]` there is a third one, the camera's angle."""
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
@@ -137,7 +138,7 @@ _built_in: dict[str, Any] = {
 }
 
 
-class RewardWeights(create_model("_BuiltInWeights", __base__=Part, **_built_in)):  # type: ignore[misc]
+class RewardWeights(create_model("_BuiltInWeights", __base__=Section, **_built_in)):  # type: ignore[misc]
     """Weights of the named terms of the reward, per decision step; the reward is their weighted sum.
 
     One number per name: coopenv's, and any that is registered or stands in `reward.custom`.
@@ -153,7 +154,7 @@ def _only_those_of_coopenv(names: Iterable[str], table: str = "") -> Any:
     return {"if": {"not": {"required": ["custom"]}}, "then": {"properties": {table: keys}} if table else keys}
 
 
-class Reward(Part):
+class Reward(Section):
     """The reward of one decision step."""
 
     model_config = ConfigDict(json_schema_extra=_only_those_of_coopenv(REWARD_TERMS.built_in, "weights"))
@@ -186,7 +187,7 @@ class Reward(Part):
         return self
 
 
-class Termination(Part):
+class Termination(Section):
     """What ends an agent's episode before the horizon: a switch for every condition, its own and those of coopenv."""
 
     model_config = ConfigDict(
@@ -262,7 +263,7 @@ def _two_factors(what: str, low: float, high: float) -> tuple[Any, Any]:
 _BOTH: dict[str, Any] = {name: _two_factors(*row) for name, row in PARAMETERS.items()}
 
 
-class _Factors(create_model("_Ranges", __base__=Part, **_BOTH)):  # type: ignore[misc]
+class _Factors(create_model("_Ranges", __base__=Section, **_BOTH)):  # type: ignore[misc]
     """Two factors of every parameter."""
 
     def factors(self, name: str) -> tuple[float, float]:

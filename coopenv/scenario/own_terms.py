@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from coopenv.base import user_code
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.scenario.base import one_line
+from coopenv.base.sections import one_line
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,

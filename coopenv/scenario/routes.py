@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario.base import NonNegative, Part, Vector2
+from coopenv.base.sections import Section
+from coopenv.scenario.base import NonNegative, Vector2
 from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, Vehicle, WaypointMotion
 
 SPACING = 0.25  # m between the points of a route that is not straight ...
@@ -19,7 +20,7 @@ MOST_POINTS = 64  # ... and how many there are at most
 STRAIGHT = 1e-6  # rad; a smaller turn at a waypoint is no corner
 
 
-class Route(Part):
+class Route(Section):
     """A way that vehicles are to go, of which every reset draws a variant."""
 
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")

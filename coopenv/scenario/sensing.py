@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from coopenv.base.errors import shown
+from coopenv.base.sections import Section
 from coopenv.scenario.base import (
     Loss,
     NonNegative,
     NonNegativeVector3,
     Number,
-    Part,
     Positive,
     PositiveVector2,
     Probability,
@@ -45,7 +45,7 @@ def _known_model(given: object) -> object:
     return given
 
 
-class Camera(Part):
+class Camera(Section):
     """The camera that every vehicle carries, unless it has its own; optical frame: x right, y down, z forward."""
 
     model: Annotated[Literal["pinhole", "omnidirectional"], BeforeValidator(_known_model)] = "omnidirectional"
@@ -92,7 +92,7 @@ class Camera(Part):
         return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
 
 
-class Rates(Part):
+class Rates(Section):
     """Rates in Hz; the sensors are asynchronous."""
 
     camera: Rate = 60.0
@@ -115,7 +115,7 @@ class Rates(Part):
         return self
 
 
-class BearingNoise(Part):
+class BearingNoise(Section):
     """Noise of a bearing."""
 
     model: Literal["paper", "isotropic"] = "isotropic"
@@ -135,7 +135,7 @@ class BearingNoise(Part):
         return self
 
 
-class Slip(Part):
+class Slip(Section):
     """Wheels that slip now and then, so that the odometry reads what the body does not do. Off unless `rate` is set."""
 
     rate: NonNegative = 0.0
@@ -149,7 +149,7 @@ class Slip(Part):
     rad."""
 
 
-class Noise(Part):
+class Noise(Section):
     """Measurement noise, and errors of the odometry that last."""
 
     enabled: bool = True
@@ -179,7 +179,7 @@ class Noise(Part):
         return any(np.any(error) for error in errors)
 
 
-class Topology(Part):
+class Topology(Section):
     """Who may measure and hear whom."""
 
     mode: Literal["fixed", "sensed"] = "fixed"
@@ -188,7 +188,7 @@ class Topology(Part):
     """Restrict to the directed acyclic leader-follower order of the paper's Assumption 1."""
 
 
-class V2x(Part):
+class V2x(Section):
     """The radio that carries pose estimates between vehicles."""
 
     delay: int = Field(default=0, ge=0, le=600)
@@ -203,7 +203,7 @@ class V2x(Part):
     """Messages older than this are not used, s (none: used for ever)."""
 
 
-class Observer(Part):
+class Observer(Section):
     """The estimator that every vehicle runs, and its gains."""
 
     name: str = Field(default="riccati", max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_.-]*$")
@@ -236,7 +236,7 @@ LONGEST_REPLAY = 60.0
 """s; so long a sender's messages are kept."""
 
 
-class Restart(Part):
+class Restart(Section):
     """A vehicle whose computer starts anew: its observer loses all, and begins again knowing nothing of its pose."""
 
     chance: Probability = 0.0
@@ -247,7 +247,7 @@ class Restart(Part):
     """So much later at most, drawn uniformly, s."""
 
 
-class Corruption(Part):
+class Corruption(Section):
     """Messages whose pose is altered on the way, so that they can still be read. What cannot is lost: `v2x.loss`."""
 
     probability: Probability = 0.0
@@ -260,7 +260,7 @@ class Corruption(Part):
     """Largest component of the rotation vector by which the orientation is turned, rad."""
 
 
-class Lie(Part):
+class Lie(Section):
     """A vehicle that broadcasts a pose other than its estimate."""
 
     kind: Literal["none", "jump", "drift", "replay", "collude"] = "none"
@@ -290,7 +290,7 @@ class Lie(Part):
         return self
 
 
-class Faults(Part):
+class Faults(Section):
     """What goes wrong with a vehicle's computer, clock and messages."""
 
     clock_offset: NonNegative = 0.0

@@ -12,7 +12,8 @@ from pydantic.json_schema import SkipJsonSchema
 
 from coopenv.base import user_code
 from coopenv.base.errors import CoopenvError, shown, suggest
-from coopenv.scenario.base import Number, Part, Positive, Text
+from coopenv.base.sections import Section
+from coopenv.scenario.base import Number, Positive, Text
 
 LOG_SCALE = 10.0
 """Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""
@@ -158,7 +159,7 @@ def _or_text(schema: dict[str, Any]) -> None:
     schema["anyOf"] = [{"type": "string", "description": row["properties"]["function"]["description"]}, row]
 
 
-class Row(Part):
+class Row(Section):
     """What every term says of itself; a text alone is its function."""
 
     model_config = ConfigDict(json_schema_extra=_or_text)

@@ -1,7 +1,6 @@
 """The settings of a training, read from a TOML file, and what exactly is to be trained."""
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,15 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, model_validator
 
 from coopenv.base.errors import CoopenvError, suggest
-from coopenv.scenario.base import NonNegative, Part, Positive, Probability, one_line
+from coopenv.base.sections import Section, read_toml, validated
+from coopenv.scenario.base import NonNegative, Positive, Probability
 
 SETTINGS_FILE = "train.toml"
 Count = Annotated[int, Field(gt=0, le=2**31)]
 Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
-class Ppo(Part):
+class Ppo(Section):
     """Proximal policy optimisation (Schulman et al. 2017) with parameters shared over vehicles."""
 
     vehicles: Count = 512
@@ -58,7 +58,7 @@ class Ppo(Part):
         return self
 
 
-class Clone(Part):
+class Clone(Section):
     """A start from the behaviour of another driver, whose actions and returns are learnt by regression first."""
 
     agent: str
@@ -73,7 +73,7 @@ class Clone(Part):
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
 
 
-class Evaluation(Part):
+class Evaluation(Section):
     """Judging the mean action on held-out maps."""
 
     every: Count = 250_000
@@ -84,7 +84,7 @@ class Evaluation(Part):
     """Held-out worlds of the last evaluation, for the results in `agent.toml`."""
 
 
-class Settings(Part):
+class Settings(Section):
     """Everything that decides how a training goes, but for environment and seed."""
 
     steps: Count | None = None
@@ -160,7 +160,7 @@ def read_settings(
     Raises:
         CoopenvError: no such file or arm, or it is not valid; one line that names file and field.
     """
-    where, raw = (str(path), _read(path)) if path is not None else ("settings", {})
+    where, raw = (str(path), read_toml(path)) if path is not None else ("settings", {})
     raw["scenario"] = _flat(raw.get("scenario", {}), where)
     environments = _tables(raw.pop("environments", {}), f"{where}: environments")
     arms = _tables(raw.pop("arms", {}), f"{where}: arms")
@@ -180,19 +180,7 @@ def read_settings(
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
-    try:
-        return Settings.model_validate_json(json.dumps(raw, default=str), strict=True)
-    except ValidationError as error:
-        raise CoopenvError(one_line(error, where, Settings)) from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
+    return validated(Settings, json.dumps(raw, default=str), where)
 
 
 def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:

@@ -17,8 +17,8 @@ import numpy as np
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.base.sections import TOO_DEEP
 from coopenv.scenario import parse_scenario
-from coopenv.scenario.base import TOO_DEEP
 from coopenv.scenario.files import apply_vehicle_defaults
 from coopenv.scenario.own_terms import located
 

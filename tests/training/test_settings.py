@@ -106,5 +106,5 @@ def test_missing_file_and_unknown_arm(path: Path) -> None:
     path.write_text(FILE.replace("arms.blind =", "arms.blnd ="))
     with pytest.raises(coopenv.CoopenvError, match=r"no arm 'blnd' \(did you mean 'blind'\?\)"):
         read_settings(path, environment="open_square")
-    with pytest.raises(coopenv.CoopenvError, match=r"nowhere\.toml: cannot be read: No such file"):
+    with pytest.raises(coopenv.CoopenvError, match=r"nowhere\.toml: cannot be read \(No such file"):
         read_settings(path.with_name("nowhere.toml"))

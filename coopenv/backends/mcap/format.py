@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
+from coopenv.base.sections import Section, validated
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.scenario.base import Number, Part, Vector3, one_line
+from coopenv.scenario.base import Number, Vector3
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
@@ -112,7 +113,7 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix6 = tuple[Vector6, Vector6, Vector6, Vector6, Vector6, Vector6]
 
 
-class NoiseHeader(Part):
+class NoiseHeader(Section):
     """A `SensorNoise`."""
 
     velocity: Number
@@ -131,7 +132,7 @@ class NoiseHeader(Part):
     clock_offset: Number = 0.0
 
 
-class GainsHeader(Part):
+class GainsHeader(Section):
     """The `Gains` of one vehicle."""
 
     k: Number
@@ -141,7 +142,7 @@ class GainsHeader(Part):
     max_turn: Number
 
 
-class SetupHeader(Part):
+class SetupHeader(Section):
     """The `Setup` of one vehicle."""
 
     vehicle: Index
@@ -156,7 +157,7 @@ class SetupHeader(Part):
     gains: GainsHeader
 
 
-class DrawnHeader(Part):
+class DrawnHeader(Section):
     """A `Drawn`."""
 
     key: int
@@ -164,7 +165,7 @@ class DrawnHeader(Part):
     parameters: tuple[Number, ...]
 
 
-class Header(Part):
+class Header(Section):
     """Everything of a `Recording` that does not change from tick to tick; `check_recording` knows what makes sense."""
 
     ticks: int = Field(ge=1)
@@ -183,10 +184,7 @@ class Header(Part):
     @classmethod
     def read(cls, text: bytes, where: str) -> Self:
         """Return a header from its JSON. Raises DataError: it is no header; `where` begins the line."""
-        try:
-            return cls.model_validate_json(text, strict=True)
-        except ValidationError as error:
-            raise DataError(one_line(error, where, cls)) from None
+        return validated(cls, text, where, DataError)
 
     def constants(self, where: str) -> dict[str, Any]:
         """Return the arguments of a `Recording` that the header gives; a ScenarioError if its scenario is none."""

@@ -1,22 +1,21 @@
 """Which agents a study trains: environments, arms of the settings, and seeds."""
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from coopenv.base.errors import CoopenvError, suggest
-from coopenv.scenario.base import Part, one_line
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.training.settings import Plan, Settings, read_settings
 
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
 
 
-class StudyFile(Part):
+class StudyFile(Section):
     """The contents of a study's TOML file."""
 
     settings: str
@@ -96,15 +95,7 @@ def read_study(path: Path) -> Study:
     Raises:
         CoopenvError: one of the files is not valid; one line that names file and field.
     """
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-        file = StudyFile.model_validate(raw)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
-    except OSError as error:
-        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except ValidationError as error:
-        raise CoopenvError(one_line(error, str(path), StudyFile)) from None
+    file = validated(StudyFile, read_toml(path), str(path))
     groups = [Group(environment, arm) for environment in file.environments for arm in file.arms]
     settings = {group: read_settings(path.parent / file.settings, group.arm, group.environment) for group in groups}
     return Study(settings, file.seeds)

@@ -1,18 +1,17 @@
 """The map of a bag: the environment of its cars, their topics, and the treatment of its clocks."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
+from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
-from coopenv.cars.profile import PREFIX, Number, Positive, Role, Section, load_profile
+from coopenv.cars.profile import PREFIX, Number, Positive, Role, load_profile
 from coopenv.cars.readings import READERS
-from coopenv.scenario.base import one_line
 
 READ = (
     *(Role.DETECTIONS, Role.BEARINGS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.ODOMETRY),
@@ -179,16 +178,7 @@ def load_map(path: str | Path) -> TopicMap:
         TopicMapError: it cannot be read, or one line says which field is not what it must be.
     """
     path = Path(path)
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise TopicMapError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except ValueError as error:
-        raise TopicMapError(f"{path}: not valid TOML: {error}") from None
-    try:
-        made = TopicMap.model_validate(raw)
-    except ValidationError as error:
-        raise TopicMapError(one_line(error, path.name, TopicMap)) from None
+    made = validated(TopicMap, read_toml(path, TopicMapError), path.name, TopicMapError)
     try:
         patterns_of(made.names, path.parent)
     except CoopenvError as error:

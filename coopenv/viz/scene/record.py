@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import ValidationError
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import jsonable
 from coopenv.base.npz import read_npz
+from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import Part, one_line
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 from coopenv.viz.scene.stage import FIELDS, WHOLE_FIELDS, Frame, Shown
@@ -23,7 +22,7 @@ SCENE_FILE = "scene.npz"
 _HEADER = "header"
 
 
-class Source(Part):
+class Source(Section):
     """What a scene is of, for its heading."""
 
     name: str
@@ -114,10 +113,8 @@ class SceneRecord:
         header = read_npz(path, "scene", {_HEADER: "u B"})[_HEADER]
         try:
             facts = json.loads(header.tobytes())
-            count, source = int(facts["frames"]), Source.model_validate(facts["source"])
+            count, source = int(facts["frames"]), validated(Source, facts["source"], str(path), DataError)
             scenario = parse_scenario(facts["scenario"], str(path))
-        except ValidationError as error:
-            raise DataError(one_line(error, str(path), Source)) from None
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, CoopenvError):
                 raise

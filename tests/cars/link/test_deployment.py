@@ -121,7 +121,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, case: str) -> None:
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     (tmp_path / "latin.toml").write_bytes(b'environment = "\xff"')
-    for name, why in (("none.toml", "No such file"), (".", "Is a directory"), ("latin.toml", "not valid TOML")):
+    for name, why in (("none.toml", "No such file"), (".", "Is a directory"), ("latin.toml", "not a text file")):
         with pytest.raises(DeploymentError, match=why) as caught:
             load_deployment(tmp_path / name)
         assert "\n" not in str(caught.value)

@@ -1,0 +1,149 @@
+"""TOML files in typed sections: reading and validation, each with an error of one line."""
+
+import tomllib
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from coopenv.base.errors import CoopenvError, shortened, shown, suggest
+
+MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
+
+
+class Section(BaseModel):
+    """A frozen section of a TOML file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_toml(path: Path, error: type[CoopenvError] = CoopenvError, where: str | None = None) -> dict[str, Any]:
+    """Return the contents of a TOML file.
+
+    Args:
+        path: of the file.
+        error: class of the error.
+        where: name of the file in the error (default: its path).
+
+    Raises:
+        CoopenvError: of class `error`; the file cannot be read, is too large, or is not valid TOML.
+    """
+    where = where or str(path)
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise error(f"{where}: larger than {MOST_BYTES // 2**20} MiB")
+        return tomllib.loads(content.decode("utf-8-sig").replace("\r\n", "\n"))
+    except OSError as problem:
+        raise error(f"{where}: cannot be read ({problem.strerror or problem})") from None
+    except UnicodeDecodeError:
+        raise error(f"{where}: not a text file, expected TOML") from None
+    except RecursionError:
+        raise error(f"{where}: {TOO_DEEP}") from None
+    except CoopenvError:
+        raise
+    except ValueError as problem:  # of tomllib itself, or of numbers with thousands of digits
+        raise error(f"{where}: not valid TOML: {problem}") from None
+
+
+def validated(model: type[Model], raw: Any, where: str, error: type[CoopenvError] = CoopenvError) -> Model:
+    """Return plain data as a model.
+
+    Args:
+        model: of the data.
+        raw: tables, lists and values; a text or bytes: JSON, which is validated strictly.
+        where: name of the origin in the error.
+        error: class of the error.
+
+    Raises:
+        CoopenvError: of class `error`; one line that names the field.
+    """
+    try:
+        if isinstance(raw, str | bytes):
+            return model.model_validate_json(raw, strict=True)
+        return model.model_validate(raw)
+    except ValidationError as problem:
+        raise error(one_line(problem, where, model)) from None
+
+
+TOO_DEEP = "lists or tables stand too deep in one another"
+
+
+def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
+    """Return the most helpful of the problems in one line, which begins with `where`; `model` knows the valid keys."""
+    details = error.errors(include_url=False)
+    # A misspelt key often also leaves a required one missing: the misspelling is what helps.
+    first = min(details, key=lambda d: d["type"] != "extra_forbidden")
+    # Pydantic puts its own tags of unions into the location; keys of the file are identifiers or stand last.
+    last = len(first["loc"]) - 1
+    unknown = first["type"] == "extra_forbidden"
+    keys = [
+        part
+        for i, part in enumerate(first["loc"])
+        if isinstance(part, int) or part.isidentifier() or (unknown and i == last)
+    ]
+    field = ".".join(shortened(str(part)) for part in keys)
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    if unknown:
+        valid = _valid_keys(first["loc"][:-1], model)
+        hint = suggest(str(keys[-1]), valid) or f"; allowed: {', '.join(valid)}"
+        return f"{where}: {field}: unknown key{hint}{more}"
+    if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
+        return f"{where}: {field}.{_kind_message(first)}{more}"
+    message = (
+        first["msg"].removeprefix("Value error, ").replace("valid tuple", "list").replace("Tuple should", "List should")
+    )
+    if first["type"] == "missing" and isinstance(keys[-1], int):
+        return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
+    if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
+        joint = "." if field and _starts_with_field(message) else ": "
+        return f"{where}: {field}{joint if field else ''}{message}{more}"
+    if first["type"] == "json_invalid":
+        return f"{where}: {TOO_DEEP if 'recursion' in message else message}"
+    got = first.get("input")
+    given = f", got {shown(got)}" if isinstance(got, bool | int | float | str) else ""
+    return f"{where}: {field}: {message}{given}{more}"
+
+
+def _kind_message(detail: Any) -> str:
+    """Say which kinds exist, for a table whose `kind` is missing, misspelt or unknown."""
+    context, given = detail.get("ctx", {}), detail.get("input")
+    if "expected_tags" not in context:
+        near = get_close_matches("kind", [str(k) for k in given], n=1) if isinstance(given, dict) else []
+        return f"{near[0]}: unknown key (did you mean 'kind'?)" if near else "kind: Field required"
+    kinds = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+    tag = shortened(str(context.get("tag", "")))
+    return f"kind: unknown kind '{tag}'{suggest(tag, kinds)}; known: {', '.join(kinds)}"
+
+
+def _starts_with_field(message: str) -> bool:
+    head, colon, _ = message.partition(":")
+    return bool(colon) and head.replace(".", "").isidentifier()
+
+
+def _valid_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
+    """Return the keys allowed at a location of a validation error, by walking the model's annotations."""
+    models: list[Any] = [model]
+    for part in location:
+        if isinstance(part, int):
+            continue
+        nested = [
+            inner
+            for model in models
+            if isinstance(part, str) and part in model.model_fields
+            for inner in _models_in(model.model_fields[part].annotation)
+        ]
+        tagged = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
+        models = nested or tagged or models
+    return sorted({name for model in models for name in model.model_fields})
+
+
+def _models_in(annotation: Any) -> list[Any]:
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
