@@ -17,6 +17,7 @@ PAGES = {
     "agents/README.md": "reference/agents/index.md",
     "docs": "index.md",
     "examples": "files/examples.md",
+    "examples/fleet": "files/examples.md",
 }
 """Pages of files (and folders) that do not stand under files/."""
 
