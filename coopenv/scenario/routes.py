@@ -8,7 +8,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.spatial.transform import Rotation
 
 from coopenv.base.sections import Section
 from coopenv.scenario.base import NonNegative, Vector2
@@ -189,6 +188,8 @@ def left_jacobian(w: np.ndarray) -> np.ndarray:
 
 def twist_table(start: np.ndarray, linear: np.ndarray, angular: np.ndarray) -> TwistTable:
     """Chain held twists; segment i lasts from start[i] to start[i + 1], the last for ever."""
+    from scipy.spatial.transform import Rotation  # here, as names are looked up without SciPy
+
     count = len(start)
     rotation = np.tile(np.eye(3), (count, 1, 1))
     position = np.zeros((count, 3))
@@ -249,6 +250,8 @@ def _sample_spline(motion: WaypointMotion, until: float) -> tuple[np.ndarray, np
 
 
 def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray, until: float) -> TwistTable:
+    from scipy.spatial.transform import Rotation  # here, as names are looked up without SciPy
+
     t, position, heading = _sample_spline(motion, until)
     angle = heading - heading[0] if motion.heading == "path" else np.zeros(len(t))
     rotation = Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])).as_matrix()
