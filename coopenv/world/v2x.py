@@ -123,7 +123,7 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 
 @wp.func
-def as_told(model: Any, state: Any, world: int, vehicle: int, R: Any, position: Any):
+def as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, position: Any):
     """Return the pose that a vehicle broadcasts at this tick in place of (R, position), in their precision."""
     told_R = R
     told = position
@@ -208,7 +208,7 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
         sent = tick
         R = state.estimate_rotation[world, vehicle]
-        told_R, told = as_told(model, state, world, vehicle, R, R * state.estimate_position[world, vehicle])
+        told_R, told = as_broadcast(model, state, world, vehicle, R, R * state.estimate_position[world, vehicle])
         state.outbox_rotation[world, vehicle, slot] = told_R
         state.outbox_position[world, vehicle, slot] = told
     state.outbox_tick[world, vehicle, slot] = sent

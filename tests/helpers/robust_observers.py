@@ -41,7 +41,7 @@ class Open(KernelObserver):
     @property
     def trusted(self) -> dict[int, bool]:
         """Whether the other members are trusted."""
-        return {int(m["vehicle"]): not m["distrusted"] for m in self.members[1:]}
+        return {int(m["vehicle"]): not m["excluded"] for m in self.members[1:]}
 
     @property
     def told(self) -> dict[int, set[int]]:
@@ -63,5 +63,5 @@ class OpenJoint(Open):
     @property
     def told(self) -> dict[int, set[int]]:
         """As for `Open`."""
-        contacts = zip(self.memory.contact, self.memory.contact_told["vehicle"], strict=True)
+        contacts = zip(self.memory.contact, self.memory.contact_broadcast["vehicle"], strict=True)
         return {int(c["sender"]): set(told[: c["count"]].tolist()) for c, told in contacts if c["sender"] >= 0}

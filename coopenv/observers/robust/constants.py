@@ -9,7 +9,7 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.1, 1.0, 12.0
+LINEARISATION_TIME, MEMBER_LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 1.0, 12.0
 """s for which what a bearing's linearisation leaves out is the same, so that all frames of that time count as one: to a
 landmark; to a member; and to one that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
@@ -44,10 +44,12 @@ MESSAGE_GATE = 40.0
 AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is trusted again. Chosen."""
 AGREEMENT_GATE = 16.8  # of the squared distance at which a distrusted sender agrees: chi-square of 6, 0.99
-MAX_REVISIONS = 2  # how often a sender that is not believed may be believed again because others explain less. Chosen
-MAX_OFFENCES = 7  # from which on a sender is not believed for a minute: 2^(n - 1) s. Chosen
+MAX_RETESTED_EXCLUSIONS = (
+    2  # how often a sender that is not believed may be believed again because others explain less. Chosen
+)
+MAX_EXCLUSIONS = 7  # from which on a sender is not believed for a minute: 2^(n - 1) s. Chosen
 SILENCE_TIME = 0.5  # s, after which a sender may be elsewhere: who is lost says nothing. Chosen
-ADMISSION = 0.5  # by how much of its variance a sender must know less than before to admit an error. Chosen
+RESET_GROWTH = 0.5  # by how much of its variance a sender must know less than before to admit an error. Chosen
 DRIFT_GATE, DRIFT_CLEAR = 28.0, 9.0
 """Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 4e-6; and below which a
 distrusted one is clear of it, 0.97."""
@@ -55,10 +57,10 @@ DRIFT_STD = 6.0  # of what it says of itself, by which a sender must have drifte
 DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0  # s over which a sender's place is held against its odometry. Chosen
 SLACK = 0.1  # share of the noise of its odometry by which a sender may be off in what it says of its errors. Tuned
 JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
-WORD_GATE = 60.0
+INNOVATION_SUM_GATE = 60.0
 """Gate of the squared size of a sender's error that innovations reveal. Tuned: honest senders pass."""
-EVIDENCE_SHARE = 0.5  # of a frame's information on that, because innovations are not quite white. Tuned
-LEAST_CERTAINTY = 0.01  # 1/m^2, at first
+INNOVATION_SUM_SHARE = 0.5  # of a frame's information on that, because innovations are not quite white. Tuned
+LEAST_INFORMATION = 0.01  # 1/m^2, at first
 ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen
 GROSS_ERROR, GROSS_TURN = 0.5, 0.1
 """m of which an error of a sender has spoilt linearisations, and rad of the own pose per metre of it. Tuned."""
@@ -69,15 +71,15 @@ HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
 """Share of contradicting bearings, and for how long, s, it must be lower for the pose to be an anchor. Chosen."""
 ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE = 0.05**2, 0.5**2
 """rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost. Chosen."""
-ALONE_TIME = 0.2  # s between corrections of what landmarks alone say. Chosen
-ALONE_NOISE = 4.0
+LANDMARK_ONLY_PERIOD = 0.2  # s between corrections of what landmarks alone say. Chosen
+LANDMARK_ONLY_NOISE = 4.0
 """Ratio of the variances of its bearings and odometry to those declared: with two landmarks in view, linearisations
 make a filter sure of what it cannot know. Tuned."""
 SEPARATION_GATE = 24.0  # of the squared distance of the belief from that: chi-square of 6, 0.9995
 DISPUTE_MARGIN = 6.0
 """By how much less bearings to the others must cost without a sender for it to be wrong, and not the one that bearings
 contradict: odds of exp(-3)."""
-REVISION_MARGIN = 12.0
+RETEST_MARGIN = 12.0
 """By how much less bearings must cost without another sender than without those that are not believed, for these to be
 believed again: odds of exp(-6). Tuned: at 6 some vehicles change their minds often, at 18 some take long."""
 ENOUGH_LANDMARKS = 2  # in view, for what they say alone to outweigh several senders. Chosen
@@ -92,7 +94,7 @@ DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 STEPS = 127  # of a correlation, as it is sent
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
-TOLD_TIME = 1.037
+CORRELATION_VALIDITY = 1.037
 """s between two reports of a vehicle for which what is told of one counts for the other: the correlation hardly changes
 within a second, and not to know it is worse. No multiple of usual frame periods. Chosen."""
 RETURNING_SHARE = 0.7
@@ -104,11 +106,11 @@ LEAST_NEWS = 0.1
 learnt in small steps it has learnt by linearisations, which add up. Tuned."""
 STEP_GATE = 22.5
 """Gate of the squared size of such a step in standard deviations: chi-square of 6, 0.999."""
-MAX_TOLD_ANGLE = 0.01
+MAX_SENDER_ANGLE = 0.01
 """rad, by how much a standard deviation of a sender's position may turn the line of sight to it for its steps to be
 followed: larger ones are no small errors. Tuned."""
 RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
-LEAST_FORGIVEN = 0.005
+MIN_INFLATION = 0.005
 """Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is
 not all there is, so that everybody is a little too sure, and who hears him more so. Tuned."""
 LEAST_LEFT = 0.003
@@ -117,7 +119,7 @@ MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
 MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; it is below 1.1 as a rule
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
-MAX_TOLD = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
+MAX_BROADCAST = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
 SUPERSEDING_TIME = 1.0  # s, for which a joint message stands for the messages of the vehicles that it holds. Chosen
 
 ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite

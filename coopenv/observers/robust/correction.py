@@ -7,7 +7,7 @@ import warp as wp
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
-from coopenv.observers.robust.measurements import across_line, linearise, project
+from coopenv.observers.robust.measurements import innovation_cross_covariance, linearise, project
 from coopenv.observers.robust.memory import Frame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function
 
@@ -32,18 +32,20 @@ def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
             memory.scratch[world, k].last_correction = correction
             memory.scratch[world, k].recentring = recentring(correction)
             memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
-    for n in range(frame.lines):
-        if memory.line[world, n].fits == 1:
+    for n in range(frame.bearings):
+        if memory.measurement[world, n].fits == 1:
             linearise(frame, memory, world, i, n)
-            member = memory.line[world, n].member
-            H = memory.line[world, n].jacobian
-            memory.line[world, n].jacobian = by_rows(H, memory.scratch[world, 0].recentring)
+            member = memory.measurement[world, n].member
+            H = memory.measurement[world, n].jacobian
+            memory.measurement[world, n].jacobian = by_rows(H, memory.scratch[world, 0].recentring)
             if member > 0 and is_free(memory, world, i, member):
-                H = memory.line[world, n].member_jacobian
-                memory.line[world, n].member_jacobian = by_rows(H, memory.scratch[world, member].recentring)
+                H = memory.measurement[world, n].member_jacobian
+                memory.measurement[world, n].member_jacobian = by_rows(H, memory.scratch[world, member].recentring)
             if frame.mounting > 0:
-                H = memory.line[world, n].mounting_jacobian
-                memory.line[world, n].mounting_jacobian = by_rows(H, memory.scratch[world, frame.mounting].recentring)
+                H = memory.measurement[world, n].mounting_jacobian
+                memory.measurement[world, n].mounting_jacobian = by_rows(
+                    H, memory.scratch[world, frame.mounting].recentring
+                )
 
 
 @device_function
@@ -51,12 +53,14 @@ def set_gain(memory: Any, world: int, i: int, n: int):
     """Let a line's `gain`, H P, be with the covariance that the lines before leave, and set its `weight` S^-1."""
     members = memory.belief[world, i].members
     for m in range(n):
-        if memory.line[world, m].fits == 1:
-            share = across_line(memory, world, n, m) * memory.line[world, m].weight
+        if memory.measurement[world, m].fits == 1:
+            share = innovation_cross_covariance(memory, world, n, m) * memory.measurement[world, m].weight
             for k in range(members):
                 memory.gain[world, n, k] = memory.gain[world, n, k] - share * memory.gain[world, m, k]
-    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
-    memory.line[world, n].weight = wp.inverse(S)
+    S = memory.measurement[world, n].noise * wp.identity(2, wp.float64) + innovation_cross_covariance(
+        memory, world, n, n
+    )
+    memory.measurement[world, n].weight = wp.inverse(S)
 
 
 @device_function
@@ -75,7 +79,7 @@ def error_left(memory: Any, world: int, k: int):
 
 
 @device_function
-def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool):
+def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool):
     """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
 
     One line after the other, with the residual that those before have left, is the batch update. `judging`: lines are
@@ -86,22 +90,26 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
     members = memory.belief[world, i].members
     for k in range(members):
         memory.scratch[world, k].correction = vec6d()
-    for n in range(lines):
-        if memory.line[world, n].fits == 1:
-            if not judging:
+    for n in range(bearings):
+        if memory.measurement[world, n].fits == 1:
+            if not gating:
                 project(memory, world, i, n)
             set_gain(memory, world, i, n)
-            member = memory.line[world, n].member
-            residual = memory.line[world, n].residual + memory.line[world, n].jacobian * error_left(memory, world, 0)
+            member = memory.measurement[world, n].member
+            residual = memory.measurement[world, n].residual + memory.measurement[world, n].jacobian * error_left(
+                memory, world, 0
+            )
             if member > 0:
-                residual = residual + memory.line[world, n].member_jacobian * error_left(memory, world, member)
-            mounting = memory.line[world, n].mounting
+                residual = residual + memory.measurement[world, n].member_jacobian * error_left(memory, world, member)
+            mounting = memory.measurement[world, n].mounting
             if mounting > 0:
-                residual = residual + memory.line[world, n].mounting_jacobian * error_left(memory, world, mounting)
-            weighted = memory.line[world, n].weight * residual
+                residual = residual + memory.measurement[world, n].mounting_jacobian * error_left(
+                    memory, world, mounting
+                )
+            weighted = memory.measurement[world, n].weight * residual
             nis = wp.dot(weighted, residual)
-            if judging and member > 0 and nis > wp.float64(BEARING_GATE):
-                memory.line[world, n].fits = 0
+            if gating and member > 0 and nis > wp.float64(BEARING_GATE):
+                memory.measurement[world, n].fits = 0
             else:
                 total += nis
                 for k in range(members):
@@ -112,26 +120,26 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
 
 
 @device_function
-def condense(memory: Any, world: int, i: int, lines: int):
+def condense(memory: Any, world: int, i: int, bearings: int):
     """Let the covariance be that after the lines that fit; that of errors that are only considered stays."""
     for k in range(memory.belief[world, i].members):
         for j in range(k + 1):
             if is_free(memory, world, i, k) or is_free(memory, world, i, j):
                 block = mat66d()
-                for n in range(lines):
-                    if memory.line[world, n].fits == 1:
-                        K = memory.line[world, n].weight * memory.gain[world, n, k]
+                for n in range(bearings):
+                    if memory.measurement[world, n].fits == 1:
+                        K = memory.measurement[world, n].weight * memory.gain[world, n, k]
                         block = block + transposed_by_rows(K, memory.gain[world, n, j])
                 subtract_block(memory, world, i, k, j, block)
 
 
 @device_function
-def nearest(memory: Any, world: int, lines: int):
+def nearest(memory: Any, world: int, bearings: int):
     """Return the distance of the nearest target whose line fits, m."""
     distance = wp.float64(wp.inf)
-    for n in range(lines):
-        if memory.line[world, n].fits == 1:
-            distance = wp.min(distance, memory.line[world, n].distance)
+    for n in range(bearings):
+        if memory.measurement[world, n].fits == 1:
+            distance = wp.min(distance, memory.measurement[world, n].distance)
     return distance
 
 
@@ -143,12 +151,12 @@ def turn_of_sight(error: Any, distance: Any):
 
 
 @device_function
-def next_share(memory: Any, world: int, i: int, lines: int, first: bool):
+def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
     """Return at which share of the correction to linearise next, 0 if that would be where it was done last.
 
     All of it where it turns a line of sight far, else half.
     """
-    distance = nearest(memory, world, lines)
+    distance = nearest(memory, world, bearings)
     turn = wp.float64(0.0)
     for k in range(memory.belief[world, i].members):
         if is_free(memory, world, i, k):
@@ -176,17 +184,17 @@ def iterated_update(frame: Frame, memory: Any, world: int, i: int):
     Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic
     Control 38(2), 1993.
     """
-    lines = frame.lines
+    bearings = frame.bearings
     store_poses(memory, world, i)
-    correct_by_lines(memory, world, i, lines, True)
-    share = next_share(memory, world, i, lines, True)
+    correct_by_bearings(memory, world, i, bearings, True)
+    share = next_share(memory, world, i, bearings, True)
     step = int(1)
     while share > wp.float64(0.0) and step < MAX_LINEARISATIONS:
         linearise_again(frame, memory, world, i, share)
-        correct_by_lines(memory, world, i, lines, False)
-        share = next_share(memory, world, i, lines, False)
+        correct_by_bearings(memory, world, i, bearings, False)
+        share = next_share(memory, world, i, bearings, False)
         step += 1
     for k in range(memory.belief[world, i].members):
         memory.member[world, i, k].pose = memory.scratch[world, k].pose
-    condense(memory, world, i, lines)
+    condense(memory, world, i, bearings)
     apply_corrections(memory, world, i)

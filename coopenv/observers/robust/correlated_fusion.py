@@ -18,11 +18,18 @@ from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
 from coopenv.observers.robust.constants import LEAST_CHANGE, SHARE_OF_CHANGE
-from coopenv.observers.robust.correlations import is_positive, place_of, rank, regress
-from coopenv.observers.robust.measurements import is_heard
+from coopenv.observers.robust.correlations import correlation_index, is_positive, rank, regress
+from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.propagation import lasting_noise
-from coopenv.observers.robust.sender_monitor import carry_evidence, drift_of, has_jumped, is_barred, judge, note_step
+from coopenv.observers.robust.sender_monitor import (
+    drift_of,
+    has_jumped,
+    is_excluded,
+    note_step,
+    propagate_information,
+    test_report,
+)
 from coopenv.observers.robust.tracklets import bit_of, depends_on_own, propagate_member
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
@@ -65,7 +72,7 @@ def set_row(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def place(model: Any, memory: Any, world: int, i: int, n: int):
+def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     """Put a member where its report says that it is, whatever was believed of it before."""
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
@@ -89,14 +96,14 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         memory.member[world, i, n].report = report
         memory.member[world, i, n].seen_tick = tick
         known = memory.belief[world, i].depends_on & bit_of(sender)
-        memory.member[world, i, n].untold = wp.where(known != wp.uint64(0), 1, 0)
-        place(model, memory, world, i, n)
+        memory.member[world, i, n].correlation_unknown = wp.where(known != wp.uint64(0), 1, 0)
+        set_to_report(model, memory, world, i, n)
         depends_on = report.depends_on | bit_of(sender)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
 @device_function
-def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
+def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     """Let the vehicle's own pose follow a step d, whose covariances with all errors are in `scratch.column`."""
     members = memory.belief[world, i].members
     others = memory.belief[world, i].others
@@ -114,7 +121,7 @@ def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
 
 
 @device_function
-def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool, lasting: Any):
+def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, lasting: Any):
     """Put a trusted member where its new report says that it is, and follow the step there if that tells anything.
 
     `lasting`, variances (rotation, translation) in rad^2 and m^2, is what errors of its odometry that last may have
@@ -147,14 +154,14 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
     for k in range(6):
         N[k, k] = N[k, k] + wp.float64(constants.LEAST_NEWS) * before[k, k]
     variance = algebra.position_variance(before)
-    reach = wp.float64(constants.MAX_TOLD_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
-    if following and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
+    reach = wp.float64(constants.MAX_SENDER_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
+    if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
         if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.STEP_GATE):
-            follow(memory, world, i, n, d, N)
+            apply_sender_increment(memory, world, i, n, d, N)
 
 
 @device_function
-def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
+def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
     """Take a member's new report."""
     sent = memory.inbox[world, i, sender].tick
     before = memory.member[world, i, n].report.tick
@@ -170,27 +177,27 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
     learnt = note_step(memory, world, i, sender, last, report, noise, lasting, dt)
-    if memory.member[world, i, n].distrusted == 0:  # else there is no evidence, and what it says may leap
-        carry_evidence(memory, world, i, sender, learnt, noise[1])
+    if memory.member[world, i, n].excluded == 0:  # else there is no evidence, and what it says may leap
+        propagate_information(memory, world, i, sender, learnt, noise[1])
     drift = drift_of(memory, world, i, n)
-    anew = judge(model, memory, world, i, n, tick, dt, drift, jumped)
-    if memory.member[world, i, n].distrusted == 1:
+    anew = test_report(model, memory, world, i, n, tick, dt, drift, jumped)
+    if memory.member[world, i, n].excluded == 1:
         memory.member[world, i, n].considered = 0
         return
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
     if anew:
-        place(model, memory, world, i, n)
+        set_to_report(model, memory, world, i, n)
     else:
-        telling = steady and lasting[0] <= white[0] and lasting[1] <= white[1]
-        telling = telling and not depends_on_own(memory, world, i, n)
-        step_to(model, memory, world, i, n, telling, lasting)
+        fusing = steady and lasting[0] <= white[0] and lasting[1] <= white[1]
+        fusing = fusing and not depends_on_own(memory, world, i, n)
+        fuse_increment(model, memory, world, i, n, fusing, lasting)
 
 
 @device_function
 def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
     """Return whether a report of member n that counts has been heard and not been taken."""
     sender = memory.member[world, i, n].vehicle
-    if not is_heard(model, state, memory, world, i, sender, tick):
+    if not is_received(model, state, memory, world, i, sender, tick):
         return False
     report = memory.inbox[world, i, sender].tick
     return memory.inbox[world, i, sender].news == 1 and report > memory.member[world, i, n].report.tick
@@ -209,11 +216,11 @@ def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int,
         if k != n:
             if is_pending(model, state, memory, world, i, k, tick):
                 other = memory.member[world, i, k].vehicle
-                c = place_of(memory, world, i, sender, other)
+                c = correlation_index(memory, world, i, sender, other)
                 if c >= 0:
                     if memory.correlation[world, i, sender, c].tick > memory.member[world, i, k].report.tick:
                         return True
-                c = place_of(memory, world, i, other, sender)
+                c = correlation_index(memory, world, i, other, sender)
                 if c >= 0:
                     if memory.correlation[world, i, other, c].tick == before:
                         return True
@@ -249,8 +256,8 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
         target = model.targets[i, n]
         sender = target - model.landmarks
         if sender >= 0 and state.sight[world, i, target] == VISIBLE:
-            if is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if index_of(memory, world, i, sender) == 0 and not is_barred(memory, world, i, sender, tick):
+            if is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
+                if index_of(memory, world, i, sender) == 0 and not is_excluded(memory, world, i, sender, tick):
                     at = rank(model, sender, memory.inbox[world, i, sender])
                     if at > last and (best < 0 or at < best):
                         best = at
@@ -258,14 +265,14 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
 
 
 @device_function
-def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Take the reports of members that count, and add senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)
     for _ in range(memory.belief[world, i].members):
         n = next_member(model, state, memory, world, i, tick)
         if n == 0:
             break
-        hear(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
+        fuse_report(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
     at = next_met(model, state, memory, world, i, -1, tick)
     for _ in range(model.target_count[i]):
         if at < 0:

@@ -49,7 +49,7 @@ def rank(model: Any, vehicle: int, report: Report) -> int:
 
 
 @device_function
-def next_told(model: Any, memory: Any, world: int, i: int, last: int) -> int:
+def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> int:
     """Return the considered member of the highest rank below that of member `last` (0: any), 0 if there is none."""
     found = int(0)
     best = int(-1)
@@ -95,30 +95,30 @@ def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether a report at a tick is the first of an interval of `NEWS_TIME`, and note that it is."""
     time = wp.float64(tick) * model.camera_period + wp.float64(constants.SAME_TIME)
     interval = int(wp.floor(time / wp.float64(constants.NEWS_TIME))) + 1
-    if interval == memory.belief[world, i].told_interval:
+    if interval == memory.belief[world, i].news_interval:
         return False
-    memory.belief[world, i].told_interval = interval
+    memory.belief[world, i].news_interval = interval
     return True
 
 
 @device_function
-def tell(model: Any, memory: Any, world: int, i: int, slot: int):
+def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: int):
     """Tell of correlations with the members that depend on most others."""
     memory.outbox[world, i, slot].news = 1
     n = int(0)
     for c in range(memory.correlation.shape[3]):
-        told = no_correlation()
+        broadcast = no_correlation()
         if c == 0 or n > 0:
-            n = next_told(model, memory, world, i, n)
+            n = next_broadcast(model, memory, world, i, n)
             if n > 0:
-                told.vehicle = memory.member[world, i, n].vehicle
-                told.tick = memory.member[world, i, n].report.tick
-                told.matrix = own_correlation(model, memory, world, i, n)
-        memory.outbox_correlation[world, i, slot, c] = told
+                broadcast.vehicle = memory.member[world, i, n].vehicle
+                broadcast.tick = memory.member[world, i, n].report.tick
+                broadcast.matrix = own_correlation(model, memory, world, i, n)
+        memory.outbox_correlation[world, i, slot, c] = broadcast
 
 
 @device_function
-def send_told(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due; the first of an interval counts, and tells of correlations."""
     send(model, state, memory, world, i, tick)
     if tick % model.radio.period == 0:
@@ -128,11 +128,11 @@ def send_told(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
         memory.outbox[world, i, slot].odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(odometry.p)))
         if memory.outbox[world, i, slot].valid == 1:
             if has_news(model, memory, world, i, tick):
-                tell(model, memory, world, i, slot)
+                broadcast_correlations(model, memory, world, i, slot)
 
 
 @device_function
-def clear_told(model: Any, memory: Any, world: int, i: int):
+def clear_broadcasts(model: Any, memory: Any, world: int, i: int):
     """Forget what was sent and received."""
     clear_messages(model, memory, world, i)
     for c in range(memory.correlation.shape[3]):
@@ -147,7 +147,7 @@ def clear_told(model: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
+def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
@@ -163,7 +163,7 @@ def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def place_of(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
+def correlation_index(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
     """Return where it is kept what a sender has told of a vehicle, -1 if it has told nothing."""
     for c in range(memory.correlation.shape[3]):
         if memory.correlation[world, i, sender, c].vehicle == vehicle:
@@ -180,7 +180,7 @@ def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
 @wp.func
 def is_near(model: Any, tick: int, other: int) -> bool:
     """Return whether what is told of a report of one tick counts for that of another."""
-    return wp.float64(wp.abs(tick - other)) * model.camera_period < wp.float64(constants.TOLD_TIME)
+    return wp.float64(wp.abs(tick - other)) * model.camera_period < wp.float64(constants.CORRELATION_VALIDITY)
 
 
 @device_function
@@ -193,11 +193,11 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     """
     sender = memory.member[world, i, n].vehicle
     other = memory.member[world, i, k].vehicle
-    c = place_of(memory, world, i, sender, other)
+    c = correlation_index(memory, world, i, sender, other)
     if c >= 0:
         near = is_near(model, memory.correlation[world, i, sender, c].tick, memory.member[world, i, k].report.tick)
         return near, True, matrix_of(memory, world, i, sender, c)
-    c = place_of(memory, world, i, other, sender)
+    c = correlation_index(memory, world, i, other, sender)
     if c >= 0:
         near = is_near(model, memory.correlation[world, i, other, c].tick, memory.member[world, i, n].report.tick)
         return met and near, True, wp.transpose(matrix_of(memory, world, i, other, c))
@@ -206,7 +206,7 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     for a in range(memory.correlation.shape[3]):
         third = memory.correlation[world, i, sender, a].vehicle
         if third >= 0:
-            b = place_of(memory, world, i, other, third)
+            b = correlation_index(memory, world, i, other, third)
             if b >= 0:
                 tick = memory.correlation[world, i, other, b].tick
                 if is_near(model, memory.correlation[world, i, sender, a].tick, tick):
@@ -229,30 +229,32 @@ def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
 
 
 @device_function
-def note_told(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool, count: int, told: bool):
+def note_correlations(
+    model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool, count: int, broadcast: bool
+):
     """Note what is told (else what is only likely) of member n's new error; return how much is noted then."""
     A = factor(after)
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if k != n and memory.member[world, i, k].considered == 1:  # else it does not stand where its report puts it
-            known, is_told, X = correlation_of(model, memory, world, i, n, k, not heard)
-            if known and is_told == told:
+            known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
+            if known and is_broadcast == broadcast:
                 note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
                 count += 1
     return count
 
 
 @device_function
-def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
+def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
     """Note all of member n's new error: that with its last one, what is told, what is likely.
 
     Return how much that is, and how much of it is not only likely.
     """
     count = int(0)
-    if heard:
+    if received:
         note_known(memory, world, 0, n, after)
         count = 1
-    sure = note_told(model, memory, world, i, n, after, heard, count, True)
-    return note_told(model, memory, world, i, n, after, heard, sure, False), sure
+    sure = note_correlations(model, memory, world, i, n, after, received, count, True)
+    return note_correlations(model, memory, world, i, n, after, received, sure, False), sure
 
 
 @wp.func
@@ -335,7 +337,7 @@ def excess(left: Any, after: Any):
 
 
 @device_function
-def least_forgiven(memory: Any, world: int, i: int, n: int):
+def dependence_inflation(memory: Any, world: int, i: int, n: int):
     """Return the share of its covariance that is added to member n's: a little if it depends on others.
 
     Where senders depend on this vehicle in turn, what they tell may be its own words, and all of them count once.
@@ -344,7 +346,7 @@ def least_forgiven(memory: Any, world: int, i: int, n: int):
     if depends_on == wp.uint64(0):
         return wp.float64(0.0)
     if not depends_on_own(memory, world, i, n):
-        return wp.float64(constants.LEAST_FORGIVEN)
+        return wp.float64(constants.MIN_INFLATION)
     count = wp.float64(0.0)
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if depends_on_own(memory, world, i, k):
@@ -364,13 +366,13 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
 
 
 @device_function
-def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
+def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return by how much more it has.
 
     That is added to the covariance that it states, `after`; both are 6x6, rad and m. Where what is only likely
     contradicts the rest, it does not count.
     """
-    count, sure = gather_known(model, memory, world, i, n, after, heard)
+    count, sure = gather_known(model, memory, world, i, n, after, received)
     more = mat66d()
     growth = wp.float64(0.0)
     if count > 0:
@@ -379,11 +381,11 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, hea
             if not is_positive(left - wp.float64(constants.LEAST_LEFT) * after):
                 count = sure
                 left = solve_for(memory, world, i, after, count)
-        larger = wp.float64(1.0) + least_forgiven(memory, world, i, n)  # what is forgiven is the same error
+        larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # what is forgiven is the same error
         more = larger * (after + excess(left, after)) - after
         growth = wp.sqrt(larger)
-    if count > wp.where(heard, 1, 0):
-        memory.member[world, i, n].untold = 0
+    if count > wp.where(received, 1, 0):
+        memory.member[world, i, n].correlation_unknown = 0
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, k].row = growth * regressed(memory, world, i, count, k)
     memory.scratch[world, n].row = after + more

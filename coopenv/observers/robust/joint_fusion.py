@@ -33,7 +33,7 @@ from coopenv.observers.robust.belief import (
     remove_member,
     subtract_block,
 )
-from coopenv.observers.robust.constants import MAX_TOLD, MAX_VARIANCE_GROWTH
+from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_VARIANCE_GROWTH
 from coopenv.observers.robust.joint_messages import (
     JOINT_SIZES,
     Contact,
@@ -43,7 +43,7 @@ from coopenv.observers.robust.joint_messages import (
     receive_joint,
     send_joint,
 )
-from coopenv.observers.robust.measurements import is_heard
+from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
 from coopenv.observers.robust.messages import JOINT_MESSAGES
 from coopenv.observers.robust.observer import OPTIONS, in_space, make_estimate, make_start
@@ -55,23 +55,23 @@ from coopenv.world.warp_internals import device_function
 
 
 @device_function
-def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int):
+def predict_message(model: Any, memory: Any, world: int, i: int, c: int, count: int):
     """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
     for a in range(count):
-        last = memory.contact_told[world, i, c, a]
-        step = between(last.odometry, memory.told[world, a].odometry)
+        last = memory.contact_broadcast[world, i, c, a]
+        step = between(last.odometry, memory.broadcast[world, a].odometry)
         memory.step[world, a] = moved(last.pose, step)
         F = transition(step)
         for b in range(count):
-            memory.matrix[world, BEFORE, a, b] = F * memory.contact_P[world, i, c, MAX_TOLD * a + b]
+            memory.matrix[world, BEFORE, a, b] = F * memory.contact_P[world, i, c, MAX_BROADCAST * a + b]
         memory.scratch[world, a].column = F
     for a in range(count):
         for b in range(count):
             Ft = wp.transpose(memory.scratch[world, b].column)
             memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
-        ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
+        ticks = wp.max(memory.broadcast[world, a].tick - memory.contact_broadcast[world, i, c, a].tick, 0)
         dt = wp.float64(ticks) * model.camera_period
-        step = between(memory.contact_told[world, i, c, a].odometry, memory.told[world, a].odometry)
+        step = between(memory.contact_broadcast[world, i, c, a].odometry, memory.broadcast[world, a].odometry)
         noise = increment_noise(model, memory, world, i, step, dt)
         block = memory.matrix[world, BEFORE, a, a]
         for k in range(6):
@@ -80,20 +80,20 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
 
 
 @device_function
-def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
+def propagate_to_message(model: Any, memory: Any, world: int, i: int, count: int):
     """Carry the members that a message tells of on to where it says that they were, unless they stand there already."""
     for a in range(count):
-        told = memory.told[world, a]
-        n = index_of(memory, world, i, told.vehicle)
+        broadcast = memory.broadcast[world, a]
+        n = index_of(memory, world, i, broadcast.vehicle)
         if n > 0:
             last = memory.member[world, i, n].report
-            if told.tick > last.tick:
-                dt = wp.float64(told.tick - last.tick) * model.camera_period
-                step = between(last.odometry, told.odometry)
+            if broadcast.tick > last.tick:
+                dt = wp.float64(broadcast.tick - last.tick) * model.camera_period
+                step = between(last.odometry, broadcast.odometry)
                 noise = increment_noise(model, memory, world, i, step, dt)
                 propagate_member(model, memory, world, i, n, step, dt, noise)
-                memory.member[world, i, n].report.tick = told.tick
-                memory.member[world, i, n].report.odometry = told.odometry
+                memory.member[world, i, n].report.tick = broadcast.tick
+                memory.member[world, i, n].report.odometry = broadcast.odometry
 
 
 @device_function
@@ -107,12 +107,14 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
             return False
     invert(memory, world, AFTER, INVERSE, count)
     for a in range(count):  # of the errors about `step`, as the rest
-        memory.scratch[world, a].recentring = recentring(left_error(memory.step[world, a], memory.told[world, a].pose))
+        memory.scratch[world, a].recentring = recentring(
+            left_error(memory.step[world, a], memory.broadcast[world, a].pose)
+        )
     recentre(memory, world, INVERSE, count)
     for a in range(count):
         vector = vec6d()
         for b in range(count):
-            news = left_error(memory.step[world, b], memory.told[world, b].pose)
+            news = left_error(memory.step[world, b], memory.broadcast[world, b].pose)
             vector += memory.matrix[world, INVERSE, a, b] * news
         memory.scratch[world, a].correction = vector
     invert(memory, world, BEFORE, AFTER, count)
@@ -125,13 +127,13 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     for a in range(count):
         vector = share * memory.scratch[world, a].correction
         for b in range(count):
-            n = index_of(memory, world, i, memory.told[world, b].vehicle)
+            n = index_of(memory, world, i, memory.broadcast[world, b].vehicle)
             offset = left_error(memory.step[world, b], memory.member[world, i, n].pose)
             vector = vector - memory.matrix[world, BEFORE, a, b] * offset
         memory.scratch[world, a].correction = vector
         size += wp.dot(vector, vector)
     for a in range(count):  # of the errors about the members, backwards, to second order
-        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
         G = recentring(-left_error(memory.step[world, a], memory.member[world, i, n].pose))
         memory.scratch[world, a].recentring = G
         memory.scratch[world, a].correction = wp.transpose(G) * memory.scratch[world, a].correction
@@ -147,11 +149,11 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
     """
     members = memory.belief[world, i].members
     for a in range(count):
-        m = index_of(memory, world, i, memory.told[world, a].vehicle)
+        m = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
         for k in range(members):
             memory.blocks[world, k, a] = memory.P[world, i, k, m]
     for a in range(count):
-        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
         for b in range(count):
             block = mat66d()
             for c in range(count):
@@ -181,10 +183,10 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
 
 
 @device_function
-def is_told(memory: Any, world: int, count: int, vehicle: int) -> bool:
+def is_in_message(memory: Any, world: int, count: int, vehicle: int) -> bool:
     """Return whether the message that has been read tells of a vehicle."""
     for n in range(count):
-        if memory.told[world, n].vehicle == vehicle:
+        if memory.broadcast[world, n].vehicle == vehicle:
             return True
     return False
 
@@ -195,11 +197,11 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
 
     Return False, with nothing changed, if that does not make room for all that the message tells of.
     """
-    own = wp.where(is_told(memory, world, count, i), 1, 0)
+    own = wp.where(is_in_message(memory, world, count, i), 1, 0)
     staying = int(0)
     unseen = int(0)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if not is_told(memory, world, count, memory.member[world, i, n].vehicle):
+        if not is_in_message(memory, world, count, memory.member[world, i, n].vehicle):
             staying += 1
             if is_unseen(model, memory, world, i, n, tick):
                 unseen += 1
@@ -207,7 +209,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
     if excess > unseen:
         return False
     for a in range(count):
-        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
         if n > 0:
             remove_member(memory, world, i, n)
     for _ in range(excess):
@@ -222,16 +224,16 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
         return
     depends_on = joint_messages.dependence(memory, world, i, sender)
     for a in range(count):
-        told = memory.told[world, a]
-        if told.vehicle != i:
+        broadcast = memory.broadcast[world, a]
+        if broadcast.vehicle != i:
             n = memory.belief[world, i].members
-            append_member(memory, world, i, told.vehicle, told.pose, memory.matrix[world, AFTER, a, a])
-            memory.member[world, i, n].report.tick = told.tick
-            memory.member[world, i, n].report.odometry = told.odometry
+            append_member(memory, world, i, broadcast.vehicle, broadcast.pose, memory.matrix[world, AFTER, a, a])
+            memory.member[world, i, n].report.tick = broadcast.tick
+            memory.member[world, i, n].report.odometry = broadcast.odometry
             memory.member[world, i, n].seen_tick = tick
-            depends_on = depends_on | bit_of(told.vehicle)
+            depends_on = depends_on | bit_of(broadcast.vehicle)
             for b in range(a):
-                m = index_of(memory, world, i, memory.told[world, b].vehicle)
+                m = index_of(memory, world, i, memory.broadcast[world, b].vehicle)
                 if m > 0:
                     block = memory.matrix[world, AFTER, a, b]
                     memory.P[world, i, n, m] = block
@@ -248,21 +250,21 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
 @device_function
 def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
     """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
-    ticks = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
-    if not is_due(model, memory.contact_told[world, i, c, 0].tick, memory.told[world, 0].tick):
+    ticks = memory.broadcast[world, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
+    if not is_due(model, memory.contact_broadcast[world, i, c, 0].tick, memory.broadcast[world, 0].tick):
         return
-    predict_told(model, memory, world, i, c, count)
+    predict_message(model, memory, world, i, c, count)
     joint_messages.store_contact(memory, world, i, c, sender, count)
-    propagate_told(model, memory, world, i, count)
+    propagate_to_message(model, memory, world, i, count)
     n = index_of(memory, world, i, sender)
-    told = memory.told[world, 0]
-    was_distrusted = memory.contact[world, i, c].distrusted
+    broadcast = memory.broadcast[world, 0]
+    was_excluded = memory.contact[world, i, c].excluded
     joint_messages.note_contacts(memory, world, i)
-    now = Estimate(told.pose, memory.matrix[world, AFTER, 0, 0])
+    now = Estimate(broadcast.pose, memory.matrix[world, AFTER, 0, 0])
     test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
-    memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
+    memory.contact[world, i, c].excluded = memory.member[world, i, n].excluded
     memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
-    if was_distrusted == 1 or memory.contact[world, i, c].distrusted == 1:
+    if was_excluded == 1 or memory.contact[world, i, c].excluded == 1:
         return
     depends_on = memory.contact[world, i, c].depends_on
     if news_of(memory, world, i, count, information_share(memory, world, i, depends_on)):
@@ -271,18 +273,18 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
 
 
 @device_function
-def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
+def vehicle_in_message(memory: Any, world: int, i: int, sender: int, n: int) -> int:
     """Return the n-th vehicle of which a received message tells, the sender first."""
     if n == 0:
         return sender
-    return memory.inbox_told[world, i, sender, n - 1].vehicle
+    return memory.inbox_broadcast[world, i, sender, n - 1].vehicle
 
 
 @device_function
-def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
+def includes_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
     """Return whether a received message tells of a vehicle in view."""
-    for n in range(joint_messages.others_told(memory, world, i, sender) + 1):
-        if state.sight[world, i, model.landmarks + told_vehicle(memory, world, i, sender, n)] == VISIBLE:
+    for n in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
+        if state.sight[world, i, model.landmarks + vehicle_in_message(memory, world, i, sender, n)] == VISIBLE:
             return True
     return False
 
@@ -296,9 +298,9 @@ def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
         if c >= 0:
             joint_messages.store_contact(memory, world, i, c, sender, count)
         return
-    if joint_messages.tells_of_the_same(memory, world, i, c, count):
+    if joint_messages.includes_the_same(memory, world, i, c, count):
         fuse_joint_message(model, memory, world, i, c, sender, count)
-    elif c >= 0 or tells_of_visible(model, state, memory, world, i, sender):
+    elif c >= 0 or includes_visible(model, state, memory, world, i, sender):
         add_joint_members(model, memory, world, i, sender, count, tick)
     c = joint_messages.contact_of(memory, world, i, sender)
     if c >= 0:
@@ -314,20 +316,20 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
         memory.contact[world, i, c].fused = 1
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
-        if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+        if sender >= 0 and is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
             c = joint_messages.contact_of(memory, world, i, sender)
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
-                if tells_of_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
-                    for k in range(joint_messages.others_told(memory, world, i, sender) + 1):
-                        m = index_of(memory, world, i, told_vehicle(memory, world, i, sender, k))
+                if includes_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
+                    for k in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
+                        m = index_of(memory, world, i, vehicle_in_message(memory, world, i, sender, k))
                         if m > 0:
                             memory.member[world, i, m].seen_tick = tick
-    for fewer in range(MAX_TOLD):
+    for fewer in range(MAX_BROADCAST):
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks
-            if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if joint_messages.others_told(memory, world, i, sender) == MAX_TOLD - 1 - fewer:
+            if sender >= 0 and is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
+                if joint_messages.others_in_message(memory, world, i, sender) == MAX_BROADCAST - 1 - fewer:
                     fuse_one(model, state, memory, world, i, sender, tick)
     joint_messages.forget_contacts(memory, world, i)
     joint_messages.note_contacts(memory, world, i)

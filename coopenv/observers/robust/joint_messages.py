@@ -9,7 +9,7 @@ import warp as wp
 
 from coopenv.observers.robust.algebra import AFTER, entry, factorise
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
+from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_MEMBERS_JOINT, SAME_TIME, SUPERSEDING_TIME
 from coopenv.observers.robust.memory import (
     LARGE,
     MOUNTING,
@@ -25,11 +25,11 @@ from coopenv.observers.robust.memory import (
 from coopenv.observers.robust.tracklets import (
     arrived,
     bit_of,
+    broadcast_report,
     clear_messages,
     marker_jacobian,
     own_report,
     receive,
-    told_report,
 )
 from coopenv.world.state import FLAG, ROTATION, TICK, Rule, array, extended, whole
 from coopenv.world.v2x import claimed_std, content_tick
@@ -37,7 +37,7 @@ from coopenv.world.warp_internals import device_function
 
 
 @wp.struct
-class Told:
+class BroadcastVehicle:
     """One of the vehicles that a joint message tells of."""
 
     vehicle: wp.int32
@@ -61,7 +61,7 @@ class Contact:
     sender: wp.int32  # -1: none
     count: wp.int32  # of vehicles that it tells of, the sender included
     depends_on: wp.uint64
-    distrusted: wp.int32
+    excluded: wp.int32
     agreement_time: wp.float64  # s for which a distrusted sender has agreed
     fused: wp.int32  # whether it is part of the belief at this tick
 
@@ -75,35 +75,35 @@ JointMemory = extended(
     Cholesky factor, row by row.
     """,
     outbox_joint=array("WNS", Joint),
-    outbox_told=array("WNSB", Told),
+    outbox_broadcast=array("WNSB", BroadcastVehicle),
     outbox_factor=array("WNSF", wp.float32),
     inbox_joint=array("WNN", Joint),
-    inbox_told=array("WNNB", Told),
+    inbox_broadcast=array("WNNB", BroadcastVehicle),
     inbox_factor=array("WNNF", wp.float32),
     contact=array("WNK", Contact),
-    contact_told=array("WNKT", Told),  # the sender first
+    contact_broadcast=array("WNKT", BroadcastVehicle),  # the sender first
     contact_P=array("WNKE", mat66d),  # blocks, row by row
-    told=array("WT", Told),  # scratch: of the message that is read
+    broadcast=array("WT", BroadcastVehicle),  # scratch: of the message that is read
     step=array("WT", Pose),  # scratch: the last report of each carried on by odometry
     matrix=array("WXTT", mat66d),  # scratch
     blocks=array("WKT", mat66d),  # scratch: columns of the covariance
 )
 
-DIMENSION = 6 * MAX_TOLD
+DIMENSION = 6 * MAX_BROADCAST
 JOINT_SIZES = {
     **SIZES,
     "K": MAX_MEMBERS_JOINT + MOUNTING,
-    "T": MAX_TOLD,
-    "B": MAX_TOLD - 1,
-    "E": MAX_TOLD**2,
+    "T": MAX_BROADCAST,
+    "B": MAX_BROADCAST - 1,
+    "E": MAX_BROADCAST**2,
     "F": DIMENSION * (DIMENSION + 1) // 2,
     "X": 3,
 }
 
 
-def _are_told(P: Any, fields: Any, model: Any) -> Any:
+def _are_in_message(P: Any, fields: Any, model: Any) -> Any:
     """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles that a contact tells of."""
-    return are_joint(P.reshape(*P.shape[:3], MAX_TOLD, MAX_TOLD, 6, 6), fields["observer_contact.count"])
+    return are_joint(P.reshape(*P.shape[:3], MAX_BROADCAST, MAX_BROADCAST, 6, 6), fields["observer_contact.count"])
 
 
 VEHICLE = Rule("a vehicle", lambda values, fields, model: (values >= 0) & (values < model.vehicles))
@@ -115,18 +115,18 @@ def joint_rules() -> dict[str, Rule]:
     rules = {
         **rules_for(JOINT_SIZES["K"]),
         "contact.sender": SENDER,
-        "contact.count": whole(0, MAX_TOLD),
-        "contact_P": Rule("a covariance", _are_told, axes=3),
-        **dict.fromkeys(("contact.distrusted", "contact.fused"), FLAG),
+        "contact.count": whole(0, MAX_BROADCAST),
+        "contact_P": Rule("a covariance", _are_in_message, axes=3),
+        **dict.fromkeys(("contact.excluded", "contact.fused"), FLAG),
         **dict.fromkeys(("matrix", "blocks"), LARGE),
     }
     counts = {"outbox": "outbox_joint.others", "inbox": "inbox_joint.others", "contact": "contact.count"}
     for box, count in counts.items():
-        rules |= where(count, {f"{box}_told.pose.R": ROTATION, f"{box}_told.odometry.R": ROTATION})
-        rules |= {f"{box}_told.vehicle": VEHICLE, f"{box}_told.tick": TICK}
+        rules |= where(count, {f"{box}_broadcast.pose.R": ROTATION, f"{box}_broadcast.odometry.R": ROTATION})
+        rules |= {f"{box}_broadcast.vehicle": VEHICLE, f"{box}_broadcast.tick": TICK}
         if box != "contact":
-            rules |= {f"{box}_joint.others": whole(0, MAX_TOLD - 1), f"{box}_joint.complete": FLAG}
-    return rules | {"told.vehicle": VEHICLE, "told.tick": TICK}
+            rules |= {f"{box}_joint.others": whole(0, MAX_BROADCAST - 1), f"{box}_joint.complete": FLAG}
+    return rules | {"broadcast.vehicle": VEHICLE, "broadcast.tick": TICK}
 
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
@@ -139,27 +139,27 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
     for c in range(memory.contact.shape[2]):
         memory.contact[world, i, c] = Contact()
         memory.contact[world, i, c].sender = -1
-        for n in range(MAX_TOLD):
-            memory.contact_told[world, i, c, n] = Told()
+        for n in range(MAX_BROADCAST):
+            memory.contact_broadcast[world, i, c, n] = BroadcastVehicle()
             memory.blocks[world, c, n] = mat66d()
         for e in range(memory.contact_P.shape[3]):
             memory.contact_P[world, i, c, e] = mat66d()
-    for n in range(MAX_TOLD):
-        memory.told[world, n] = Told()
+    for n in range(MAX_BROADCAST):
+        memory.broadcast[world, n] = BroadcastVehicle()
         memory.step[world, n] = Pose()
         for x in range(memory.matrix.shape[1]):
-            for k in range(MAX_TOLD):
+            for k in range(MAX_BROADCAST):
                 memory.matrix[world, x, n, k] = mat66d()
     for slot in range(model.radio.slots):
         memory.outbox_joint[world, i, slot] = Joint()
-        for n in range(MAX_TOLD - 1):
-            memory.outbox_told[world, i, slot, n] = Told()
+        for n in range(MAX_BROADCAST - 1):
+            memory.outbox_broadcast[world, i, slot, n] = BroadcastVehicle()
         for k in range(memory.outbox_factor.shape[3]):
             memory.outbox_factor[world, i, slot, k] = wp.float32(0.0)
     for sender in range(model.vehicles):
         memory.inbox_joint[world, i, sender] = Joint()
-        for n in range(MAX_TOLD - 1):
-            memory.inbox_told[world, i, sender, n] = Told()
+        for n in range(MAX_BROADCAST - 1):
+            memory.inbox_broadcast[world, i, sender, n] = BroadcastVehicle()
         for k in range(memory.inbox_factor.shape[3]):
             memory.inbox_factor[world, i, sender, k] = wp.float32(0.0)
 
@@ -170,12 +170,12 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if tick % model.radio.period != 0:
         return
     slot = tick % model.radio.slots
-    report = told_report(model, state, world, i, own_report(model, memory, world, i, tick))
+    report = broadcast_report(model, state, world, i, own_report(model, memory, world, i, tick))
     claimed = wp.float64(claimed_std(model, state, world, i, tick))
     joint = Joint()
     others = memory.belief[world, i].others
     members = memory.belief[world, i].members - others + 1  # without the odometry's errors
-    count = wp.min(members, MAX_TOLD)
+    count = wp.min(members, MAX_BROADCAST)
     if report.valid == 1:
         joint.others = count - 1
         joint.complete = wp.where(count == members, 1, 0)
@@ -195,8 +195,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
             joint = Joint()
     for n in range(joint.others):
         other = memory.member[world, i, others + n]
-        told = Told(other.vehicle, other.report.tick, other.pose, other.report.odometry)
-        memory.outbox_told[world, i, slot, n] = told
+        broadcast = BroadcastVehicle(other.vehicle, other.report.tick, other.pose, other.report.odometry)
+        memory.outbox_broadcast[world, i, slot, n] = broadcast
     if report.valid == 1:
         for k in range(6 * count):
             for j in range(k + 1):
@@ -219,8 +219,10 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
             joint = memory.outbox_joint[world, sender, slot]
             memory.inbox_joint[world, i, sender] = joint
             for k in range(joint.others):
-                memory.inbox_told[world, i, sender, k] = memory.outbox_told[world, sender, slot, k]
-                memory.inbox_told[world, i, sender, k].tick = memory.inbox_told[world, i, sender, k].tick + later
+                memory.inbox_broadcast[world, i, sender, k] = memory.outbox_broadcast[world, sender, slot, k]
+                memory.inbox_broadcast[world, i, sender, k].tick = (
+                    memory.inbox_broadcast[world, i, sender, k].tick + later
+                )
             size = 6 * (joint.others + 1)
             for k in range((size * (size + 1)) // 2):
                 memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
@@ -228,7 +230,7 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def others_told(memory: Any, world: int, i: int, sender: int) -> int:
+def others_in_message(memory: Any, world: int, i: int, sender: int) -> int:
     """Return of how many other vehicles a received message tells; of none where the sender depends on this vehicle."""
     if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
         return 0
@@ -249,10 +251,10 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
 def read_message(memory: Any, world: int, i: int, sender: int) -> int:
     """Write what a received message tells of to `told`, their covariance to AFTER; return how many they are."""
     report = memory.inbox[world, i, sender]
-    memory.told[world, 0] = Told(sender, report.tick, report.pose, report.odometry)
-    others = others_told(memory, world, i, sender)
+    memory.broadcast[world, 0] = BroadcastVehicle(sender, report.tick, report.pose, report.odometry)
+    others = others_in_message(memory, world, i, sender)
     for n in range(others):
-        memory.told[world, n + 1] = memory.inbox_told[world, i, sender, n]
+        memory.broadcast[world, n + 1] = memory.inbox_broadcast[world, i, sender, n]
     if (report.depends_on & bit_of(i)) != wp.uint64(0):
         memory.matrix[world, AFTER, 0, 0] = mat66d(report.P)
     else:
@@ -283,21 +285,21 @@ def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: i
     memory.contact[world, i, c].count = count
     memory.contact[world, i, c].depends_on = dependence(memory, world, i, sender)
     for n in range(count):
-        memory.contact_told[world, i, c, n] = memory.told[world, n]
+        memory.contact_broadcast[world, i, c, n] = memory.broadcast[world, n]
     for a in range(count):
         for b in range(count):
-            memory.contact_P[world, i, c, MAX_TOLD * a + b] = memory.matrix[world, AFTER, a, b]
+            memory.contact_P[world, i, c, MAX_BROADCAST * a + b] = memory.matrix[world, AFTER, a, b]
 
 
 @device_function
-def tells_of_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bool:
+def includes_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bool:
     """Return whether there is a contact whose last message tells of the same vehicles as the one that has been read."""
     if c < 0:
         return False
     if memory.contact[world, i, c].count != count:
         return False
     for n in range(count):
-        if memory.contact_told[world, i, c, n].vehicle != memory.told[world, n].vehicle:
+        if memory.contact_broadcast[world, i, c, n].vehicle != memory.broadcast[world, n].vehicle:
             return False
     return True
 
@@ -308,12 +310,12 @@ def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, coun
     for c in range(memory.contact.shape[2]):
         other = memory.contact[world, i, c].sender
         if other >= 0 and other != sender and memory.contact[world, i, c].fused == 1:
-            later = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
+            later = memory.broadcast[world, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
             recent = wp.float64(later) * model.camera_period <= wp.float64(MAX_AGE)
             more = memory.contact[world, i, c].count > count or other < sender
             if recent and more:
                 for n in range(memory.contact[world, i, c].count):
-                    if memory.contact_told[world, i, c, n].vehicle == sender:
+                    if memory.contact_broadcast[world, i, c, n].vehicle == sender:
                         return True
     return False
 
@@ -323,7 +325,7 @@ def forget_contacts(memory: Any, world: int, i: int):
     """Forget the senders that tell of vehicles which are no members; they may be met again."""
     for c in range(memory.contact.shape[2]):
         for n in range(memory.contact[world, i, c].count):
-            vehicle = memory.contact_told[world, i, c, n].vehicle
+            vehicle = memory.contact_broadcast[world, i, c, n].vehicle
             if vehicle != i and index_of(memory, world, i, vehicle) == 0:
                 memory.contact[world, i, c].sender = -1
 
@@ -333,9 +335,9 @@ def note_contacts(memory: Any, world: int, i: int):
     """Let the members show what their contacts say: whether they are trusted, and on whom they depend."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         c = contact_of(memory, world, i, memory.member[world, i, n].vehicle)
-        memory.member[world, i, n].distrusted = 0
+        memory.member[world, i, n].excluded = 0
         memory.member[world, i, n].report.depends_on = wp.uint64(0)
         if c >= 0:
-            memory.member[world, i, n].distrusted = memory.contact[world, i, c].distrusted
+            memory.member[world, i, n].excluded = memory.contact[world, i, c].excluded
             memory.member[world, i, n].agreement_time = memory.contact[world, i, c].agreement_time
             memory.member[world, i, n].report.depends_on = memory.contact[world, i, c].depends_on

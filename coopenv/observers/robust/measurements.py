@@ -12,18 +12,18 @@ from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import (
-    BEND_TIME,
-    CONSIDERED_BEND_TIME,
+    CONSIDERED_LINEARISATION_TIME,
     CORRELATION_FACTOR,
     CORRELATION_TIME,
+    LINEARISATION_TIME,
     MAX_ACCELERATION,
     MAX_SPEED,
-    MEMBER_BEND_TIME,
+    MEMBER_LINEARISATION_TIME,
     THIRD,
 )
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
-from coopenv.observers.robust.sender_monitor import is_barred
+from coopenv.observers.robust.sender_monitor import is_excluded
 from coopenv.observers.robust.tracklets import only_returns
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -57,19 +57,19 @@ def tangent_basis(b: Any):
 
 
 @device_function
-def set_line(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
+def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
     """Let the n-th bearing b be to a point in the body of a member, or (member 0) in the map.
 
     `variance` is that of the point per axis, m^2, besides the member's own.
     """
-    memory.line[world, n].member = member
-    memory.line[world, n].bearing = b
-    memory.line[world, n].point = point
-    memory.line[world, n].variance = variance
+    memory.measurement[world, n].member = member
+    memory.measurement[world, n].bearing = b
+    memory.measurement[world, n].point = point
+    memory.measurement[world, n].variance = variance
 
 
 @device_function
-def is_heard(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
+def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
     """Return whether there is a message of a sender that knows where it is."""
     return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
 
@@ -97,14 +97,14 @@ def frames_in(time: Any, period: Any):
 
 
 @device_function
-def set_line_to_member(
+def set_measurement_of_member(
     model: Any,
     memory: Any,
     world: int,
     i: int,
     n: int,
     member: int,
-    heard: bool,
+    received: bool,
     tick: int,
     b: Any,
     period: Any,
@@ -121,7 +121,7 @@ def set_line_to_member(
     gone = vec3d()
     turned = wp.identity(3, wp.float64)
     variance = wp.float64(0.0)
-    if heard and memory.inbox[world, i, sender].tick > stands:
+    if received and memory.inbox[world, i, sender].tick > stands:
         step = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, sender].odometry)
         gone = step.p
         turned = step.R
@@ -142,53 +142,57 @@ def set_line_to_member(
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
             averaged = frames_in(averaging_time(model, i), period)
             variance += memory.member[world, i, member].velocity_variance * age * age * averaged
-    set_line(memory, world, n, member, b, gone, variance)
+    set_bearing_measurement(memory, world, n, member, b, gone, variance)
     return True
 
 
 @device_function
-def set_line_to_target(
+def set_measurement_of_target(
     model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, period: Any, purpose: int
 ) -> bool:
     """Let the n-th line be the bearing to a target in view; return whether that can be used now."""
     b = vec3d(body_bearing(model, state, world, i, target))
     sender = target - model.landmarks
     if sender < 0:
-        set_line(memory, world, n, 0, b, vec3d(marker_position(model, state, world, target)), wp.float64(0.0))
+        set_bearing_measurement(
+            memory, world, n, 0, b, vec3d(marker_position(model, state, world, target)), wp.float64(0.0)
+        )
         return True
-    heard = is_heard(model, state, memory, world, i, sender, tick)
+    received = is_received(model, state, memory, world, i, sender, tick)
     if purpose == SEARCH:
-        heard = heard and not is_barred(memory, world, i, sender, tick)
-        if heard:
+        received = received and not is_excluded(memory, world, i, sender, tick)
+        if received:
             variance = received_variance(model, memory, world, i, sender, tick, period)
-            set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
-        return heard
+            set_bearing_measurement(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
+        return received
     member = index_of(memory, world, i, sender)
     if member > 0 and not (purpose == TRACKING and only_returns(memory, world, i, member)):
-        return set_line_to_member(model, memory, world, i, n, member, heard, tick, b, period, purpose)
+        return set_measurement_of_member(model, memory, world, i, n, member, received, tick, b, period, purpose)
     return False
 
 
 @device_function
-def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int):
+def set_bearing_measurements(
+    model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int
+):
     """Set the lines of sight of the bearings to landmarks and vehicles that can be used, and return their frame.
 
     In a search vehicles are where they say that they are, otherwise where they are believed to be. `period` is the time
     since the last frame, s.
     """
-    lines = int(0)
+    bearings = int(0)
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         if state.sight[world, i, target] == VISIBLE:
-            if set_line_to_target(model, state, memory, world, i, lines, target, tick, period, purpose):
-                lines += 1
+            if set_measurement_of_target(model, state, memory, world, i, bearings, target, tick, period, purpose):
+                bearings += 1
     mounting = int(0)
     variance = bearing_variance(model, i)
     if purpose == TRACKING:
         mounting = mounting_of(memory, world, i)
     else:
         variance += mounting_variances(model, i)[0]
-    return Frame(lines, mounting, vec3d(model.camera[i].position), variance, period)
+    return Frame(bearings, mounting, vec3d(model.camera[i].position), variance, period)
 
 
 @device_function
@@ -199,7 +203,7 @@ def time_between(model: Any, state: Any, world: int, i: int, now: Any):
 
 
 @device_function
-def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
+def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
     """Return the variance of what a bearing's linearisation leaves out, rad^2.
 
     With relative position uncertain by s along the line of sight u and by t across, its direction is t / (d + s), and
@@ -209,11 +213,11 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     along = wp.dot(u, V * u)
     total = wp.trace(V)
-    time = wp.float64(BEND_TIME)
+    time = wp.float64(LINEARISATION_TIME)
     if member > 0:
-        time = wp.float64(MEMBER_BEND_TIME)
+        time = wp.float64(MEMBER_LINEARISATION_TIME)
         if memory.member[world, i, member].considered == 1:
-            time = wp.float64(CONSIDERED_BEND_TIME)
+            time = wp.float64(CONSIDERED_LINEARISATION_TIME)
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)
         C = block3(memory.P[world, i, 0, member], 3, 3)
@@ -229,9 +233,9 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
 @device_function
 def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
-    member = memory.line[world, n].member
-    point = memory.line[world, n].point
-    bearing = memory.line[world, n].bearing
+    member = memory.measurement[world, n].member
+    point = memory.measurement[world, n].point
+    bearing = memory.measurement[world, n].bearing
     own = memory.member[world, i, 0].pose
     z = point
     turn = wp.identity(3, wp.float64)
@@ -253,59 +257,61 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
     H = mat26d()
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
-    memory.line[world, n].jacobian = H
+    memory.measurement[world, n].jacobian = H
     if member > 0:
         G = B * turn
         H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
-        memory.line[world, n].member_jacobian = H
-    memory.line[world, n].mounting = frame.mounting
+        memory.measurement[world, n].member_jacobian = H
+    memory.measurement[world, n].mounting = frame.mounting
     if frame.mounting > 0:
         turned = memory.member[world, i, frame.mounting].pose.R
-        H[:, :3] = T * turned * skew(memory.line[world, n].bearing)
+        H[:, :3] = T * turned * skew(memory.measurement[world, n].bearing)
         H[:, 3:] = -(B * turned)
-        memory.line[world, n].mounting_jacobian = H
-    memory.line[world, n].residual = T * bearing
-    memory.line[world, n].distance = distance
-    bend = bend_variance(memory, world, i, member, turn, u, distance, frame.period)
-    memory.line[world, n].noise = frame.variance + memory.line[world, n].variance * inverse * inverse + bend
+        memory.measurement[world, n].mounting_jacobian = H
+    memory.measurement[world, n].residual = T * bearing
+    memory.measurement[world, n].distance = distance
+    remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
+    memory.measurement[world, n].noise = (
+        frame.variance + memory.measurement[world, n].variance * inverse * inverse + remainder
+    )
     return wp.dot(u, bearing) > wp.float64(0.0)
 
 
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
     """Set a line's `gain` to H P."""
-    H = memory.line[world, n].jacobian
-    member = memory.line[world, n].member
-    mounting = memory.line[world, n].mounting
+    H = memory.measurement[world, n].jacobian
+    member = memory.measurement[world, n].member
+    mounting = memory.measurement[world, n].mounting
     for k in range(memory.belief[world, i].members):
         rows = by_rows(H, memory.P[world, i, 0, k])
         if member > 0:
-            rows = rows + by_rows(memory.line[world, n].member_jacobian, memory.P[world, i, member, k])
+            rows = rows + by_rows(memory.measurement[world, n].member_jacobian, memory.P[world, i, member, k])
         if mounting > 0:
-            rows = rows + by_rows(memory.line[world, n].mounting_jacobian, memory.P[world, i, mounting, k])
+            rows = rows + by_rows(memory.measurement[world, n].mounting_jacobian, memory.P[world, i, mounting, k])
         memory.gain[world, n, k] = rows
 
 
 @device_function
-def across_line(memory: Any, world: int, n: int, m: int):
+def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
     """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
-    S = memory.line[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
-    member = memory.line[world, n].member
+    S = memory.measurement[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
+    member = memory.measurement[world, n].member
     if member > 0:
-        S = S + memory.line[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
-    mounting = memory.line[world, n].mounting
+        S = S + memory.measurement[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
+    mounting = memory.measurement[world, n].mounting
     if mounting > 0:
-        S = S + memory.line[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
+        S = S + memory.measurement[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
     return S
 
 
 @device_function
 def innovation_with(memory: Any, world: int, n: int, more: Any):
     """Return the normalised innovation squared of a line that has its `gain`, with more noise per axis, rad^2."""
-    residual = memory.line[world, n].residual
-    noise = memory.line[world, n].noise + more
-    S = noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
+    residual = memory.measurement[world, n].residual
+    noise = memory.measurement[world, n].noise + more
+    S = noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, n, n)
     return wp.dot(residual, wp.inverse(S) * residual)
 
 

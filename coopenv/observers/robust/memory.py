@@ -1,7 +1,7 @@
-"""What every vehicle's observer remembers: small records, and one record of arrays of them.
+"""The state of every vehicle's observer: small records, one record of arrays of them, and rules for saved states.
 
 Covariances are of left errors (theta, rho), rad and m; positions are in the map frame. Numbers are float64 in worlds of
-any precision, because what a neighbour has learnt is a small difference of large inverses.
+any precision, because the new information in a message is a small difference of large inverses.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import warp as wp
 
 from coopenv.base.format import LARGEST
 from coopenv.estimation.validity import are_covariances
-from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, MAX_OFFENCES, STEPS
+from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_EXCLUSIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
 from coopenv.world.state import (
     COVARIANCE,
     FLAG,
@@ -54,15 +54,15 @@ class Estimate:
 
 @wp.struct
 class Report:
-    """A message: where its sender is, what the sender's odometry says, and from whom it has heard."""
+    """A message: pose of the sender, its dead reckoning, and the vehicles whose messages it has fused."""
 
     tick: wp.int32  # when it was sent; -1: never
-    valid: wp.int32  # 0: empty, the sender does not know where it is
+    valid: wp.int32  # 0: empty, the sender is searching for its pose
     pose: Pose  # of the marker
     P: mat66f  # at the marker
     odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
     depends_on: wp.uint64  # bits of the vehicles whose messages are in it
-    news: wp.int32  # whether it tells of correlations, and counts
+    news: wp.int32  # whether it carries correlations and is fused
 
 
 @wp.struct
@@ -74,42 +74,42 @@ class Member:
     has_twist: wp.int32
     v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
-    dated_v: vec3d  # m/s, body: by which clocks that are off count, see correlated_fusion.py
+    dated_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: Report  # its last one, at which it stands
-    distrusted: wp.int32
-    agreement_time: wp.float64  # s for which a distrusted sender has agreed
-    considered: wp.int32  # whether it stands as it says, and bearings do not correct it
-    untold: wp.int32  # whether it had been heard before it was met, and nobody has told how its error correlates
+    excluded: wp.int32
+    agreement_time: wp.float64  # s for which an excluded sender has agreed
+    considered: wp.int32  # whether its pose is the reported one, which bearings do not correct
+    correlation_unknown: wp.int32  # whether it is an earlier source of information whose correlation is not known
 
 
 @wp.struct
 class Drift:
-    """A sum of steps, which forgets, see sender_monitor.py."""
+    """A cumulative sum of steps with exponential forgetting, see sender_monitor.py."""
 
     sum: vec3d  # m
     covariance: mat33d  # m^2
 
 
 @wp.struct
-class Word:
-    """What a vehicle makes of what another one says of its place, see sender_monitor.py; along the axes of the map."""
+class SenderMonitor:
+    """Fault tests of one sender, see sender_monitor.py; along the axes of the map."""
 
-    offset: vec3d  # 1/m: information on how far it is from where it says
-    certainty: mat33d  # 1/m^2: the matrix of that information
-    drift: Drift  # of where it says to be from where its odometry has led
+    information_vector: vec3d  # 1/m: on the error of its position
+    information_matrix: mat33d  # 1/m^2: on that error
+    drift: Drift  # of its position from its odometry
     slow_drift: Drift  # the same over a longer time
-    missed_share: wp.float64  # mean share of bearings to it that do not fit
-    fitted_time: wp.float64  # s for which they have
-    perjured: wp.int32  # whether it was believed no more because it had contradicted itself
-    offences: wp.int32  # how often it has not been believed
-    barred_until: wp.int32  # the tick from which on it may be believed again
+    rejected_share: wp.float64  # mean share of bearings to it that fail the gate
+    fitted_time: wp.float64  # s for which bearings to it have passed the gate
+    self_inconsistent: wp.int32  # whether it was excluded because its reports contradict its odometry
+    exclusions: wp.int32  # how many so far
+    excluded_until: wp.int32  # the first tick at which it may be readmitted
 
 
 @wp.struct
 class Belief:
-    """What a vehicle believes, but for the members' poses and covariance."""
+    """The joint state of a vehicle's estimator, without the members' poses and covariance."""
 
     odometry: Pose  # by dead reckoning, in a frame of its own
     has_sample: wp.int32  # whether there has been a tick
@@ -119,17 +119,17 @@ class Belief:
     members: wp.int32  # how many
     others: wp.int32  # the first of them that is another vehicle; before it the odometry's errors and the mounting
     depends_on: wp.uint64  # bits of vehicles
-    missed_share: wp.float64  # mean share of bearings that do not fit
+    rejected_share: wp.float64  # mean share of bearings that fail the gate
     healthy_time: wp.float64  # s for which it has been low
-    accused: wp.int32  # the member that this frame's bearings contradict, 0: none
-    accused_error: wp.float64  # m, by which it is off
-    accused_followed: wp.int32  # whether the own pose has followed that error
-    told_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
+    suspect: wp.int32  # the member that this frame's bearings contradict, 0: none
+    suspect_error: wp.float64  # m, of its position
+    suspect_fused: wp.int32  # whether the own pose has fused that error
+    news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
 
 
 @wp.struct
 class Anchor:
-    """Where a vehicle was when its bearings last fitted, or at the start."""
+    """The pose at which the bearings last fitted, or the initial one: the prior of a search."""
 
     estimate: Estimate
     odometry: Pose  # then
@@ -143,8 +143,8 @@ class Search:
     active: wp.int32
     prior: Estimate  # carried on by odometry
     hypotheses: wp.int32  # how many
-    followed_time: wp.float64  # s for which hypotheses have been followed
-    least_time: wp.float64  # s for which they have to be before one is believed
+    tracked_time: wp.float64  # s for which hypotheses have been tracked
+    least_time: wp.float64  # s for which they have to be tracked before one is accepted
     waited_time: wp.float64  # s for which there were none
     clear_time: wp.float64  # s for which the frames' solutions have been well determined; below 0: s to the next look
     attempts: wp.int32
@@ -152,19 +152,19 @@ class Search:
 
 @wp.struct
 class Hypothesis:
-    """A pose that may be the vehicle's."""
+    """A candidate for the vehicle's pose, with a filter of its own."""
 
     estimate: Estimate
     cost: wp.float64  # sum of normalised innovations squared, each limited, by the noise common to all hypotheses
     prior_distance: wp.float64  # squared, in standard deviations
-    misfit: wp.float64  # sum of what bearings cost by its own noise, less twice what is expected of a true one
+    misfit: wp.float64  # sum of innovations squared by its own noise, less twice the value expected of the true one
 
 
 @wp.struct
 class Frame:
-    """What the bearings of a frame have in common; small, because functions are handed copies of their arguments."""
+    """Properties that all bearings of a frame share; small, because functions receive copies of their arguments."""
 
-    lines: wp.int32  # how many bearings can be used
+    bearings: wp.int32  # how many bearings can be used
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
     lever: vec3d  # m, of the camera in the body
     variance: wp.float64  # rad^2, of a bearing per tangent axis
@@ -172,11 +172,11 @@ class Frame:
 
 
 @wp.struct
-class Line:
+class BearingMeasurement:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
-    member: wp.int32  # that it is to; 0: to a point in the map
-    teller: wp.int32  # the member who has told that point, see solution_separation.py
+    member: wp.int32  # its target; 0: a point in the map
+    reported_by: wp.int32  # the member whose report states that point, see solution_separation.py
     mounting: wp.int32  # see `Frame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
@@ -194,20 +194,20 @@ class Line:
 
 @wp.struct
 class Scratch:
-    """What a correction needs of a member."""
+    """Intermediate results of a correction for one member."""
 
     column: mat66d  # a block of the covariance
     row: mat66d  # another one, as it will be
     correction: vec6d
     full_correction: vec6d  # the correction of a member that is considered, which is not carried out
-    last_correction: vec6d  # where the lines were linearised
+    last_correction: vec6d  # at which the measurements were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
     pose: Pose  # before the correction
 
 
 @wp.struct
 class CommonMemory:
-    """What `robust` and `robust_joint` have in common.
+    """The memory that `robust` and `robust_joint` share.
 
     K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`.
     """
@@ -217,11 +217,11 @@ class CommonMemory:
     P: array("WNKK", mat66d)  # blocks of the members' joint covariance
     anchor: array("WN", Anchor)
     search: array("WN", Search)
-    word: array("WNN", Word)  # per receiver and sender
+    monitor: array("WNN", SenderMonitor)  # per receiver and sender
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", Report)
     inbox: array("WNN", Report)  # per receiver and sender
-    line: array("WA", Line)
+    measurement: array("WA", BearingMeasurement)
     scratch: array("WK", Scratch)
     gain: array("WAK", mat26d)  # scratch: of a line in a member, transposed and not yet weighted, see correction.py
 
@@ -233,7 +233,7 @@ SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hy
 
 @device_function
 def clear(model: Any, memory: Any, world: int, i: int):
-    """Forget an earlier episode, down to what is only used within a tick: equal states are equal in every bit."""
+    """Clear an earlier episode, scratch included: equal states are equal in every bit."""
     memory.belief[world, i] = Belief()
     memory.search[world, i] = Search()
     members = memory.member.shape[2]
@@ -245,9 +245,9 @@ def clear(model: Any, memory: Any, world: int, i: int):
     for h in range(memory.hypothesis.shape[2]):
         memory.hypothesis[world, i, h] = Hypothesis()
     for sender in range(model.vehicles):
-        memory.word[world, i, sender] = Word()
+        memory.monitor[world, i, sender] = SenderMonitor()
     for n in range(model.agents):
-        memory.line[world, n] = Line()
+        memory.measurement[world, n] = BearingMeasurement()
         for k in range(members):
             memory.gain[world, n, k] = mat26d()
 
@@ -265,12 +265,12 @@ def are_joint(blocks: Any, count: Any) -> Any:
 
 
 def where(used: str, rules: dict[str, Rule]) -> dict[str, Rule]:
-    """Return rules that count where a field of the memory says so."""
+    """Return rules that apply where a field of the memory is not 0."""
     return {name: rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
 
 
 def _others(rule: Rule) -> Rule:
-    """Return the rule of what is kept of the other vehicles, not of the vehicle itself and its odometry's errors."""
+    """Return a rule that applies to members that are other vehicles."""
 
     def holds(values: Any, fields: Any, model: Any) -> Any:
         others = fields["observer_belief.others"][..., None]
@@ -282,33 +282,33 @@ def _others(rule: Rule) -> Rule:
 
 
 def rules_for(members: int) -> dict[str, Rule]:
-    """Return what a saved memory with so many members may hold, by field, see `coopenv.world.state`."""
+    """Return the rules of a saved memory with so many members, by field, see `coopenv.world.state`."""
     flags = (
-        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
-        "member.considered member.untold outbox.news inbox.news member.report.news member.report.valid line.fits "
-        "belief.accused_followed word.perjured"
+        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.excluded member.considered "
+        "member.correlation_unknown outbox.news inbox.news member.report.news member.report.valid measurement.fits "
+        "belief.suspect_fused monitor.self_inconsistent"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = (
-        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance line.variance line.noise line.common_noise "
-        "line.weight scratch.column gain word.certainty"
+        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
+        "measurement.common_noise measurement.weight scratch.column gain monitor.information_matrix"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
         **dict.fromkeys(ticks.split(), TICK),
         **dict.fromkeys(large.split(), LARGE),
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
-        **dict.fromkeys(("search.attempts", "belief.told_interval"), whole(0, 10**9)),
-        "word.offences": whole(0, MAX_OFFENCES),
-        "word.barred_until": whole(0, 2**31 - 1),
+        **dict.fromkeys(("search.attempts", "belief.news_interval"), whole(0, 10**9)),
+        "monitor.exclusions": whole(0, MAX_EXCLUSIONS),
+        "monitor.excluded_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),
-        "belief.accused": whole(0, 0),
+        "belief.suspect": whole(0, 0),
         "belief.others": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        **dict.fromkeys(("line.member", "line.teller"), whole(0, members - 1)),
-        "line.mounting": whole(0, MOUNTING),
+        **dict.fromkeys(("measurement.member", "measurement.reported_by"), whole(0, members - 1)),
+        "measurement.mounting": whole(0, MOUNTING),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
@@ -321,10 +321,10 @@ def rules_for(members: int) -> dict[str, Rule]:
 
 @wp.struct
 class Correlation:
-    """What a sender tells of its error and that of a vehicle that it hears, see correlations.py."""
+    """The correlation of a sender's error with the error of a vehicle that it receives, see correlations.py."""
 
     vehicle: wp.int32  # -1: none
-    tick: wp.int32  # when the report was sent that the sender has from that vehicle
+    tick: wp.int32  # at which that vehicle sent the report on which the correlation is based
     matrix: mat66f  # whole numbers, in steps
 
 
@@ -338,38 +338,38 @@ class Known:
 
 
 @wp.struct
-class Alone:
-    """Where landmarks and odometry alone put a vehicle, see solution_separation.py."""
+class LandmarkOnlySolution:
+    """The pose from landmarks and odometry alone, see solution_separation.py."""
 
-    begun: wp.int32  # 0 while the pose is searched for, and where it has been found wrong: it begins anew
-    exposed: wp.int32  # whether a sender may have misled the belief since the belief was last this
-    tick: wp.int32  # when it was last carried on
+    begun: wp.int32  # 0 during a search, and after it was found wrong: it begins anew
+    exposed: wp.int32  # whether the belief has fused a sender since it was last set to this solution
+    tick: wp.int32  # of the last propagation
     odometry: Pose  # of the belief, then
     estimate: Estimate
 
 
-ToldMemory = extended(
+RobustMemory = extended(
     CommonMemory,
-    "ToldMemory",
+    "RobustMemory",
     """C correlations in a message.""",
-    alone=array("WN", Alone),
+    landmark_only=array("WN", LandmarkOnlySolution),
     outbox_correlation=array("WNSC", Correlation),
     correlation=array("WNNC", Correlation),  # per receiver and sender
     known=array("WK", Known),  # scratch
     factor=array("WKK", mat66d),  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
 )
-TOLD_SIZES = {**SIZES, "C": MAX_CORRELATIONS}
+ROBUST_SIZES = {**SIZES, "C": MAX_CORRELATIONS}
 
 VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
 WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
 
 
-def told_rules() -> dict[str, Rule]:
-    """Return what a saved memory may hold, see `rules_for`."""
-    rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
+def robust_rules() -> dict[str, Rule]:
+    """Return the rules of a saved memory by field, see `rules_for`."""
+    rules: dict[str, Any] = rules_for(ROBUST_SIZES["K"])
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
-    rules |= {"alone.begun": FLAG, "alone.exposed": FLAG, "alone.tick": TICK}
-    rules |= where("alone.begun", {"alone.estimate.pose.R": ROTATION, "alone.estimate.P": COVARIANCE})
-    rules |= where("alone.begun", {"alone.odometry.R": ROTATION})
-    return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}
+    rules |= {"landmark_only.begun": FLAG, "landmark_only.exposed": FLAG, "landmark_only.tick": TICK}
+    solution = {"estimate.pose.R": ROTATION, "estimate.P": COVARIANCE, "odometry.R": ROTATION}
+    rules |= where("landmark_only.begun", {f"landmark_only.{name}": rule for name, rule in solution.items()})
+    return rules | {"known.member": whole(0, ROBUST_SIZES["K"] - 1)}

@@ -9,7 +9,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import Array, exp_so3, log_so3
 from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
-from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_TOLD, MIN_VARIANCE, STEPS
+from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_CORRELATIONS, MIN_VARIANCE, STEPS
 from coopenv.world.embedded import Messages
 
 
@@ -58,7 +58,7 @@ def check_pose(message: Message) -> None:
         raise CoopenvError("message: covariance is not positive definite, or not plausible")
 
 
-def write_told(observer: Any) -> Message:
+def write_broadcast(observer: Any) -> Message:
     """Return pose, covariance and dead reckoning (single precision), at times also correlations in whole steps."""
     message = write(observer)
     if message.position is None:
@@ -66,18 +66,18 @@ def write_told(observer: Any) -> Message:
     extra: dict[str, Any] = {**message.extra, "odometry": message.extra["odometry"].astype(np.float32)}
     report = observer.memory.outbox[0]
     if report["news"]:
-        told = observer.memory.outbox_correlation[0]
-        told = told[told["vehicle"] >= 0]
-        ages = (int(report["tick"]) - told["tick"]) * observer.unit
+        broadcast = observer.memory.outbox_correlation[0]
+        broadcast = broadcast[broadcast["vehicle"] >= 0]
+        ages = (int(report["tick"]) - broadcast["tick"]) * observer.unit
         extra |= {
-            "told": told["vehicle"].astype(np.uint16),
+            "told": broadcast["vehicle"].astype(np.uint16),
             "ages": ages.astype(np.float32),
-            "correlations": told["matrix"].astype(np.int8),
+            "correlations": broadcast["matrix"].astype(np.int8),
         }
     return replace(message, extra=extra)
 
 
-def read_told(observer: Any, sender: int, message: Message, sent: int) -> None:
+def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> None:
     """Put a message into the inbox; a CoopenvError or LookupError says that it is malformed."""
     m = observer.memory
     read(observer, sender, message, sent)
@@ -85,24 +85,29 @@ def read_told(observer: Any, sender: int, message: Message, sent: int) -> None:
     if not m.inbox[sender]["valid"] or "told" not in message.extra:
         return
     m.inbox[sender]["valid"] = 0
-    told, ages, matrices = (np.asarray(message.extra[name]) for name in ("told", "ages", "correlations"))
+    broadcast, ages, matrices = (np.asarray(message.extra[name]) for name in ("told", "ages", "correlations"))
     count = len(observer.setup.target_names) - observer.setup.landmarks
-    if told.ndim != 1 or len(told) > MAX_CORRELATIONS or told.dtype.kind != "u" or not (told < count).all():
+    if (
+        broadcast.ndim != 1
+        or len(broadcast) > MAX_CORRELATIONS
+        or broadcast.dtype.kind != "u"
+        or not (broadcast < count).all()
+    ):
         raise CoopenvError("message: told")
-    if len(np.unique(told)) < len(told) or sender in told:
+    if len(np.unique(broadcast)) < len(broadcast) or sender in broadcast:
         raise CoopenvError("message: told twice")
-    if matrices.shape != (len(told), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
+    if matrices.shape != (len(broadcast), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
         raise CoopenvError("message: correlations")
-    if ages.shape != told.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():
+    if ages.shape != broadcast.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():
         raise CoopenvError("message: ages")
     m.inbox[sender]["valid"] = m.inbox[sender]["news"] = 1
     kept = m.correlation[sender]
     kept["vehicle"] = -1
-    for n, (vehicle, age, matrix) in enumerate(zip(told.tolist(), ages.tolist(), matrices, strict=True)):
+    for n, (vehicle, age, matrix) in enumerate(zip(broadcast.tolist(), ages.tolist(), matrices, strict=True)):
         kept[n] = vehicle, sent - observer.units(age), matrix
 
 
-TOLD_MESSAGES = Messages(write_told, read_told)
+ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast)
 
 
 JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")  # what a joint message has besides
@@ -118,13 +123,13 @@ def write_joint(observer: Any) -> Message:
         return message
     m = observer.memory
     others = int(m.outbox_joint[0]["others"])
-    told = m.outbox_told[0, :others]
+    broadcast = m.outbox_broadcast[0, :others]
     n = 6 * (others + 1)
     joint: dict[str, Any] = {
-        "vehicles": told["vehicle"].astype(np.uint16),
-        "ages": (int(m.outbox[0]["tick"]) - told["tick"]) * observer.unit,
-        "poses": _six(told["pose"]),
-        "odometries": _six(told["odometry"]),
+        "vehicles": broadcast["vehicle"].astype(np.uint16),
+        "ages": (int(m.outbox[0]["tick"]) - broadcast["tick"]) * observer.unit,
+        "poses": _six(broadcast["pose"]),
+        "odometries": _six(broadcast["odometry"]),
         "factor": m.outbox_factor[0, : n * (n + 1) // 2].copy(),
         "complete": m.outbox_joint[0]["complete"].astype(np.uint8).reshape(1),
     }
@@ -144,7 +149,7 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
     names = {sender, *vehicles.tolist()}
     if (
         vehicles.dtype.kind not in "iu"
-        or others >= MAX_TOLD
+        or others >= MAX_BROADCAST
         or len(names) <= others
         or not _are_vehicles(observer, names)
     ):
@@ -160,9 +165,9 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
         raise CoopenvError("message: factor")
     if not (factor[np.cumsum(np.arange(1, n + 1)) - 1] ** 2 >= MIN_VARIANCE).all():
         raise CoopenvError("message: factor is singular")
-    told = m.inbox_told[sender, :others]
-    told["vehicle"], told["tick"] = vehicles, [sent - observer.units(age) for age in ages.tolist()]
-    for one, pose, odometry in zip(told, poses, odometries, strict=True):
+    broadcast = m.inbox_broadcast[sender, :others]
+    broadcast["vehicle"], broadcast["tick"] = vehicles, [sent - observer.units(age) for age in ages.tolist()]
+    for one, pose, odometry in zip(broadcast, poses, odometries, strict=True):
         one["pose"], one["odometry"] = from_six(pose), from_six(odometry)
     m.inbox_factor[sender, : len(factor)] = factor
     m.inbox_joint[sender] = others, complete[0] != 0

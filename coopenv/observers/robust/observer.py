@@ -34,24 +34,30 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.belief import apply_error, begin_belief, own_estimate, set_anchor
 from coopenv.observers.robust.constants import SAME_PRIOR, SURE
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.correlated_fusion import hear_all
-from coopenv.observers.robust.correlations import receive_told, send_told
-from coopenv.observers.robust.measurements import RESECTION, TRACKING, innovation_squared, set_lines, time_between
+from coopenv.observers.robust.correlated_fusion import fuse_messages
+from coopenv.observers.robust.correlations import receive_broadcast, send_broadcast
+from coopenv.observers.robust.measurements import (
+    RESECTION,
+    TRACKING,
+    innovation_squared,
+    set_bearing_measurements,
+    time_between,
+)
 from coopenv.observers.robust.memory import (
-    TOLD_SIZES,
+    ROBUST_SIZES,
     Estimate,
     Frame,
     Pose,
-    ToldMemory,
+    RobustMemory,
     clear,
     mat33d,
     mat66d,
-    told_rules,
+    robust_rules,
     vec2d,
     vec3d,
     vec6d,
 )
-from coopenv.observers.robust.messages import TOLD_MESSAGES
+from coopenv.observers.robust.messages import ROBUST_MESSAGES
 from coopenv.observers.robust.propagation import (
     begin_errors,
     increment_noise,
@@ -62,8 +68,8 @@ from coopenv.observers.robust.propagation import (
     walk_mounting,
 )
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search, put_off
-from coopenv.observers.robust.sender_monitor import forget_evidence, test_missed, test_words
-from coopenv.observers.robust.solution_separation import begin_told, separate
+from coopenv.observers.robust.sender_monitor import reset_monitors, test_innovations, test_rejected_bearings
+from coopenv.observers.robust.solution_separation import begin_broadcasts, separate
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.world.embedded import Embedded
 from coopenv.world.v2x import start_covariance
@@ -80,16 +86,16 @@ def gate(frame: Frame, memory: Any, world: int, i: int):
     missed = int(0)
     fitting = int(0)
     total = wp.float64(0.0)
-    for n in range(frame.lines):
+    for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         fits = int(0)
         if nis >= wp.float64(0.0) and nis < wp.float64(constants.BEARING_GATE):
             fits = 1
             total += nis
-        memory.line[world, n].fits = fits
+        memory.measurement[world, n].fits = fits
         fitting += fits
-        member = memory.line[world, n].member
-        if member == 0 or memory.member[world, i, member].distrusted == 0:
+        member = memory.measurement[world, n].member
+        if member == 0 or memory.member[world, i, member].excluded == 0:
             counted += 1
             missed += 1 - fits
     share = wp.float64(-1.0)
@@ -99,7 +105,7 @@ def gate(frame: Frame, memory: Any, world: int, i: int):
 
 
 @wp.func
-def is_sound(estimate: Estimate):
+def is_valid(estimate: Estimate):
     """Return whether an estimate is finite and its covariance positive definite, but for rounding."""
     P = estimate.P
     for k in range(6):
@@ -109,9 +115,9 @@ def is_sound(estimate: Estimate):
 
 
 @device_function
-def lose(model: Any, memory: Any, world: int, i: int, tick: int):
+def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
     """Search anew, from where most bearings fitted, carried on by odometry since."""
-    forget_evidence(memory, world, i)
+    reset_monitors(memory, world, i)
     anchor = memory.anchor[world, i]
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
@@ -128,20 +134,20 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-        test_words(frame, memory, world, i, now)
+        test_innovations(frame, memory, world, i, now)
     if share < wp.float64(0.0):
         return
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
-    missed = memory.belief[world, i].missed_share + (share - memory.belief[world, i].missed_share) * weight
+    missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
     healthy = memory.belief[world, i].healthy_time + now.period
     if missed >= wp.float64(constants.HEALTHY_SHARE):
         healthy = wp.float64(0.0)
-    memory.belief[world, i].missed_share = missed
-    test_missed(memory, world, i, frame.lines, now.period)
+    memory.belief[world, i].rejected_share = missed
+    test_rejected_bearings(memory, world, i, frame.bearings, now.period)
     memory.belief[world, i].healthy_time = healthy
     if missed > wp.float64(constants.LOST_SHARE):
-        lose(model, memory, world, i, now.tick)
-    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_sound(own_estimate(memory, world, i)):
+        declare_lost(model, memory, world, i, now.tick)
+    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_valid(own_estimate(memory, world, i)):
         noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
 
@@ -149,23 +155,23 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
 @device_function
 def weight_of(memory: Any, world: int, i: int, n: int):
     """Return the weight of a bearing, to whose variance the error of the member that it is to adds."""
-    N = memory.line[world, n].noise * wp.identity(2, wp.float64)
-    member = memory.line[world, n].member
+    N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
+    member = memory.measurement[world, n].member
     if member > 0:
-        G = memory.line[world, n].member_jacobian
+        G = memory.measurement[world, n].member_jacobian
         N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
     return wp.inverse(N)
 
 
 @device_function
-def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inverse: Any):
+def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, inverse: Any):
     """Set the vehicle's covariance to that of the solution, the members' errors included."""
     members = memory.belief[world, i].members
     own = mat66d()
     for k in range(members):
         memory.scratch[world, k].column = mat66d()
-    for n in range(lines):
-        line = memory.line[world, n]
+    for n in range(bearings):
+        line = memory.measurement[world, n]
         if line.fits == 1:
             HtW = wp.transpose(line.jacobian) * weight_of(memory, world, i, n)
             own += (HtW * wp.transpose(HtW)) * line.noise
@@ -185,18 +191,18 @@ def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inver
 @device_function
 def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
-    lines = frame.lines
+    bearings = frame.bearings
     inverse = mat66d()
     for step in range(constants.GAUSS_NEWTON_STEPS):
         _, fitting, _ = gate(frame, memory, world, i)
         M = mat66d()
         b = vec6d()
-        for n in range(lines):
-            if memory.line[world, n].fits == 1:
-                H = memory.line[world, n].jacobian
+        for n in range(bearings):
+            if memory.measurement[world, n].fits == 1:
+                H = memory.measurement[world, n].jacobian
                 HtW = wp.transpose(H) * weight_of(memory, world, i, n)
                 M += HtW * H
-                b += HtW * memory.line[world, n].residual
+                b += HtW * memory.measurement[world, n].residual
         if fitting < 3:
             return False
         inverse = inverse6(M)
@@ -204,18 +210,18 @@ def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
             return False
         if step < constants.GAUSS_NEWTON_STEPS - 1:
             apply_error(memory, world, i, 0, inverse * b)
-    write_resected_covariance(memory, world, i, lines, inverse)
+    write_resected_covariance(memory, world, i, bearings, inverse)
     return True
 
 
-BELIEVING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
+ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
 
 
 @device_function
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in a pose alone; on all that may be heard it may depend."""
     begin_belief(memory, world, i, estimate)
-    memory.belief[world, i].missed_share = wp.float64(0.0)
+    memory.belief[world, i].rejected_share = wp.float64(0.0)
     bits = wp.uint64(0)
     for n in range(model.target_count[i]):
         if model.targets[i, n] >= model.landmarks:
@@ -283,15 +289,17 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
     if confirmed:
         found = prior
     restart_belief(model, memory, world, i, found)
-    return wp.where(confirmed, BELIEVING, FOUND)
+    return wp.where(confirmed, ESTIMATING, FOUND)
 
 
 @device_function
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
-    purpose = wp.where(standing == BELIEVING, TRACKING, RESECTION)
-    frame = set_lines(model, state, memory, world, i, now.tick, time_between(model, state, world, i, now), purpose)
-    if standing == BELIEVING:
+    purpose = wp.where(standing == ESTIMATING, TRACKING, RESECTION)
+    frame = set_bearing_measurements(
+        model, state, memory, world, i, now.tick, time_between(model, state, world, i, now), purpose
+    )
+    if standing == ESTIMATING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
     elif resect(frame, memory, world, i) and is_known(wp.float64(SURE) * memory.P[world, i, 0, 0]):
@@ -318,7 +326,7 @@ def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
         step, jump = take_odometry(model, state, memory, world, i, now.period)
         walk_errors(model, memory, world, i, now.period)
         walk_mounting(model, memory, world, i, now.period)
-        standing = int(BELIEVING)
+        standing = int(ESTIMATING)
         if memory.search[world, i].active == 1:
             noise = increment_noise(model, memory, world, i, step, now.period) + jump
             propagate_search(memory, world, i, step, noise)
@@ -332,8 +340,8 @@ def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
             fuse_messages(model, state, memory, world, i, now.tick)
             if now.due:
                 correct(model, state, memory, world, i, now, standing)
-            if memory.search[world, i].active == 0 and not is_sound(own_estimate(memory, world, i)):
-                lose(model, memory, world, i, now.tick)  # a message that no honest vehicle sends
+            if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
+                declare_lost(model, memory, world, i, now.tick)  # a message that no honest vehicle sends
         separate(model, state, memory, world, i, now)
         write(state, memory, world, i)
         if now.due:
@@ -348,13 +356,13 @@ with the last one, which is Warp's on a GPU, steps take a twentieth less than wi
 
 ROBUST = Embedded(
     "robust",
-    make_estimate(receive_told, hear_all, separate),
-    make_start(begin_told, receive_told),
-    send_told,
-    ToldMemory,
-    TOLD_SIZES,
-    valid=told_rules(),
-    messages=TOLD_MESSAGES,
+    make_estimate(receive_broadcast, fuse_messages, separate),
+    make_start(begin_broadcasts, receive_broadcast),
+    send_broadcast,
+    RobustMemory,
+    ROBUST_SIZES,
+    valid=robust_rules(),
+    messages=ROBUST_MESSAGES,
     coordinates=Coordinates.LEFT,
     options=OPTIONS,
 )

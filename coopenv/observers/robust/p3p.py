@@ -230,7 +230,7 @@ def distances_of(a: Any, gaps: Any):
 
 
 @wp.func
-def is_sound(b: Any, z: Any, longest: Any):
+def is_valid(b: Any, z: Any, longest: Any):
     """Return whether three points make a triangle and the bearings are unit vectors."""
     area = wp.length(wp.cross(z[1] - z[0], z[2] - z[0]))
     if not (area > wp.float64(FLAT) * longest and wp.isfinite(longest)):
@@ -246,7 +246,7 @@ def solve_triangle(b: Any, z: Any):
     longest = wp.max(sides)
     count = int(0)
     result = mat43d()
-    if is_sound(b, z, longest):
+    if is_valid(b, z, longest):
         a = sides / longest
         gaps = vec3d(wp.length_sq(b[0] - b[1]), wp.length_sq(b[0] - b[2]), wp.length_sq(b[1] - b[2]))
         rows = distances_of(a, gaps)
@@ -254,11 +254,11 @@ def solve_triangle(b: Any, z: Any):
             d = polished(rows[n], gaps, a)
             missed = wp.max(wp.abs(misfit(d, gaps, a)))
             if wp.min(d) > wp.float64(0.0) and missed < wp.float64(TOLERANCE):
-                place = count
-                while place > 0 and d[0] < result[wp.max(place - 1, 0), 0]:
-                    result[place] = result[place - 1]
-                    place -= 1
-                result[place] = d
+                slot = count
+                while slot > 0 and d[0] < result[wp.max(slot - 1, 0), 0]:
+                    result[slot] = result[slot - 1]
+                    slot -= 1
+                result[slot] = d
                 count += 1
     return count, result * wp.sqrt(longest)
 
@@ -287,10 +287,10 @@ def p3p_kernel(bearings: Any, positions: Any, R: Any, camera: Any, mask: Any):
     n = wp.tid()
     count, distances = solve_triangle(bearings[n], positions[n])
     for s in range(count):
-        turn, place = camera_pose(bearings[n], positions[n], distances[s])
-        if wp.isfinite(wp.ddot(turn, turn) + wp.dot(place, place)):
+        turn, slot = camera_pose(bearings[n], positions[n], distances[s])
+        if wp.isfinite(wp.ddot(turn, turn) + wp.dot(slot, slot)):
             R[n, s] = turn
-            camera[n, s] = place
+            camera[n, s] = slot
             mask[n, s] = True
 
 

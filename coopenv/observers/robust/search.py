@@ -24,7 +24,7 @@ from coopenv.observers.robust.measurements import (
     innovation_squared,
     innovation_with,
     linearise,
-    set_lines,
+    set_bearing_measurements,
     tangent_basis,
 )
 from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search, mat33d, mat66d
@@ -45,8 +45,10 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
     for n0 in range(count):
         for n1 in range(n0 + 1, count):
             for n2 in range(n1 + 1, count):
-                a = memory.line[world, n0].bearing
-                area = wp.length(wp.cross(memory.line[world, n1].bearing - a, memory.line[world, n2].bearing - a))
+                a = memory.measurement[world, n0].bearing
+                area = wp.length(
+                    wp.cross(memory.measurement[world, n1].bearing - a, memory.measurement[world, n2].bearing - a)
+                )
                 later = area < size or (area == size and here > number)
                 if later and area > best_size:
                     best = wp.vec3i(n0, n1, n2)
@@ -66,13 +68,13 @@ def angles_within(P: Any, most: Any) -> bool:
 
 
 @device_function
-def covariance_of(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool):
+def covariance_of(frame: Frame, memory: Any, world: int, i: int, triple: Any, patient: bool):
     """Return whether three bearings determine the pose believed well enough, and its covariance."""
     M = mat66d()
     for n in range(3):
-        linearise(frame, memory, world, i, lines[n])
-        H = memory.line[world, lines[n]].jacobian
-        M += (wp.transpose(H) * (wp.float64(1.0) / memory.line[world, lines[n]].noise)) * H
+        linearise(frame, memory, world, i, triple[n])
+        H = memory.measurement[world, triple[n]].jacobian
+        M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, triple[n]].noise)) * H
     P = symmetric_part(inverse6(M))
     if patient:
         return is_known(P), P
@@ -100,7 +102,7 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
 
 
 @device_function
-def solve(frame: Frame, memory: Any, world: int, i: int, lines: Any, b: Any, z: Any, patient: bool, following: bool):
+def solve(frame: Frame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool):
     """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
 
     They become hypotheses if they are to be followed.
@@ -111,16 +113,16 @@ def solve(frame: Frame, memory: Any, world: int, i: int, lines: Any, b: Any, z: 
         if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
             pose = Pose(R, camera - R * frame.lever)
             begin_belief(memory, world, i, Estimate(pose, mat66d()))
-            determined, P = covariance_of(frame, memory, world, i, lines, patient)
+            determined, P = covariance_of(frame, memory, world, i, triple, patient)
             if patient and not determined:
                 return False
-            if following and determined:
+            if tracking and determined:
                 add_hypothesis(memory, world, i, Estimate(pose, P))
     return True
 
 
 @device_function
-def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
+def problem(frame: Frame, memory: Any, world: int, triple: Any, number: int):
     """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
     The first is as measured. In the others a bearing is perturbed along an axis across it, or its point if that is not
@@ -129,8 +131,8 @@ def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
     b = mat33d()
     z = mat33d()
     for n in range(3):
-        b[n] = memory.line[world, lines[n]].bearing
-        z[n] = memory.line[world, lines[n]].point
+        b[n] = memory.measurement[world, triple[n]].bearing
+        z[n] = memory.measurement[world, triple[n]].point
     exists = bool(True)
     if number > 0:
         n = (number - 1) // 10
@@ -142,23 +144,23 @@ def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
             across = step * wp.sqrt(frame.variance)
             b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
         else:
-            variance = memory.line[world, lines[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
+            variance = memory.measurement[world, triple[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
             z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)
             exists = variance > wp.float64(0.0)
     return exists, b, z
 
 
 @device_function
-def solve_triple(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool, following: bool) -> bool:
+def solve_triple(frame: Frame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool) -> bool:
     """Make hypotheses of the poses that agree with three bearings, in their order, if they are to be followed.
 
     Return False, without hypotheses, if a solution is not well determined and one is `patient` enough to wait.
     """
     memory.search[world, i].hypotheses = 0
     for number in range(constants.PROBLEMS):
-        exists, b, z = problem(frame, memory, world, lines, number)
+        exists, b, z = problem(frame, memory, world, triple, number)
         if exists:
-            if not solve(frame, memory, world, i, lines, b, z, patient, following):
+            if not solve(frame, memory, world, i, triple, b, z, patient, tracking):
                 memory.search[world, i].hypotheses = 0
                 return False
     return True
@@ -223,14 +225,14 @@ def prune(memory: Any, world: int, i: int):
 @device_function
 def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
     """Set for every line the largest noise that it has for any hypothesis, by which all of them are compared."""
-    for n in range(frame.lines):
-        memory.line[world, n].common_noise = wp.float64(0.0)
+    for n in range(frame.bearings):
+        memory.measurement[world, n].common_noise = wp.float64(0.0)
     for h in range(memory.search[world, i].hypotheses):
         begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
-        for n in range(frame.lines):
+        for n in range(frame.bearings):
             linearise(frame, memory, world, i, n)
-            noise = memory.line[world, n].noise
-            memory.line[world, n].common_noise = wp.max(memory.line[world, n].common_noise, noise)
+            noise = memory.measurement[world, n].noise
+            memory.measurement[world, n].common_noise = wp.max(memory.measurement[world, n].common_noise, noise)
 
 
 @device_function
@@ -239,20 +241,20 @@ def expected_of(frame: Frame, memory: Any, world: int, n: int):
 
     Noise that is not the camera's stands for an error that is the same for a while, times the frames in that.
     """
-    time = wp.float64(constants.BEND_TIME)
-    if memory.line[world, n].variance > wp.float64(0.0):
+    time = wp.float64(constants.LINEARISATION_TIME)
+    if memory.measurement[world, n].variance > wp.float64(0.0):
         time = wp.float64(constants.CORRELATION_TIME)
-    noise = memory.line[world, n].noise
+    noise = memory.measurement[world, n].noise
     lasting = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
     return wp.float64(2.0) * (frame.variance + lasting) / noise
 
 
 @device_function
-def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used: Any):
+def track_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
     fitting = int(0)
-    for n in range(frame.lines):
+    for n in range(frame.bearings):
         fits = int(0)
         if n != used[0] and n != used[1] and n != used[2]:
             nis = innovation_squared(frame, memory, world, i, n)
@@ -260,12 +262,12 @@ def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, use
                 fits = 1
             cost = nis
             if wp.isfinite(nis):
-                more = memory.line[world, n].common_noise - memory.line[world, n].noise
+                more = memory.measurement[world, n].common_noise - memory.measurement[world, n].noise
                 cost = innovation_with(memory, world, n, more)
             memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
-        memory.line[world, n].fits = fits
+        memory.measurement[world, n].fits = fits
         fitting += fits
     if fitting > 0:
         iterated_update(frame, memory, world, i)
@@ -286,13 +288,13 @@ def add_prior(memory: Any, world: int, i: int):
 @device_function
 def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
     """Return three well placed bearings, others at every attempt."""
-    triples = frame.lines * (frame.lines - 1) * (frame.lines - 2) // 6
-    lines = wp.vec3i(0, 0, 0)
+    triples = frame.bearings * (frame.bearings - 1) * (frame.bearings - 2) // 6
+    triple = wp.vec3i(0, 0, 0)
     size = wp.float64(wp.inf)
     number = int(-1)
     for _ in range(memory.search[world, i].attempts % triples + 1):
-        lines, size, number = next_triple(memory, world, frame.lines, size, number)
-    return lines
+        triple, size, number = next_triple(memory, world, frame.bearings, size, number)
+    return triple
 
 
 @device_function
@@ -305,7 +307,7 @@ def wait(memory: Any, world: int, i: int, period: Any) -> bool:
 
 
 @device_function
-def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, period: Any) -> bool:
+def solve_chosen(frame: Frame, memory: Any, world: int, i: int, triple: Any, period: Any) -> bool:
     """Solve a triple; return whether its solutions are hypotheses now: if for a while all were well determined.
 
     Where two solutions nearly meet, the region where they may be is no ellipsoid, and noise makes them come and go;
@@ -313,11 +315,11 @@ def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, peri
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
     patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
-    following = not patient or clear >= wp.float64(constants.CLEAR_TIME)
-    if not solve_triple(frame, memory, world, i, lines, patient, following):
+    tracking = not patient or clear >= wp.float64(constants.CLEAR_TIME)
+    if not solve_triple(frame, memory, world, i, triple, patient, tracking):
         clear = wp.float64(-constants.DOUBT_TIME)
-        following = False
-    if following:
+        tracking = False
+    if tracking:
         for h in range(memory.search[world, i].hypotheses):
             distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
             memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
@@ -327,7 +329,7 @@ def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, peri
         least = wp.where(patient, wp.float64(constants.MIN_SEARCH_TIME), wp.float64(constants.MIN_DOUBTFUL_TIME))
         memory.search[world, i].least_time = least
     memory.search[world, i].clear_time = clear
-    return following
+    return tracking
 
 
 @device_function
@@ -336,49 +338,49 @@ def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any)
 
     Return the bearings that have been used, and for how many hypotheses.
     """
-    lines = wp.vec3i(-1, -1, -1)
+    triple = wp.vec3i(-1, -1, -1)
     solved = int(0)
-    following = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
-    if not following:
+    tracking = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
+    if not tracking:
         if wait(memory, world, i, period):
-            lines = chosen_triple(frame, memory, world, i)
-            following = solve_chosen(frame, memory, world, i, lines, period)
+            triple = chosen_triple(frame, memory, world, i)
+            tracking = solve_chosen(frame, memory, world, i, triple, period)
             solved = memory.search[world, i].hypotheses
-    if following:
+    if tracking:
         add_prior(memory, world, i)
         memory.search[world, i].attempts += 1
-        memory.search[world, i].followed_time = wp.float64(0.0)
-    return lines, solved
+        memory.search[world, i].tracked_time = wp.float64(0.0)
+    return triple, solved
 
 
 @device_function
 def put_off(memory: Any, world: int, i: int):
     """Follow the hypothesis that is left for some more frames: this one has not told the pose well enough."""
-    memory.search[world, i].least_time = memory.search[world, i].followed_time + wp.float64(constants.DOUBT_TIME)
+    memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.DOUBT_TIME)
 
 
 @device_function
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
-    frame = set_lines(model, state, memory, world, i, now.tick, now.period, SEARCH)
+    frame = set_bearing_measurements(model, state, memory, world, i, now.tick, now.period, SEARCH)
     beginning = memory.search[world, i].hypotheses == 0
-    lines = wp.vec3i(-1, -1, -1)
+    triple = wp.vec3i(-1, -1, -1)
     solved = int(0)
     if beginning:
-        if frame.lines < 3:
+        if frame.bearings < 3:
             return False
-        lines, solved = begin_hypotheses(frame, memory, world, i, now.period)
+        triple, solved = begin_hypotheses(frame, memory, world, i, now.period)
     set_common_noise(frame, memory, world, i)
     for h in range(memory.search[world, i].hypotheses):
         used = wp.vec3i(-1, -1, -1)
         if h < solved:
-            used = lines
-        follow_hypothesis(frame, memory, world, i, h, used)
+            used = triple
+        track_hypothesis(frame, memory, world, i, h, used)
     if beginning:
         sort_hypotheses(memory, world, i)
         memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, constants.MAX_HYPOTHESES)
         return False
-    memory.search[world, i].followed_time += now.period
+    memory.search[world, i].tracked_time += now.period
     prune(memory, world, i)
-    alone = memory.search[world, i].hypotheses == 1
-    return alone and memory.search[world, i].followed_time >= memory.search[world, i].least_time
+    single = memory.search[world, i].hypotheses == 1
+    return single and memory.search[world, i].tracked_time >= memory.search[world, i].least_time

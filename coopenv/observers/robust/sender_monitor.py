@@ -30,7 +30,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Drift, Estimate, Frame, Report, Word, mat33d, mat66d, vec2d, vec3d
+from coopenv.observers.robust.memory import Drift, Estimate, Frame, Report, SenderMonitor, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.tracklets import test_sender
 from coopenv.world.warp_internals import device_function
 
@@ -38,9 +38,9 @@ GROSS_VARIANCE = constants.GROSS_ERROR**2
 
 
 @device_function
-def is_barred(memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether a sender is not to be believed yet."""
-    return tick < memory.word[world, i, sender].barred_until
+def is_excluded(memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
+    """Return whether a sender is still excluded by time."""
+    return tick < memory.monitor[world, i, sender].excluded_until
 
 
 @wp.func
@@ -54,8 +54,8 @@ def only_position(M: Any):
 
 
 @device_function
-def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
-    """Let member n be farther from where it says, by a variance per axis in m^2, with all that depends on its error."""
+def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
+    """Add a variance (m^2 per axis) to member n's position, and to all errors that depend on it."""
     members = memory.belief[world, i].members
     inverse = algebra.inverse6(memory.P[world, i, n, n])
     for k in range(members):
@@ -69,143 +69,145 @@ def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
 
 
 @device_function
-def reopen(memory: Any, world: int, i: int, n: int, variance: Any):
-    """Let all that depends on what member n said be as uncertain as that is now; where that is much, the own pose.
+def inflate_covariance(memory: Any, world: int, i: int, n: int, variance: Any):
+    """Add a variance (m^2 per axis) to member n's position and to dependent errors; if it is large, to the own pose.
 
-    It depends on a gross error in ways that no covariance tells, because lines of sight were linearised far away.
+    The covariance does not hold how the own pose depends on a gross error: bearings were linearised far from the truth.
     """
-    enlarge(memory, world, i, n, variance)
+    inflate_dependents(memory, world, i, n, variance)
     if variance > wp.float64(GROSS_VARIANCE):
         turn = wp.float64(constants.GROSS_TURN * constants.GROSS_TURN) * variance
         memory.P[world, i, 0, 0] = algebra.with_noise(memory.P[world, i, 0, 0], vec2d(turn, variance))
 
 
 @device_function
-def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, believed: bool):
-    """Believe member n no more, which is off by some metres; `believed`: the own pose has followed that error."""
+def exclude(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, fused: bool):
+    """Exclude member n, whose position is wrong by `error` (m); `fused`: the own pose has fused that error."""
     sender = memory.member[world, i, n].vehicle
-    if believed:
+    if fused:
         size = wp.float64(constants.ERROR_FACTOR) * error
-        reopen(memory, world, i, n, size * size)
+        inflate_covariance(memory, world, i, n, size * size)
     memory.P[world, i, n, n] = algebra.with_noise(memory.P[world, i, n, n], vec2d(wp.float64(0.0), error * error))
-    memory.member[world, i, n].distrusted = 1
+    memory.member[world, i, n].excluded = 1
     memory.member[world, i, n].considered = 0
     memory.member[world, i, n].agreement_time = wp.float64(0.0)
-    word = Word()
-    word.offences = wp.min(memory.word[world, i, sender].offences + 1, constants.MAX_OFFENCES)
-    word.slow_drift = memory.word[world, i, sender].slow_drift
-    time = wp.float64(constants.AGREEMENT_TIME) * wp.float64(1 << (word.offences - 1))
-    word.barred_until = tick + int(wp.ceil(time / model.camera_period - wp.float64(constants.SAME_TIME)))
-    memory.word[world, i, sender] = word
+    monitor = SenderMonitor()
+    monitor.exclusions = wp.min(memory.monitor[world, i, sender].exclusions + 1, constants.MAX_EXCLUSIONS)
+    monitor.slow_drift = memory.monitor[world, i, sender].slow_drift
+    time = wp.float64(constants.AGREEMENT_TIME) * wp.float64(1 << (monitor.exclusions - 1))
+    monitor.excluded_until = tick + int(wp.ceil(time / model.camera_period - wp.float64(constants.SAME_TIME)))
+    memory.monitor[world, i, sender] = monitor
 
 
 @device_function
-def accuse(memory: Any, world: int, i: int, n: int, error: Any, followed: int):
-    """Say that bearings contradict member n, if they do no other: it is off by some metres.
+def set_suspect(memory: Any, world: int, i: int, n: int, error: Any, fused: int):
+    """Set member n as the frame's suspect, unless there is one: its position seems wrong by `error` (m).
 
-    `followed`: the own pose has followed that error. solution_separation.py decides on it.
+    `fused`: the own pose has fused that error. solution_separation.py decides whether to exclude the suspect.
     """
-    if memory.belief[world, i].accused == 0:
-        memory.belief[world, i].accused = n
-        memory.belief[world, i].accused_error = error
-        memory.belief[world, i].accused_followed = followed
+    if memory.belief[world, i].suspect == 0:
+        memory.belief[world, i].suspect = n
+        memory.belief[world, i].suspect_error = error
+        memory.belief[world, i].suspect_fused = fused
 
 
 @device_function
-def admits(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
-    """Take note where member n's new report admits that what it said before was wrong; return whether it starts anew.
+def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
+    """Inflate the covariance where member n's new report shows a reset; return whether to replace the old report.
 
-    It does where it knows much less than before, and where it has been silent for long and is elsewhere.
+    A reset shows as a covariance that has grown much, or as a jump of the position after a long silence.
     """
     report = memory.member[world, i, n].report
     P = mat66d(report.P)
     before = memory.P[world, i, n, n]
     spread = algebra.position_variance(before)
     grown = algebra.position_variance(P) - spread
-    if grown > wp.float64(constants.ADMISSION) * spread:
-        reopen(memory, world, i, n, wp.float64(constants.THIRD) * grown)
+    if grown > wp.float64(constants.RESET_GROWTH) * spread:
+        inflate_covariance(memory, world, i, n, wp.float64(constants.THIRD) * grown)
     if dt > wp.float64(constants.SILENCE_TIME):
-        believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-        if algebra.distance_squared(believed, Estimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
-            reopen(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
+        estimated = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+        if algebra.distance_squared(estimated, Estimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
+            inflate_covariance(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
             return True
     return False
 
 
 @device_function
-def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: Any, drift: Any, jumped: bool) -> bool:
-    """Decide whether member n is believed, from its new report, dt after the last one; return whether it starts anew.
+def test_report(
+    model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: Any, drift: Any, jumped: bool
+) -> bool:
+    """Exclude or readmit member n by its new report, dt after the last one; return whether to replace the old report.
 
-    It has drifted from its odometry by `drift` (m; 0 if by no more than it may), or its odometry has jumped.
+    `drift` (m) is the detected drift from its odometry, 0 if there is none; `jumped`: its odometry has jumped.
     """
     report = memory.member[world, i, n].report
     sender = memory.member[world, i, n].vehicle
-    if memory.member[world, i, n].distrusted == 1:
+    if memory.member[world, i, n].excluded == 1:
         test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
-        if is_barred(memory, world, i, sender, tick) or drift > wp.float64(0.0):
-            memory.member[world, i, n].distrusted = 1
+        if is_excluded(memory, world, i, sender, tick) or drift > wp.float64(0.0):
+            memory.member[world, i, n].excluded = 1
             memory.member[world, i, n].agreement_time = wp.float64(0.0)
-        return memory.member[world, i, n].distrusted == 0
-    if admits(memory, world, i, n, dt):
+        return memory.member[world, i, n].excluded == 0
+    if sender_reset_detected(memory, world, i, n, dt):
         return True
     test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
-    if jumped or memory.member[world, i, n].distrusted == 1:
-        distrust(model, memory, world, i, n, tick, wp.float64(0.0), False)
-        memory.word[world, i, sender].perjured = 1
+    if jumped or memory.member[world, i, n].excluded == 1:
+        exclude(model, memory, world, i, n, tick, wp.float64(0.0), False)
+        memory.monitor[world, i, sender].self_inconsistent = 1
     elif drift > wp.float64(0.0):
-        distrust(model, memory, world, i, n, tick, drift, True)
-        memory.word[world, i, sender].perjured = 1
+        exclude(model, memory, world, i, n, tick, drift, True)
+        memory.monitor[world, i, sender].self_inconsistent = 1
     return False
 
 
 @device_function
-def forget_evidence(memory: Any, world: int, i: int):
-    """Forget what bearings have said of others: they were taken from where the vehicle is not."""
-    for sender in range(memory.word.shape[2]):
-        memory.word[world, i, sender].offset = vec3d()
-        memory.word[world, i, sender].certainty = mat33d()
-        memory.word[world, i, sender].missed_share = wp.float64(0.0)
-        memory.word[world, i, sender].fitted_time = wp.float64(0.0)
+def reset_monitors(memory: Any, world: int, i: int):
+    """Clear the sums over innovations of all senders; they were linearised about a wrong pose."""
+    for sender in range(memory.monitor.shape[2]):
+        memory.monitor[world, i, sender].information_vector = vec3d()
+        memory.monitor[world, i, sender].information_matrix = mat33d()
+        memory.monitor[world, i, sender].rejected_share = wp.float64(0.0)
+        memory.monitor[world, i, sender].fitted_time = wp.float64(0.0)
 
 
 @device_function
-def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
-    """Average which share of the bearings to each member do not fit; return whether those to most targets fit.
+def average_rejected_share(memory: Any, world: int, i: int, bearings: int, dt: Any) -> bool:
+    """Average the share of rejected bearings to each member; return whether bearings to most targets pass the gate.
 
-    Distrusted members do not count. Where most do not fit it may be the vehicle itself that is lost.
+    Excluded members do not count. If most bearings fail, the own pose may be wrong.
     """
     weight = wp.min(wp.float64(1.0), dt / wp.float64(constants.LOST_TIME))
     balance = int(0)
-    for m in range(lines):
-        n = memory.line[world, m].member
-        fits = memory.line[world, m].fits
+    for m in range(bearings):
+        n = memory.measurement[world, m].member
+        fits = memory.measurement[world, m].fits
         if n > 0:
             sender = memory.member[world, i, n].vehicle
-            share = memory.word[world, i, sender].missed_share
+            share = memory.monitor[world, i, sender].rejected_share
             share = share + (wp.float64(1 - fits) - share) * weight
-            memory.word[world, i, sender].missed_share = share
-            memory.word[world, i, sender].fitted_time += wp.float64(fits) * dt
+            memory.monitor[world, i, sender].rejected_share = share
+            memory.monitor[world, i, sender].fitted_time += wp.float64(fits) * dt
             fits = wp.where(share < wp.float64(0.5), 1, 0)
-        if n == 0 or memory.member[world, i, n].distrusted == 0:
+        if n == 0 or memory.member[world, i, n].excluded == 0:
             balance += 2 * fits - 1
     return balance > 0
 
 
 @device_function
-def test_missed(memory: Any, world: int, i: int, lines: int, dt: Any):
-    """Accuse a member to which most bearings do not fit, while those to most targets do."""
-    if not note_missed(memory, world, i, lines, dt):
+def test_rejected_bearings(memory: Any, world: int, i: int, bearings: int, dt: Any):
+    """Set a member as suspect if most bearings to it fail the gate and bearings to most targets pass."""
+    if not average_rejected_share(memory, world, i, bearings, dt):
         return
-    for m in range(lines):
-        n = memory.line[world, m].member
+    for m in range(bearings):
+        n = memory.measurement[world, m].member
         if n > 0:
             sender = memory.member[world, i, n].vehicle
-            missed = memory.word[world, i, sender].missed_share > wp.float64(constants.LOST_SHARE)
-            missed = missed and memory.line[world, m].fits == 0
-            if missed and memory.member[world, i, n].considered == 1:
-                far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
-                fitted = memory.word[world, i, sender].fitted_time > wp.float64(constants.LOST_TIME)
-                accuse(memory, world, i, n, far, wp.where(fitted, 1, 0))
+            rejected = memory.monitor[world, i, sender].rejected_share > wp.float64(constants.LOST_SHARE)
+            rejected = rejected and memory.measurement[world, m].fits == 0
+            if rejected and memory.member[world, i, n].considered == 1:
+                far = wp.length(memory.measurement[world, m].residual) * memory.measurement[world, m].distance
+                fitted = memory.monitor[world, i, sender].fitted_time > wp.float64(constants.LOST_TIME)
+                set_suspect(memory, world, i, n, far, wp.where(fitted, 1, 0))
 
 
 @wp.func
@@ -215,95 +217,97 @@ def size_squared(x: Any, P: Any):
 
 
 @device_function
-def certainty_of(memory: Any, world: int, i: int, sender: int):
-    """Return the information on how far a sender is from where it says, 1/m^2; at first there is hardly any."""
-    V = memory.word[world, i, sender].certainty
+def information_of(memory: Any, world: int, i: int, sender: int):
+    """Return the information on the error of a sender's position, 1/m^2, with a small initial value."""
+    V = memory.monitor[world, i, sender].information_matrix
     if wp.trace(V) == wp.float64(0.0):
-        V = wp.float64(constants.LEAST_CERTAINTY) * wp.identity(3, wp.float64)
+        V = wp.float64(constants.LEAST_INFORMATION) * wp.identity(3, wp.float64)
     return V
 
 
 @device_function
-def carry_evidence(memory: Any, world: int, i: int, sender: int, x: Any, variance: Any):
-    """Let evidence be about where a sender says to be now: x (m) from where odometry of a variance (m^2) has led."""
-    covariance = wp.inverse(certainty_of(memory, world, i, sender))
-    believed = covariance * memory.word[world, i, sender].offset - x
-    certainty = wp.inverse(covariance + variance * wp.identity(3, wp.float64))
-    memory.word[world, i, sender].certainty = certainty
-    memory.word[world, i, sender].offset = certainty * believed
+def propagate_information(memory: Any, world: int, i: int, sender: int, x: Any, variance: Any):
+    """Propagate the information to a sender's new report: correction x (m) after odometry of a variance (m^2)."""
+    covariance = wp.inverse(information_of(memory, world, i, sender))
+    estimated = covariance * memory.monitor[world, i, sender].information_vector - x
+    information = wp.inverse(covariance + variance * wp.identity(3, wp.float64))
+    memory.monitor[world, i, sender].information_matrix = information
+    memory.monitor[world, i, sender].information_vector = information * estimated
 
 
 @device_function
 def share_of(frame: Frame, memory: Any, world: int, dt: Any):
-    """Return which share of a frame's information counts: noise that is not the camera's lasts for many frames."""
+    """Return the share of a frame's information that counts: noise beyond the camera's is correlated over frames."""
     frames = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0))
     most = frame.variance
-    for m in range(frame.lines):
-        if memory.line[world, m].fits == 1:
-            lasting = frames * (memory.line[world, m].noise - frame.variance)
+    for m in range(frame.bearings):
+        if memory.measurement[world, m].fits == 1:
+            lasting = frames * (memory.measurement[world, m].noise - frame.variance)
             most = wp.max(most, frame.variance + lasting)
-    return wp.float64(constants.EVIDENCE_SHARE) * frame.variance / most
+    return wp.float64(constants.INNOVATION_SUM_SHARE) * frame.variance / most
 
 
 @device_function
-def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, share: Any):
-    """Add what a frame says of how far member n is from where it says, along the axes of the map."""
+def add_information(memory: Any, world: int, i: int, n: int, bearings: int, share: Any):
+    """Add a frame's information on the error of member n's position, along the axes of the map."""
     D = mat33d()
-    for m in range(lines):
-        if memory.line[world, m].fits == 1:
+    for m in range(bearings):
+        if memory.measurement[world, m].fits == 1:
             g = memory.gain[world, m, n]
-            K = memory.line[world, m].weight * g
+            K = memory.measurement[world, m].weight * g
             D = D + wp.transpose(K[:, 3:]) * g[:, 3:]
     R = memory.member[world, i, n].pose.R
     inverse = R * wp.inverse(block3(memory.P[world, i, n, n], 3, 3))
     sender = memory.member[world, i, n].vehicle
     correction = memory.scratch[world, n].full_correction
-    certainty = certainty_of(memory, world, i, sender) + share * (inverse * D * wp.transpose(inverse))
-    offset = memory.word[world, i, sender].offset + share * (inverse * correction[3:])
-    memory.word[world, i, sender].offset = offset
-    memory.word[world, i, sender].certainty = certainty
+    information = information_of(memory, world, i, sender) + share * (inverse * D * wp.transpose(inverse))
+    vector = memory.monitor[world, i, sender].information_vector + share * (inverse * correction[3:])
+    memory.monitor[world, i, sender].information_vector = vector
+    memory.monitor[world, i, sender].information_matrix = information
 
 
 @device_function
 def contradiction(memory: Any, world: int, i: int, n: int):
-    """Return by how much bearings contradict member n, squared in standard deviations."""
+    """Return the squared normalised error of member n that innovations reveal."""
     sender = memory.member[world, i, n].vehicle
-    certainty = certainty_of(memory, world, i, sender)
-    offset = memory.word[world, i, sender].offset
-    covariance = wp.inverse(certainty)
+    information = information_of(memory, world, i, sender)
+    vector = memory.monitor[world, i, sender].information_vector
+    covariance = wp.inverse(information)
     R = memory.member[world, i, n].pose.R
     P = R * block3(memory.P[world, i, n, n], 3, 3) * wp.transpose(R)
-    return size_squared(covariance * offset, P + covariance)
+    return size_squared(covariance * vector, P + covariance)
 
 
 @device_function
 def likely_error(memory: Any, world: int, i: int, n: int):
-    """Return how far member n is likely to be from where it says, m: some metre at most, unless bearings tell."""
+    """Return the most likely error of member n's position, m, with a prior of 1 m."""
     sender = memory.member[world, i, n].vehicle
-    certainty = certainty_of(memory, world, i, sender)
-    return wp.length(wp.inverse(certainty + wp.identity(3, wp.float64)) * memory.word[world, i, sender].offset)
+    information = information_of(memory, world, i, sender)
+    return wp.length(
+        wp.inverse(information + wp.identity(3, wp.float64)) * memory.monitor[world, i, sender].information_vector
+    )
 
 
 @device_function
-def test_words(frame: Frame, memory: Any, world: int, i: int, now: Any):
-    """Weigh a frame's bearings against what every member says; accuse the one that they contradict most."""
+def test_innovations(frame: Frame, memory: Any, world: int, i: int, now: Any):
+    """Add a frame's innovations to every considered member's sum; set the member that fails worst as suspect."""
     worst = int(0)
-    most = wp.float64(constants.WORD_GATE)
+    most = wp.float64(constants.INNOVATION_SUM_GATE)
     share = share_of(frame, memory, world, now.period)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].considered == 1:
-            note_evidence(memory, world, i, n, frame.lines, share)
+            add_information(memory, world, i, n, frame.bearings, share)
             size = contradiction(memory, world, i, n)
             if size > most:
                 worst = n
                 most = size
     if worst > 0:
-        accuse(memory, world, i, worst, likely_error(memory, world, i, worst), 1)
+        set_suspect(memory, world, i, worst, likely_error(memory, world, i, worst), 1)
 
 
 @device_function
 def has_jumped(model: Any, memory: Any, world: int, i: int, n: int, step: Any, dt: Any) -> bool:
-    """Return whether member n's odometry changes by more than brakes and steering can, as a repeated message's does."""
+    """Return whether member n's odometry changes faster than a vehicle can, as with a replayed message."""
     if memory.member[world, i, n].has_twist == 0:
         return False
     q = algebra.odometry_noise(model, i, dt)[1]
@@ -323,11 +327,10 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 def note_step(
     memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, lasting: Any, dt: Any
 ):
-    """Sum up by how far a sender says to be from where its odometry has led since its last report.
+    """Add to a sender's sums the step from its propagated last report to its new one; return the step (3,), m, map.
 
-    Who has been silent for long, or knows much less than before, may be anywhere. `noise` and `lasting` are variances
-    (rotation, translation) of the odometry, rad^2 and m^2; errors that last are the same in all steps of a sum.
-    Return how far (3,), m, in the map.
+    The sums restart after a long silence or a large growth of the covariance. `noise` and `lasting` are variances
+    (rotation, translation) of the odometry, rad^2 and m^2; lasting errors are the same in all steps of a sum.
     """
     step = algebra.between(last.odometry, report.odometry)
     carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
@@ -336,10 +339,10 @@ def note_step(
     before = block3(carried.P, 3, 3)
     N = before - block3(mat66d(report.P), 3, 3)
     gained = wp.trace(N)
-    word = memory.word[world, i, sender]
-    if dt > wp.float64(constants.SILENCE_TIME) or gained < -wp.float64(constants.ADMISSION) * wp.trace(before):
-        word.drift = Drift()
-        word.slow_drift = Drift()
+    monitor = memory.monitor[world, i, sender]
+    if dt > wp.float64(constants.SILENCE_TIME) or gained < -wp.float64(constants.RESET_GROWTH) * wp.trace(before):
+        monitor.drift = Drift()
+        monitor.slow_drift = Drift()
     one = wp.identity(3, wp.float64)
     N = symmetric_part(R * N * wp.transpose(R))
     if gained < wp.float64(0.0):
@@ -348,19 +351,19 @@ def note_step(
     same = lasting[1] * one
     fast = N + wp.float64(constants.DRIFT_TIME / constants.ERRORS_TIME) * same
     slow = N + wp.float64(constants.SLOW_DRIFT_TIME / constants.ERRORS_TIME) * same
-    word.drift = summed(word.drift, x, fast, dt, wp.float64(constants.DRIFT_TIME))
-    word.slow_drift = summed(word.slow_drift, x, slow, dt, wp.float64(constants.SLOW_DRIFT_TIME))
-    memory.word[world, i, sender] = word
+    monitor.drift = summed(monitor.drift, x, fast, dt, wp.float64(constants.DRIFT_TIME))
+    monitor.slow_drift = summed(monitor.slow_drift, x, slow, dt, wp.float64(constants.SLOW_DRIFT_TIME))
+    memory.monitor[world, i, sender] = monitor
     return x
 
 
 @device_function
 def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any):
-    """Return how far a sender has drifted from its odometry, in m, if by more than it may and by `least`, else 0."""
-    fast = memory.word[world, i, sender].drift
+    """Return a sender's drift from its odometry, m, if it exceeds the gate and `least` (m), else 0."""
+    fast = memory.monitor[world, i, sender].drift
     if size_squared(fast.sum, fast.covariance) > gate and wp.length(fast.sum) > least:
         return wp.length(fast.sum)
-    slow = memory.word[world, i, sender].slow_drift
+    slow = memory.monitor[world, i, sender].slow_drift
     if size_squared(slow.sum, slow.covariance) > gate and wp.length(slow.sum) > least:
         return wp.length(slow.sum)
     return wp.float64(0.0)
@@ -368,9 +371,9 @@ def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any)
 
 @device_function
 def drift_of(memory: Any, world: int, i: int, n: int):
-    """Return how far member n has drifted from its odometry, in m; 0 if by no more than it may, distrusted by less."""
+    """Return member n's drift from its odometry, m, 0 below the gate; the gate of an excluded member is lower."""
     sender = memory.member[world, i, n].vehicle
-    if memory.member[world, i, n].distrusted == 1:
+    if memory.member[world, i, n].excluded == 1:
         return drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR), wp.float64(0.0))
     P = memory.member[world, i, n].report.P
     std = wp.sqrt(wp.float64(constants.THIRD) * algebra.position_variance(P))

@@ -27,22 +27,22 @@ import warp as wp
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, distance_squared, position_variance, with_noise
 from coopenv.observers.robust.belief import index_of, own_estimate, put_own, set_anchor
-from coopenv.observers.robust.correction import correct_by_lines, iterated_update, store_poses
-from coopenv.observers.robust.correlated_fusion import by_clocks, place
-from coopenv.observers.robust.correlations import clear_told
+from coopenv.observers.robust.correction import correct_by_bearings, iterated_update, store_poses
+from coopenv.observers.robust.correlated_fusion import by_clocks, set_to_report
+from coopenv.observers.robust.correlations import clear_broadcasts
 from coopenv.observers.robust.measurements import (
     TRACKING,
     bearing_variance,
     innovation_squared,
-    is_heard,
+    is_received,
     linearise,
-    set_line,
-    set_lines,
+    set_bearing_measurement,
+    set_bearing_measurements,
     time_between,
 )
-from coopenv.observers.robust.memory import Alone, Estimate, Frame, Word, mat66d, vec2d, vec3d
+from coopenv.observers.robust.memory import Estimate, Frame, LandmarkOnlySolution, SenderMonitor, mat66d, vec2d, vec3d
 from coopenv.observers.robust.propagation import begin_errors, increment_noise, mounting_variances
-from coopenv.observers.robust.sender_monitor import distrust, forget_evidence
+from coopenv.observers.robust.sender_monitor import exclude, reset_monitors
 from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.warp_internals import device_function
 
@@ -50,69 +50,69 @@ from coopenv.world.warp_internals import device_function
 @device_function
 def is_disputed(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n is not believed because of bearings, and has not been so too often before."""
-    word = memory.word[world, i, memory.member[world, i, n].vehicle]
-    may_be_right = word.perjured == 0 and word.offences <= constants.MAX_REVISIONS
-    return memory.member[world, i, n].distrusted == 1 and may_be_right
+    monitor = memory.monitor[world, i, memory.member[world, i, n].vehicle]
+    may_be_right = monitor.self_inconsistent == 0 and monitor.exclusions <= constants.MAX_RETESTED_EXCLUSIONS
+    return memory.member[world, i, n].excluded == 1 and may_be_right
 
 
 @device_function
-def believe_again(model: Any, memory: Any, world: int, i: int, n: int):
+def readmit(model: Any, memory: Any, world: int, i: int, n: int):
     """Put member n where it says to be; how often it has not been believed, and its drift, are not forgotten."""
     sender = memory.member[world, i, n].vehicle
-    word = Word()
-    word.drift = memory.word[world, i, sender].drift
-    word.slow_drift = memory.word[world, i, sender].slow_drift
-    word.offences = memory.word[world, i, sender].offences
-    memory.word[world, i, sender] = word
-    memory.member[world, i, n].distrusted = 0
+    monitor = SenderMonitor()
+    monitor.drift = memory.monitor[world, i, sender].drift
+    monitor.slow_drift = memory.monitor[world, i, sender].slow_drift
+    monitor.exclusions = memory.monitor[world, i, sender].exclusions
+    memory.monitor[world, i, sender] = monitor
+    memory.member[world, i, n].excluded = 0
     depends_on = memory.member[world, i, n].report.depends_on
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
-    place(model, memory, world, i, n)
+    set_to_report(model, memory, world, i, n)
 
 
 @device_function
 def is_rejected(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n is not believed, or most bearings to it do not fit."""
-    share = memory.word[world, i, memory.member[world, i, n].vehicle].missed_share
-    return memory.member[world, i, n].distrusted == 1 or share > wp.float64(constants.LOST_SHARE)
+    share = memory.monitor[world, i, memory.member[world, i, n].vehicle].rejected_share
+    return memory.member[world, i, n].excluded == 1 or share > wp.float64(constants.LOST_SHARE)
 
 
 @device_function
-def set_told_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Set the lines of sight to members in view that may be right, where they have said last; return their frame."""
-    lines = int(0)
+    bearings = int(0)
     mounting = mounting_variances(model, i)
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         sender = target - model.landmarks
         if sender >= 0 and state.sight[world, i, target] == VISIBLE:
             member = index_of(memory, world, i, sender)
-            if member > 0 and is_heard(model, state, memory, world, i, sender, tick):
-                if memory.member[world, i, member].distrusted == 0 or is_disputed(memory, world, i, member):
+            if member > 0 and is_received(model, state, memory, world, i, sender, tick):
+                if memory.member[world, i, member].excluded == 0 or is_disputed(memory, world, i, member):
                     report = memory.inbox[world, i, sender]
                     gone = wp.float64(constants.MAX_SPEED) * wp.float64(tick - report.tick) * model.camera_period
                     P = mat66d(report.P) + by_clocks(model, memory, world, i, member)
                     variance = wp.float64(constants.THIRD) * position_variance(P) + gone * gone + mounting[1]
                     b = vec3d(body_bearing(model, state, world, i, target))
-                    set_line(memory, world, lines, 0, b, report.pose.p, variance)
-                    memory.line[world, lines].teller = member
-                    lines += 1
+                    set_bearing_measurement(memory, world, bearings, 0, b, report.pose.p, variance)
+                    memory.measurement[world, bearings].reported_by = member
+                    bearings += 1
     variance = bearing_variance(model, i) + mounting[0]
-    once = wp.float64(constants.BEND_TIME)  # a period for which what linearisations leave out counts once
-    return Frame(lines, 0, vec3d(model.camera[i].position), variance, once)
+    once = wp.float64(constants.LINEARISATION_TIME)  # a period for which what linearisations leave out counts once
+    return Frame(bearings, 0, vec3d(model.camera[i].position), variance, once)
 
 
 @device_function
-def cost_of(frame: Frame, memory: Any, world: int, i: int, alone: Estimate):
+def cost_of(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
     """Return what an estimate and the lines that are marked as fitting cost together; put the own pose between them.
 
     Infinite where the target of one is not ahead. Every other line costs as much as a wrong bearing.
     """
-    put_own(memory, world, i, alone)
+    put_own(memory, world, i, landmark_only)
     cost = wp.float64(0.0)
     fitting = int(0)
-    for n in range(frame.lines):
-        if memory.line[world, n].fits == 1:
+    for n in range(frame.bearings):
+        if memory.measurement[world, n].fits == 1:
             fitting += 1
             if not innovation_squared(frame, memory, world, i, n) < wp.float64(wp.inf):
                 return wp.float64(wp.inf)
@@ -120,42 +120,44 @@ def cost_of(frame: Frame, memory: Any, world: int, i: int, alone: Estimate):
             cost += wp.float64(constants.MAX_BEARING_COST)
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-    for n in range(frame.lines):
-        if memory.line[world, n].fits == 1:
+    for n in range(frame.bearings):
+        if memory.measurement[world, n].fits == 1:
             if not linearise(frame, memory, world, i, n):
                 return wp.float64(wp.inf)
-            cost += wp.length_sq(memory.line[world, n].residual) / memory.line[world, n].noise
-    return cost + distance_squared(alone, Estimate(memory.member[world, i, 0].pose, mat66d()))
+            cost += wp.length_sq(memory.measurement[world, n].residual) / memory.measurement[world, n].noise
+    return cost + distance_squared(landmark_only, Estimate(memory.member[world, i, 0].pose, mat66d()))
 
 
 @device_function
-def least_cost(frame: Frame, memory: Any, world: int, i: int, alone: Estimate):
+def least_cost(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
     """Return the member without whom bearings to all others cost least, that cost, and the own pose then."""
-    liar = int(0)
+    faulty = int(0)
     least = wp.float64(wp.inf)
-    pose = alone.pose
-    for n in range(frame.lines):
-        for m in range(frame.lines):
-            memory.line[world, m].fits = wp.where(m == n, 0, 1)
-        cost = cost_of(frame, memory, world, i, alone)
+    pose = landmark_only.pose
+    for n in range(frame.bearings):
+        for m in range(frame.bearings):
+            memory.measurement[world, m].fits = wp.where(m == n, 0, 1)
+        cost = cost_of(frame, memory, world, i, landmark_only)
         if cost < least:
             least = cost
-            liar = memory.line[world, n].teller
+            faulty = memory.measurement[world, n].reported_by
             pose = memory.member[world, i, 0].pose
-    return liar, least, pose
+    return faulty, least, pose
 
 
 @device_function
-def find_liar(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, alone: Estimate):
+def find_alternative_hypothesis(
+    model: Any, state: Any, memory: Any, world: int, i: int, tick: int, landmark_only: Estimate
+):
     """Return the frame, and without whom its bearings are explained much better than without those not believed.
 
     That is a member, 0 where all is well as it is. `alone` is what landmarks alone say; the own pose is back at last.
     """
-    frame = set_told_lines(model, state, memory, world, i, tick)
+    frame = set_report_measurements(model, state, memory, world, i, tick)
     rejected = int(0)
-    for n in range(frame.lines):
-        fits = wp.where(is_rejected(memory, world, i, memory.line[world, n].teller), 0, 1)
-        memory.line[world, n].fits = fits
+    for n in range(frame.bearings):
+        fits = wp.where(is_rejected(memory, world, i, memory.measurement[world, n].reported_by), 0, 1)
+        memory.measurement[world, n].fits = fits
         rejected += 1 - fits
     if rejected == 0:
         return frame, int(0)
@@ -164,55 +166,55 @@ def find_liar(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     others = memory.belief[world, i].others
     memory.belief[world, i].members = 1
     memory.belief[world, i].others = 1
-    cost = cost_of(frame, memory, world, i, alone)
-    liar, least, pose = least_cost(frame, memory, world, i, alone)
+    cost = cost_of(frame, memory, world, i, landmark_only)
+    faulty, least, pose = least_cost(frame, memory, world, i, landmark_only)
     memory.belief[world, i].members = members
     memory.belief[world, i].others = others
     put_own(memory, world, i, own)
     elsewhere = distance_squared(own, Estimate(pose, mat66d())) > wp.float64(constants.SEPARATION_GATE)
-    convincing = cost - least > wp.float64(constants.REVISION_MARGIN)
-    return frame, wp.where(elsewhere and convincing, liar, 0)
+    convincing = cost - least > wp.float64(constants.RETEST_MARGIN)
+    return frame, wp.where(elsewhere and convincing, faulty, 0)
 
 
-LASTING_FRAME = constants.BEND_TIME / constants.CONSIDERED_BEND_TIME
+LASTING_FRAME = constants.LINEARISATION_TIME / constants.CONSIDERED_LINEARISATION_TIME
 """Share of its period that a frame counts for, so that what a linearisation leaves out is the same for longer."""
 
 
 @device_function
-def begin_alone(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
+def begin_landmark_only(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
     """Begin with an estimate at a tick."""
-    memory.alone[world, i].begun = 1
-    memory.alone[world, i].tick = tick
-    memory.alone[world, i].odometry = memory.belief[world, i].odometry
-    memory.alone[world, i].estimate = estimate
+    memory.landmark_only[world, i].begun = 1
+    memory.landmark_only[world, i].tick = tick
+    memory.landmark_only[world, i].odometry = memory.belief[world, i].odometry
+    memory.landmark_only[world, i].estimate = estimate
 
 
 @device_function
-def begin_told(model: Any, memory: Any, world: int, i: int):
+def begin_broadcasts(model: Any, memory: Any, world: int, i: int):
     """Forget what was sent and received; begin with the initial estimate, unless the pose is searched for.
 
     A search may use what anybody says; who begins with an estimate depends on nobody yet.
     """
-    clear_told(model, memory, world, i)
-    memory.alone[world, i] = Alone()
+    clear_broadcasts(model, memory, world, i)
+    memory.landmark_only[world, i] = LandmarkOnlySolution()
     if memory.search[world, i].active == 0:
         memory.belief[world, i].depends_on = wp.uint64(0)
-        begin_alone(memory, world, i, own_estimate(memory, world, i), 0)
+        begin_landmark_only(memory, world, i, own_estimate(memory, world, i), 0)
 
 
 @device_function
-def follow_alone(model: Any, memory: Any, world: int, i: int, tick: int):
+def propagate_landmark_only(model: Any, memory: Any, world: int, i: int, tick: int):
     """Carry the estimate on by odometry; return for which time, s."""
-    alone = memory.alone[world, i]
-    elapsed = wp.float64(tick - alone.tick) * model.camera_period
-    step = between(alone.odometry, memory.belief[world, i].odometry)
-    noise = wp.float64(constants.ALONE_NOISE) * increment_noise(model, memory, world, i, step, elapsed)
-    begin_alone(memory, world, i, carried(alone.estimate, step, noise), tick)
+    landmark_only = memory.landmark_only[world, i]
+    elapsed = wp.float64(tick - landmark_only.tick) * model.camera_period
+    step = between(landmark_only.odometry, memory.belief[world, i].odometry)
+    noise = wp.float64(constants.LANDMARK_ONLY_NOISE) * increment_noise(model, memory, world, i, step, elapsed)
+    begin_landmark_only(memory, world, i, carried(landmark_only.estimate, step, noise), tick)
     return elapsed
 
 
 @device_function
-def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> int:
+def correct_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> int:
     """Correct the estimate by the landmarks of a frame, elapsed (s) after the last one; return how many fit.
 
     Where none fits that are in view, it begins anew.
@@ -223,27 +225,27 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
     others = memory.belief[world, i].others
     memory.belief[world, i].members = 1
     memory.belief[world, i].others = 1
-    put_own(memory, world, i, memory.alone[world, i].estimate)
-    frames = wp.max(wp.float64(constants.CONSIDERED_BEND_TIME) / elapsed, wp.float64(1.0))
-    mounting = wp.float64(constants.ALONE_NOISE) * frames * mounting_variances(model, i)
-    variance = wp.float64(constants.ALONE_NOISE) * frame.variance + mounting[0]
-    alone = Frame(frame.lines, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
+    put_own(memory, world, i, memory.landmark_only[world, i].estimate)
+    frames = wp.max(wp.float64(constants.CONSIDERED_LINEARISATION_TIME) / elapsed, wp.float64(1.0))
+    mounting = wp.float64(constants.LANDMARK_ONLY_NOISE) * frames * mounting_variances(model, i)
+    variance = wp.float64(constants.LANDMARK_ONLY_NOISE) * frame.variance + mounting[0]
+    inflated = Frame(frame.bearings, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
     fitting = int(0)
     landmarks = int(0)
-    for n in range(alone.lines):
+    for n in range(inflated.bearings):
         fits = int(0)
-        if memory.line[world, n].member == 0:
+        if memory.measurement[world, n].member == 0:
             landmarks += 1
-            memory.line[world, n].variance = mounting[1]
-            if innovation_squared(alone, memory, world, i, n) < wp.float64(constants.BEARING_GATE):
+            memory.measurement[world, n].variance = mounting[1]
+            if innovation_squared(inflated, memory, world, i, n) < wp.float64(constants.BEARING_GATE):
                 fits = 1
-        memory.line[world, n].fits = fits
+        memory.measurement[world, n].fits = fits
         fitting += fits
     if fitting > 0:
-        iterated_update(alone, memory, world, i)
-        memory.alone[world, i].estimate = own_estimate(memory, world, i)
+        iterated_update(inflated, memory, world, i)
+        memory.landmark_only[world, i].estimate = own_estimate(memory, world, i)
     elif landmarks > 0:
-        memory.alone[world, i].begun = 0
+        memory.landmark_only[world, i].begun = 0
     memory.belief[world, i].members = members
     memory.belief[world, i].others = others
     put_own(memory, world, i, own)
@@ -270,25 +272,25 @@ def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
 
 
 @device_function
-def is_believed(memory: Any, world: int, i: int, n: int) -> bool:
+def is_fused_sender(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether the n-th bearing is to a sender that is believed."""
-    member = memory.line[world, n].member
+    member = memory.measurement[world, n].member
     return member > 0 and memory.member[world, i, member].considered == 1
 
 
 @device_function
-def cost_without(memory: Any, world: int, i: int, lines: int, without: int):
+def cost_without(memory: Any, world: int, i: int, bearings: int, without: int):
     """Return what the bearings to all senders cost that are believed, but for one line."""
-    for n in range(lines):
+    for n in range(bearings):
         fits = int(0)
-        if n != without and is_believed(memory, world, i, n):
+        if n != without and is_fused_sender(memory, world, i, n):
             fits = 1
-        memory.line[world, n].fits = fits
-    return correct_by_lines(memory, world, i, lines, False)
+        memory.measurement[world, n].fits = fits
+    return correct_by_bearings(memory, world, i, bearings, False)
 
 
 @device_function
-def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
+def find_fault_hypothesis(frame: Frame, memory: Any, world: int, i: int, suspect: int):
     """Return the sender without whom bearings to the others cost least, that cost, and that without the accused one.
 
     Besides how many bearings to senders there are. The own pose is what landmarks alone say meanwhile. The sender is a
@@ -296,27 +298,29 @@ def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
     is out of view.
     """
     own = own_estimate(memory, world, i)
-    exchange_own(memory, world, i, memory.alone[world, i].estimate)
-    culprit = int(0)
+    exchange_own(memory, world, i, memory.landmark_only[world, i].estimate)
+    faulty = int(0)
     least = wp.float64(wp.inf)
     without = wp.float64(wp.inf)
     count = int(0)
-    for n in range(frame.lines):
+    for n in range(frame.bearings):
         if not innovation_squared(frame, memory, world, i, n) < wp.float64(wp.inf):
-            memory.line[world, n].residual = vec2d(wp.float64(constants.NOT_AHEAD), wp.float64(constants.NOT_AHEAD))
+            memory.measurement[world, n].residual = vec2d(
+                wp.float64(constants.NOT_AHEAD), wp.float64(constants.NOT_AHEAD)
+            )
     store_poses(memory, world, i)
-    for n in range(frame.lines):
-        if is_believed(memory, world, i, n):
+    for n in range(frame.bearings):
+        if is_fused_sender(memory, world, i, n):
             count += 1
-            cost = cost_without(memory, world, i, frame.lines, n)
-            member = memory.line[world, n].member
+            cost = cost_without(memory, world, i, frame.bearings, n)
+            member = memory.measurement[world, n].member
             if cost < least:
-                culprit = member
+                faulty = member
                 least = cost
-            if member == accused:
+            if member == suspect:
                 without = cost
     restore_own(memory, world, i, own)
-    return culprit, least, without, count
+    return faulty, least, without, count
 
 
 @wp.func
@@ -334,11 +338,11 @@ def consistent_cost(bearings: int):
 
 
 @device_function
-def stand_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int, culprit: int):
+def revert_to_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int, faulty: int):
     """Believe what landmarks alone say, and a culprit and all that contradict landmarks by themselves no more."""
-    alone = memory.alone[world, i].estimate
-    away = wp.length(alone.pose.p - memory.member[world, i, 0].pose.p)
-    exchange_own(memory, world, i, alone)
+    landmark_only = memory.landmark_only[world, i].estimate
+    away = wp.length(landmark_only.pose.p - memory.member[world, i, 0].pose.p)
+    exchange_own(memory, world, i, landmark_only)
     members = memory.belief[world, i].members
     others = memory.belief[world, i].others
     for k in range(1, members):
@@ -347,71 +351,73 @@ def stand_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, tick:
                 memory.P[world, i, k, j] = mat66d()
                 memory.P[world, i, j, k] = mat66d()
     begin_errors(model, memory, world, i)
-    forget_evidence(memory, world, i)
+    reset_monitors(memory, world, i)
     for k in range(others, members):
         if memory.member[world, i, k].considered == 0:
             noise = vec2d(wp.float64(0.0), away * away)
             memory.P[world, i, k, k] = with_noise(memory.P[world, i, k, k], noise)
-    memory.belief[world, i].missed_share = wp.float64(0.0)
-    set_anchor(memory, world, i, alone.P, tick)
-    memory.alone[world, i].exposed = 0
-    for n in range(frame.lines):
-        if is_believed(memory, world, i, n):
+    memory.belief[world, i].rejected_share = wp.float64(0.0)
+    set_anchor(memory, world, i, landmark_only.P, tick)
+    memory.landmark_only[world, i].exposed = 0
+    for n in range(frame.bearings):
+        if is_fused_sender(memory, world, i, n):
             fits = innovation_squared(frame, memory, world, i, n) < wp.float64(constants.BEARING_GATE)
-            member = memory.line[world, n].member
-            if member == culprit or not fits:
-                far = wp.length(memory.line[world, n].residual) * memory.line[world, n].distance
-                distrust(model, memory, world, i, member, tick, far, False)
+            member = memory.measurement[world, n].member
+            if member == faulty or not fits:
+                far = wp.length(memory.measurement[world, n].residual) * memory.measurement[world, n].distance
+                exclude(model, memory, world, i, member, tick, far, False)
 
 
 @device_function
-def judge_accused(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+def test_suspect(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
     """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
-    accused = memory.belief[world, i].accused
-    follow_alone(model, memory, world, i, tick)
-    culprit, least, without, _ = find_culprit(frame, memory, world, i, accused)
+    suspect = memory.belief[world, i].suspect
+    propagate_landmark_only(model, memory, world, i, tick)
+    faulty, least, without, _ = find_fault_hypothesis(frame, memory, world, i, suspect)
     if wp.isfinite(without) and without - least > wp.float64(constants.DISPUTE_MARGIN):
-        stand_alone(model, frame, memory, world, i, tick, culprit)
+        revert_to_landmark_only(model, frame, memory, world, i, tick, faulty)
     else:
-        followed = memory.belief[world, i].accused_followed == 1
-        distrust(model, memory, world, i, accused, tick, memory.belief[world, i].accused_error, followed)
+        fused = memory.belief[world, i].suspect_fused == 1
+        exclude(model, memory, world, i, suspect, tick, memory.belief[world, i].suspect_error, fused)
 
 
 @device_function
-def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+def test_separation(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
     """Leave the belief where it is not what landmarks alone say.
 
     But where several senders contradict that and hardly a landmark is in view, odometry may be wrong: that begins anew.
     """
-    elapsed = follow_alone(model, memory, world, i, tick)
-    landmarks = correct_alone(model, frame, memory, world, i, elapsed)
-    exposed = memory.alone[world, i].exposed == 1
+    elapsed = propagate_landmark_only(model, memory, world, i, tick)
+    landmarks = correct_landmark_only(model, frame, memory, world, i, elapsed)
+    exposed = memory.landmark_only[world, i].exposed == 1
     pose = memory.member[world, i, 0].pose
-    away = distance_squared(memory.alone[world, i].estimate, Estimate(pose, mat66d()))
+    away = distance_squared(memory.landmark_only[world, i].estimate, Estimate(pose, mat66d()))
     if exposed and landmarks > 0 and away > wp.float64(constants.SEPARATION_GATE):
-        culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
-        alone = count == 0 or least <= consistent_cost(count - 1)
-        if alone or landmarks >= constants.ENOUGH_LANDMARKS:
-            stand_alone(model, frame, memory, world, i, tick, culprit)
+        faulty, least, _, count = find_fault_hypothesis(frame, memory, world, i, 0)
+        consistent = count == 0 or least <= consistent_cost(count - 1)
+        if consistent or landmarks >= constants.ENOUGH_LANDMARKS:
+            revert_to_landmark_only(model, frame, memory, world, i, tick, faulty)
         else:
-            memory.alone[world, i].begun = 0
+            memory.landmark_only[world, i].begun = 0
 
 
 @device_function
-def revise(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+def retest_exclusion(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Believe others than so far where that explains this frame's bearings better."""
-    frame, liar = find_liar(model, state, memory, world, i, now.tick, memory.alone[world, i].estimate)
-    if liar == 0:
+    frame, faulty = find_alternative_hypothesis(
+        model, state, memory, world, i, now.tick, memory.landmark_only[world, i].estimate
+    )
+    if faulty == 0:
         return
-    for n in range(frame.lines):
-        k = memory.line[world, n].teller
-        if k != liar and memory.member[world, i, k].distrusted == 1:
-            believe_again(model, memory, world, i, k)
+    for n in range(frame.bearings):
+        k = memory.measurement[world, n].reported_by
+        if k != faulty and memory.member[world, i, k].excluded == 1:
+            readmit(model, memory, world, i, k)
     period = time_between(model, state, world, i, now)
-    frame = set_lines(model, state, memory, world, i, now.tick, period, TRACKING)
-    stand_alone(model, frame, memory, world, i, now.tick, liar)
-    if memory.member[world, i, liar].distrusted == 0:
-        distrust(model, memory, world, i, liar, now.tick, wp.float64(0.0), False)
+    frame = set_bearing_measurements(model, state, memory, world, i, now.tick, period, TRACKING)
+    revert_to_landmark_only(model, frame, memory, world, i, now.tick, faulty)
+    if memory.member[world, i, faulty].excluded == 0:
+        exclude(model, memory, world, i, faulty, now.tick, wp.float64(0.0), False)
 
 
 @device_function
@@ -419,32 +425,32 @@ def note_exposure(memory: Any, world: int, i: int):
     """Note whether any sender is believed: then the belief may be misled."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].considered == 1:
-            memory.alone[world, i].exposed = 1
+            memory.landmark_only[world, i].exposed = 1
 
 
 @device_function
 def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Judge whom this frame's bearings contradict, and now and then the belief as a whole."""
     if memory.search[world, i].active == 1:
-        memory.alone[world, i].begun = 0
+        memory.landmark_only[world, i].begun = 0
     elif now.due:
-        if memory.alone[world, i].begun == 0:
+        if memory.landmark_only[world, i].begun == 0:
             variances = vec2d(
                 wp.float64(constants.KNOWN_ANGLE * constants.KNOWN_ANGLE),
                 wp.float64(constants.KNOWN_POSITION * constants.KNOWN_POSITION),
             )
             pose = memory.member[world, i, 0].pose
-            begin_alone(memory, world, i, Estimate(pose, with_noise(mat66d(), variances)), now.tick)
+            begin_landmark_only(memory, world, i, Estimate(pose, with_noise(mat66d(), variances)), now.tick)
         note_exposure(memory, world, i)
-        since = wp.float64(now.tick - memory.alone[world, i].tick) * model.camera_period
-        looking = since > wp.float64(constants.ALONE_TIME - constants.SAME_TIME)
-        if looking or memory.belief[world, i].accused > 0:
+        since = wp.float64(now.tick - memory.landmark_only[world, i].tick) * model.camera_period
+        looking = since > wp.float64(constants.LANDMARK_ONLY_PERIOD - constants.SAME_TIME)
+        if looking or memory.belief[world, i].suspect > 0:
             period = time_between(model, state, world, i, now)
-            frame = set_lines(model, state, memory, world, i, now.tick, period, TRACKING)
-            if memory.belief[world, i].accused > 0:
-                judge_accused(model, frame, memory, world, i, now.tick)
+            frame = set_bearing_measurements(model, state, memory, world, i, now.tick, period, TRACKING)
+            if memory.belief[world, i].suspect > 0:
+                test_suspect(model, frame, memory, world, i, now.tick)
             else:
-                judge_belief(model, frame, memory, world, i, now.tick)
-                if memory.alone[world, i].begun == 1:
-                    revise(model, state, memory, world, i, now)
-    memory.belief[world, i].accused = 0
+                test_separation(model, frame, memory, world, i, now.tick)
+                if memory.landmark_only[world, i].begun == 1:
+                    retest_exclusion(model, state, memory, world, i, now)
+    memory.belief[world, i].suspect = 0

@@ -15,7 +15,7 @@ from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d
-from coopenv.world.v2x import as_told, claimed_std, content_tick
+from coopenv.world.v2x import as_broadcast, claimed_std, content_tick
 from coopenv.world.warp_internals import device_function
 
 LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
@@ -65,9 +65,9 @@ def clear_messages(model: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def told_report(model: Any, state: Any, world: int, i: int, report: Report):
+def broadcast_report(model: Any, state: Any, world: int, i: int, report: Report):
     """Return a report as a vehicle broadcasts it, which may lie, see `[faults]`."""
-    R, p = as_told(model, state, world, i, report.pose.R, report.pose.p)
+    R, p = as_broadcast(model, state, world, i, report.pose.R, report.pose.p)
     report.pose = Pose(R, p)
     std = wp.float32(claimed_std(model, state, world, i, report.tick))
     if std > wp.float32(0.0):
@@ -79,7 +79,7 @@ def told_report(model: Any, state: Any, world: int, i: int, report: Report):
 def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due."""
     if tick % model.radio.period == 0:
-        report = told_report(model, state, world, i, own_report(model, memory, world, i, tick))
+        report = broadcast_report(model, state, world, i, own_report(model, memory, world, i, tick))
         memory.outbox[world, i, tick % model.radio.slots] = report
 
 
@@ -124,20 +124,20 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: 
 
 
 @device_function
-def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any):
+def test_sender(memory: Any, world: int, i: int, n: int, reported: Estimate, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
-    believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-    agrees = algebra.distance_squared(believed, told) < wp.float64(constants.MESSAGE_GATE)
+    estimated = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+    agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.MESSAGE_GATE)
     agreed = wp.float64(0.0)
-    distrusted = wp.where(agrees, 0, 1)
-    if memory.member[world, i, n].distrusted == 1:
-        away = algebra.left_error(believed.pose, told.pose)
-        agrees = algebra.distance_squared(believed, told) < wp.float64(constants.AGREEMENT_GATE)
+    excluded = wp.where(agrees, 0, 1)
+    if memory.member[world, i, n].excluded == 1:
+        away = algebra.left_error(estimated.pose, reported.pose)
+        agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.AGREEMENT_GATE)
         if agrees and wp.length(away[3:]) < wp.float64(constants.AGREEMENT_DISTANCE):
             agreed = memory.member[world, i, n].agreement_time + dt
-        distrusted = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)
+        excluded = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)
     memory.member[world, i, n].agreement_time = agreed
-    memory.member[world, i, n].distrusted = distrusted
+    memory.member[world, i, n].excluded = excluded
 
 
 @device_function
@@ -154,7 +154,7 @@ def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
     In a circle of vehicles the one that knows its place best does not follow the one before it: the rest has an order,
     as the paper's Assumption 1 has it for all.
     """
-    shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].untold == 1
+    shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].correlation_unknown == 1
     if memory.member[world, i, n].considered == 0 or not shares:
         return False
     own = algebra.position_variance(memory.P[world, i, 0, 0])

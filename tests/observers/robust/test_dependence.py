@@ -41,7 +41,7 @@ def test_nobody_in_a_lane_is_met_again() -> None:
     memory: Any = world.memory
     for _ in range(20):
         world.advance(6)
-        assert (memory.member.numpy()["untold"] == 0).all()
+        assert (memory.member.numpy()["correlation_unknown"] == 0).all()
 
 
 def meeting(worlds: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,7 +57,7 @@ def meeting(worlds: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, np.n
         engine.step()
         found.append(nees_of(engine.world))
         memory: Any = engine.world.memory
-        marked.append(memory.member.numpy()["untold"].mean())
+        marked.append(memory.member.numpy()["correlation_unknown"].mean())
     nees, errors = (np.array(part)[15:] for part in zip(*found, strict=True))
     return np.nanmean(nees, axis=(0, 2)), np.sqrt(np.nanmean(errors**2, axis=(0, 2))), np.array(marked)
 

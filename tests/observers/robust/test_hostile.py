@@ -15,7 +15,7 @@ import pytest
 from coopenv.observers import Message, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.observers.robust.test_liars import scene
+from tests.observers.robust.test_lies import scene
 
 
 @dataclass

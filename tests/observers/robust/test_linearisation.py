@@ -51,7 +51,7 @@ def noise_of(P: np.ndarray, dt: float = SLOW) -> np.ndarray:
     """Return (5,) the variances of the bearings to landmarks beyond the camera's, rad^2."""
     observer = started(AT, P)
     observer.update(tick(observer, 1, bearings={n: direction(AT, LANDMARKS[n]) for n in range(5)}, dt=dt))
-    return observer.memory.line["noise"][:5] - NOISE.bearing**2
+    return observer.memory.measurement["noise"][:5] - NOISE.bearing**2
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -87,7 +87,7 @@ def test_that_of_a_sender_counts_by_the_errors_of_both() -> None:
         sender.update(tick(sender, 1))
         b = direction(AT, there[1] + there[0] @ MARKER)
         observer.update(tick(observer, 1, bearings={6: b}, messages={1: (sender.message(), 0.0)}))
-        noise.append(observer.memory.line["noise"][0] - NOISE.bearing**2)
+        noise.append(observer.memory.measurement["noise"][0] - NOISE.bearing**2)
     assert noise[0] > 0.0
     assert_allclose(noise[1], noise[0], rtol=0.05)
     assert_allclose(noise[2], 4.0 * noise[0], rtol=0.05)

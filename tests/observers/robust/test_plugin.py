@@ -142,7 +142,7 @@ def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
     class Kidnapped(OpenRobust):
         def update(self, tick):
             if tick.index == 300 and self.setup.vehicle == 0:
-                for pose in (self.members["pose"][0], self.memory.alone["estimate"]["pose"]):
+                for pose in (self.members["pose"][0], self.memory.landmark_only["estimate"]["pose"]):
                     pose["p"] += np.array([20.0, -15.0, 1.0])
                     pose["R"] = np.diag([-1.0, -1.0, 1.0]) @ pose["R"]
             return super().update(tick)

@@ -20,7 +20,7 @@ from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.launch import start_warp
 from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_observers import OpenRobust
-from tests.observers.robust.test_liars import scene
+from tests.observers.robust.test_lies import scene
 
 start_warp()
 
@@ -56,7 +56,7 @@ def nees_alone(scenario: Scenario, worlds: int, seconds: int) -> np.ndarray:
     found = []
     for k in range(seconds):
         world.advance(60)
-        alone = world.memory.alone.numpy()
+        alone = world.memory.landmark_only.numpy()
         assert alone["begun"].all()
         estimate = alone["estimate"]
         R, p = (world.view(name)[:, world.model.landmarks :] for name in ("rotation", "position"))
@@ -88,7 +88,7 @@ def test_who_hears_nobody_does_not_go_back() -> None:
     world = simulate(scene(horizon=6.0), 2)
     reset(world, range(2))
     world.advance(300)
-    assert world.memory.alone.numpy()["exposed"].tolist() == [[0, 1, 1, 1, 1]] * 2
+    assert world.memory.landmark_only.numpy()["exposed"].tolist() == [[0, 1, 1, 1, 1]] * 2
 
 
 def test_who_is_accused_and_out_of_view_is_blamed_alone() -> None:
@@ -99,8 +99,8 @@ def test_who_is_accused_and_out_of_view_is_blamed_alone() -> None:
         def update(self, tick: Any) -> Any:
             if self.setup.vehicle != 4 or tick.index != 295:
                 return super().update(tick)
-            self.memory.belief["accused"] = 1 + self.member_numbers[1:].index(1)
-            self.memory.belief["accused_error"] = 0.3
+            self.memory.belief["suspect"] = 1 + self.member_numbers[1:].index(1)
+            self.memory.belief["suspect_error"] = 0.3
             hidden = tick.targets == self.setup.landmarks + 1
             estimate = super().update(replace(tick, valid=tick.valid & ~hidden))
             trusted.append(self.trusted)

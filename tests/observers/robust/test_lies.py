@@ -1,7 +1,7 @@
 """Who lies is found out before it costs much: five vehicles of which each sees at least two honest targets besides.
 
 The paper's intersection with more neighbours. Honest errors are compared with those in the same worlds without a lie.
-`pytest -s -m slow tests/observers/robust/test_liars.py` prints the table of docs/robust_evidence.md.
+`pytest -s -m slow tests/observers/robust/test_lies.py` prints the table of docs/robust_evidence.md.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def test_who_is_honest_is_believed() -> None:
     world = simulate(scene(), 8)
     reset(world, range(8))
     world.advance(60 * 25)
-    assert world.memory.word.numpy()["offences"].sum() <= 1
+    assert world.memory.monitor.numpy()["exclusions"].sum() <= 1
 
 
 def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +99,7 @@ def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.nd
     world.advance(60 * seconds)
     state = {name: world.view(name).copy() for name in ("rotation", "position")}
     state |= {name: world.view(name).copy() for name in ("estimate_rotation", "estimate_position")}
-    return world.memory.word.numpy()["offences"][0], errors(world, state)[0][0]
+    return world.memory.monitor.numpy()["exclusions"][0], errors(world, state)[0][0]
 
 
 @pytest.mark.parametrize(
