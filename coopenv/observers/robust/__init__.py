@@ -1,5 +1,6 @@
 """The observer `robust` as Warp functions: observer.py is one tick, and the place to begin.
 
-They run embedded in the world's kernels, and for one vehicle on the host.
-`tests/observers/robust` compares functions with SciPy, and whole filters with their invariances and bounds.
+Per tick: propagation.py, correlated_fusion.py (messages), correction.py (bearings), solution_separation.py (integrity).
+search.py finds a lost pose. The functions run embedded in the world's kernels, and for one vehicle on the host.
+`robust_joint` shares all but its messages (joint_messages.py) and their fusion (joint_fusion.py).
 """

@@ -1,8 +1,8 @@
-"""The joint belief of one vehicle: its own pose and those of vehicles that it hears, with one covariance.
+"""The belief: the joint state of the vehicle itself and of the vehicles that it receives, with one covariance.
 
-Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first; the
-covariance is kept in blocks of 6x6. A member stands where its last message put it. Where there is no room for another
-one, the member that has been out of view for longest has to leave.
+Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first. The
+covariance is kept in blocks of 6x6. A member's pose is the one of its last fused report. If a new member needs room,
+the member that has been out of view for longest is evicted.
 """
 
 from typing import Any
@@ -39,7 +39,7 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 @device_function
 def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
-    """Believe in the vehicle itself alone, and of its odometry's errors what was believed before."""
+    """Begin the belief with the vehicle itself; the calibration states are kept without correlations."""
     others = memory.belief[world, i].others
     memory.belief[world, i].members = others
     for k in range(1, others):
@@ -53,20 +53,20 @@ def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
 
 @device_function
 def own_estimate(memory: Any, world: int, i: int):
-    """Return what is believed of the vehicle itself."""
+    """Return the own estimate."""
     return Estimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
 
 
 @device_function
 def put_own(memory: Any, world: int, i: int, estimate: Estimate):
-    """Put the vehicle itself where an estimate says."""
+    """Set the own pose and covariance to an estimate."""
     memory.member[world, i, 0].pose = estimate.pose
     memory.P[world, i, 0, 0] = estimate.P
 
 
 @device_function
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
-    """Carry a member through an increment of odometry with noise."""
+    """Propagate a member by an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
     for k in range(memory.belief[world, i].members):
         if k != n:
@@ -84,13 +84,13 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 @device_function
 def is_free(memory: Any, world: int, i: int, k: int) -> bool:
-    """Return whether bearings correct a member; those of others that are considered are as they say."""
+    """Return whether bearings correct a member; a considered member keeps its reported pose."""
     return memory.member[world, i, k].considered == 0
 
 
 @device_function
 def correct_member(memory: Any, world: int, i: int, k: int):
-    """Move a member by its correction, and set the derivative of errors about where it is then by those before."""
+    """Apply a member's correction, and set the derivative of errors about the new pose by those about the old."""
     correction = memory.scratch[world, k].correction
     G = wp.identity(6, wp.float64)
     if k != ERRORS or memory.belief[world, i].others <= ERRORS:
@@ -104,7 +104,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
 
 @device_function
 def apply_corrections(memory: Any, world: int, i: int):
-    """Move all members that are free by their corrections, and let the covariance be about where they are then."""
+    """Apply the corrections of all free members, and recentre the covariance about the new poses."""
     for k in range(memory.belief[world, i].members):
         free = is_free(memory, world, i, k)
         if free:
@@ -211,6 +211,6 @@ def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
 
 @device_function
 def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
-    """Remember where the vehicle is, for a search after a loss."""
+    """Store the own pose as the anchor: the prior of a search after a loss."""
     here = Estimate(memory.member[world, i, 0].pose, P)
     memory.anchor[world, i] = Anchor(here, memory.belief[world, i].odometry, tick)

@@ -1,4 +1,4 @@
-"""The correction of the belief by a frame's bearings."""
+"""The iterated correction of the belief by a frame's bearings."""
 
 from typing import Any
 
@@ -22,9 +22,9 @@ def store_poses(memory: Any, world: int, i: int):
 
 @device_function
 def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
-    """Linearise the lines at where a share of the correction puts the poses, in the errors about those before.
+    """Linearise the bearings after a share of the correction, in errors about the poses before the correction.
 
-    Members that are considered stay.
+    Considered members stay.
     """
     for k in range(memory.belief[world, i].members):
         if is_free(memory, world, i, k):
@@ -50,7 +50,7 @@ def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
 
 @device_function
 def set_gain(memory: Any, world: int, i: int, n: int):
-    """Let a line's `gain`, H P, be with the covariance that the lines before leave, and set its `weight` S^-1."""
+    """Set a bearing's `gain` H P, with P after the earlier bearings, and its `weight` S^-1."""
     members = memory.belief[world, i].members
     for m in range(n):
         if memory.measurement[world, m].fits == 1:
@@ -65,7 +65,7 @@ def set_gain(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def hold_considered(memory: Any, world: int, i: int):
-    """Take back the corrections of the members that are considered."""
+    """Set the corrections of considered members to zero."""
     for k in range(memory.belief[world, i].members):
         if not is_free(memory, world, i, k):
             memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
@@ -74,17 +74,16 @@ def hold_considered(memory: Any, world: int, i: int):
 
 @device_function
 def error_left(memory: Any, world: int, k: int):
-    """Return where the lines were linearised, less the correction so far."""
+    """Return the linearisation point less the correction so far."""
     return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
 
 
 @device_function
 def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool):
-    """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
+    """Find the correction by all bearings that fit, without a change of the covariance; return the sum of their NIS.
 
-    One line after the other, with the residual that those before have left, is the batch update. `judging`: lines are
-    as the gate has linearised and projected them, and those to members have to fit what those before leave. Return the
-    sum of the innovations squared, normalised.
+    A sequential update with the residuals that the earlier bearings leave equals the batch update. With `gating`, the
+    bearings are those that the gate has linearised and projected; bearings to members are gated again sequentially.
     """
     total = wp.float64(0.0)
     members = memory.belief[world, i].members
@@ -121,7 +120,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
 
 @device_function
 def condense(memory: Any, world: int, i: int, bearings: int):
-    """Let the covariance be that after the lines that fit; that of errors that are only considered stays."""
+    """Update the covariance by the bearings that fit; that of considered errors stays."""
     for k in range(memory.belief[world, i].members):
         for j in range(k + 1):
             if is_free(memory, world, i, k) or is_free(memory, world, i, j):
@@ -135,7 +134,7 @@ def condense(memory: Any, world: int, i: int, bearings: int):
 
 @device_function
 def nearest(memory: Any, world: int, bearings: int):
-    """Return the distance of the nearest target whose line fits, m."""
+    """Return the distance of the nearest target whose bearing fits, m."""
     distance = wp.float64(wp.inf)
     for n in range(bearings):
         if memory.measurement[world, n].fits == 1:
@@ -145,16 +144,16 @@ def nearest(memory: Any, world: int, bearings: int):
 
 @wp.func
 def turn_of_sight(error: Any, distance: Any):
-    """Return by how much an error turns a line of sight of a length, rad."""
+    """Return the angle by which an error turns a line of sight to a distance, rad."""
     size = wp.abs(error)
     return wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance)
 
 
 @device_function
 def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
-    """Return at which share of the correction to linearise next, 0 if that would be where it was done last.
+    """Return the share of the correction at which to linearise next, 0 if that is near the last linearisation point.
 
-    All of it where it turns a line of sight far, else half.
+    The share is 1 if the correction turns a line of sight far, else 0.5.
     """
     distance = nearest(memory, world, bearings)
     turn = wp.float64(0.0)
@@ -176,11 +175,12 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 
 @device_function
 def iterated_update(frame: Frame, memory: Any, world: int, i: int):
-    """Correct by the lines that fit, linearised anew half way, or where they put the poses if that is far.
+    """Correct by the bearings that fit, linearised at half of a small correction, or after all of a large one.
 
-    Far, these are Gauss-Newton steps. Near, gain and innovation depend on the same noise: linearised where the poses
-    were, ranges between vehicles that hardly move against each other drift outwards, where they get, inwards; half way
-    the drift vanishes, as a Stratonovich integral has none.
+    For a large correction these are Gauss-Newton steps. For a small one, gain and innovation depend on the same noise.
+    For two vehicles with little relative motion, linearising at the predicted pose biases the estimated range outwards;
+    linearising at the corrected pose biases it inwards. Half way between them the bias vanishes, as in a Stratonovich
+    integral.
     Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic
     Control 38(2), 1993.
     """

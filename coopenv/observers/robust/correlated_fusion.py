@@ -1,13 +1,13 @@
-"""What a vehicle makes of what others tell: they stand where they say, and its own pose follows what they learn.
+"""Fusion of reports whose errors correlate with the vehicle's own error.
 
-The errors of other members are considered: they have the covariance that is told, correlate with the vehicle's own, and
-are not corrected by its bearings, as in the filter of Schmidt, Application of state-space methods to navigation
-problems, Advances in Control Systems 3, 1966. When a sender moves by d from where it was carried to, its error changes
-from e- to e+ = e- - d. As e+ is not correlated with d, d has the covariance N = P- - P+ and with any other error y
-cov(y, d) = cov(y, e-) - cov(y, e+): so the vehicle's own pose follows with the gain of that over N.
+Senders are considered (Schmidt): a member has the reported pose and covariance, its error correlates with the vehicle's
+own, and bearings do not correct it. When a report moves a sender by d from its propagated pose, its error changes from
+e- to e+ = e- - d. As e+ is not correlated with d, d has the covariance N = P- - P+. With any other error y,
+cov(y, d) = cov(y, e-) - cov(y, e+). The own pose is corrected with that covariance over N as the gain.
+Source: Schmidt, Application of state-space methods to navigation problems, Advances in Control Systems 3, 1966.
 
-Where clocks are declared to be off by a standard deviation, that error is considered like the sender's own: it adds
-2 s^2 v v^T to the covariance that it states, for its clock and the receiver's, and correlates with all that follows.
+Clock offsets of a declared standard deviation s are considered like the sender's own error. They add 2 s^2 v v^T to the
+reported covariance, for the sender's clock and the receiver's, and correlate with all later errors.
 """
 
 from typing import Any
@@ -37,7 +37,7 @@ from coopenv.world.warp_internals import device_function
 
 @device_function
 def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
-    """Return the covariance, 6x6, of how far member n is off by clocks; zero before its velocity is known."""
+    """Return the covariance, 6x6, of member n's error by clock offsets; zero before its velocity is known."""
     std = wp.float64(model.fault[i].clock)
     v = memory.member[world, i, n].dated_v
     P = mat66d()
@@ -47,9 +47,9 @@ def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
-    """Let clocks count by the velocity of member n where that has changed much; return whether it has.
+    """Update the velocity at which clock offsets count, if member n's velocity has changed much; return whether it has.
 
-    A covariance that followed every change would not be one.
+    An update at every change would count each of them as a new error.
     """
     if model.fault[i].clock == type(model.fault[i].clock)(0.0):
         return False
@@ -65,7 +65,7 @@ def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
 
 @device_function
 def set_row(memory: Any, world: int, i: int, n: int):
-    """Put `scratch.row` into the covariance."""
+    """Write `scratch.row` to row and column n of the covariance."""
     for k in range(memory.belief[world, i].members):
         memory.P[world, i, n, k] = memory.scratch[world, k].row
         memory.P[world, i, k, n] = wp.transpose(memory.scratch[world, k].row)
@@ -73,7 +73,7 @@ def set_row(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
-    """Put a member where its report says that it is, whatever was believed of it before."""
+    """Set a member to the pose and covariance of its report, without its earlier estimate."""
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     memory.member[world, i, n].pose = report.pose
@@ -104,7 +104,7 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
 
 @device_function
 def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
-    """Let the vehicle's own pose follow a step d, whose covariances with all errors are in `scratch.column`."""
+    """Correct the own pose by a sender's increment d (covariance N); `scratch.column` holds cov(d, y) for errors y."""
     members = memory.belief[world, i].members
     others = memory.belief[world, i].others
     inverse = algebra.inverse6(N)
@@ -122,11 +122,11 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
 
 @device_function
 def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, lasting: Any):
-    """Put a trusted member where its new report says that it is, and follow the step there if that tells anything.
+    """Set a member to its new report, and correct the own pose by the increment if `fusing`.
 
-    `lasting`, variances (rotation, translation) in rad^2 and m^2, is what errors of its odometry that last may have
-    added since the last one. The sender knows them, how well nobody else knows: so they do not count here, because it
-    would seem to have learnt what it has not lost.
+    `lasting` are the variances (rotation, translation), rad^2 and m^2, of the lasting odometry errors since the last
+    report. Only the sender knows its own odometry errors. They are excluded here, because otherwise lost information
+    would be counted as new.
     """
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
@@ -162,7 +162,7 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
 
 @device_function
 def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
-    """Take a member's new report."""
+    """Propagate a member to its new report, test the report, and fuse it."""
     sent = memory.inbox[world, i, sender].tick
     before = memory.member[world, i, n].report.tick
     last = memory.member[world, i, n].report
@@ -177,7 +177,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
     learnt = note_step(memory, world, i, sender, last, report, noise, lasting, dt)
-    if memory.member[world, i, n].excluded == 0:  # else there is no evidence, and what it says may leap
+    if memory.member[world, i, n].excluded == 0:  # an excluded sender has no sums, and its reports may jump
         propagate_information(memory, world, i, sender, learnt, noise[1])
     drift = drift_of(memory, world, i, n)
     anew = test_report(model, memory, world, i, n, tick, dt, drift, jumped)
@@ -195,7 +195,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
 
 @device_function
 def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
-    """Return whether a report of member n that counts has been heard and not been taken."""
+    """Return whether a report of member n with news is received and not yet fused."""
     sender = memory.member[world, i, n].vehicle
     if not is_received(model, state, memory, world, i, sender, tick):
         return False
@@ -205,10 +205,10 @@ def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, 
 
 @device_function
 def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
-    """Return whether a report of member n has to wait for another one, so that all fit what is told of them.
+    """Return whether a report of member n has to wait for another one, so that broadcast correlations match reports.
 
-    It has to where it tells of another member's report that is not taken yet, and where another one's that is not taken
-    tells of the report of n before.
+    It waits if its correlations refer to another member's pending report, or if those of a pending report refer to
+    the previous report of n.
     """
     sender = memory.member[world, i, n].vehicle
     before = memory.member[world, i, n].report.tick
@@ -229,7 +229,7 @@ def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int,
 
 @device_function
 def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member whose report is to be taken next, 0 if there is none: leaders first, but see `has_to_wait`."""
+    """Return the member whose report is fused next, 0 if there is none: leaders first, but see `has_to_wait`."""
     found = int(0)
     best = int(0)
     waits = bool(True)
@@ -247,7 +247,7 @@ def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: i
 
 @device_function
 def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int, tick: int) -> int:
-    """Return the rank of the next vehicle in view, by rank, that is no member and has been heard; -1 if none is left.
+    """Return the next rank above `last` of the vehicles that are in view, received and no members; -1 if none is left.
 
     The vehicle is the rank modulo the number of vehicles.
     """
@@ -266,7 +266,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
 
 @device_function
 def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Take the reports of members that count, and add senders in view to the belief."""
+    """Fuse the members' reports with news, then add new senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)
     for _ in range(memory.belief[world, i].members):
         n = next_member(model, state, memory, world, i, tick)

@@ -1,15 +1,16 @@
-"""How senders' errors correlate with those of the vehicles that they hear: told, kept, looked up.
+"""Correlations of a sender's error with the errors of the vehicles that it receives: broadcast, storage, regression.
 
-With every message a vehicle tells of some members n the correlation A^-1 C B^-T of its own error with n's, A and B
-being Cholesky factors of their covariances and C their cross-covariance. That fits the report that it comes with. Where
-messages are lost, what was told of a report a little older or newer stands in: correlations change more slowly than
-errors do.
+With a message a vehicle broadcasts, for some members n, the correlation A^-1 C B^-T of its own error with n's. A and B
+are Cholesky factors of their covariances, and C is their cross-covariance; the values fit the report in the same
+message. If messages are lost, the correlation of a slightly older or newer report takes its place: correlations change
+more slowly than errors.
 
-Known is its own covariance P+, that with other members' errors as told, and, where the sender was heard before, that
-with its error then, which is P+, too, because the step from one to the other is not correlated with where it ends.
-The new error is regressed on these: e+ = L x + w, so that with any other error y it is L cov(x, y), and the joint
-covariance stays positive definite, if that of w is. Where it is not, the sender seems to know itself better than what
-it tells allows: P+ is taken larger in those directions, so that all it correlates with is kept. All in blocks of 6x6.
+Regression gives the covariance of a sender's new error e+ with all errors of the belief. Known are its own covariance
+P+, the broadcast covariances with other members, and that with the sender's previous error. The last is P+, too,
+because the step from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the known
+errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if that of
+w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in blocks of
+6x6.
 """
 
 from typing import Any
@@ -84,7 +85,7 @@ def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
 
 @wp.func
 def no_correlation():
-    """Return what stands where nothing is told."""
+    """Return the entry of an empty place."""
     none = Correlation()
     none.vehicle = -1
     return none
@@ -103,7 +104,7 @@ def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
 
 @device_function
 def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: int):
-    """Tell of correlations with the members that depend on most others."""
+    """Broadcast the correlations with the members that depend on most others."""
     memory.outbox[world, i, slot].news = 1
     n = int(0)
     for c in range(memory.correlation.shape[3]):
@@ -119,7 +120,7 @@ def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: in
 
 @device_function
 def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Send a report if one is due; the first of an interval counts, and tells of correlations."""
+    """Send a report if one is due; the first of an interval has news and carries correlations."""
     send(model, state, memory, world, i, tick)
     if tick % model.radio.period == 0:
         slot = tick % model.radio.slots
@@ -133,7 +134,7 @@ def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick
 
 @device_function
 def clear_broadcasts(model: Any, memory: Any, world: int, i: int):
-    """Forget what was sent and received."""
+    """Clear all sent and received messages."""
     clear_messages(model, memory, world, i)
     for c in range(memory.correlation.shape[3]):
         for slot in range(model.radio.slots):
@@ -148,7 +149,7 @@ def clear_broadcasts(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Take what the radio has delivered at this tick."""
+    """Receive the messages that the radio delivers at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
         sent = arrived(state, memory, world, i, sender)
@@ -158,13 +159,13 @@ def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
                 later = state.inbox_stamp[world, i, sender] - memory.outbox[world, sender, slot].tick
                 for c in range(memory.correlation.shape[3]):
                     memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
-                    memory.correlation[world, i, sender, c].tick += later  # ages are told, not ticks
+                    memory.correlation[world, i, sender, c].tick += later  # ages are broadcast, not ticks
     receive(model, state, memory, world, i)
 
 
 @device_function
 def correlation_index(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
-    """Return where it is kept what a sender has told of a vehicle, -1 if it has told nothing."""
+    """Return the index of a sender's correlation with a vehicle, -1 if there is none."""
     for c in range(memory.correlation.shape[3]):
         if memory.correlation[world, i, sender, c].vehicle == vehicle:
             return c
@@ -173,23 +174,23 @@ def correlation_index(memory: Any, world: int, i: int, sender: int, vehicle: int
 
 @device_function
 def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
-    """Return a correlation that is kept."""
+    """Return a stored correlation."""
     return mat66d(memory.correlation[world, i, sender, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
 
 
 @wp.func
 def is_near(model: Any, tick: int, other: int) -> bool:
-    """Return whether what is told of a report of one tick counts for that of another."""
+    """Return whether the correlation of a report at one tick is valid for a report at another."""
     return wp.float64(wp.abs(tick - other)) * model.camera_period < wp.float64(constants.CORRELATION_VALIDITY)
 
 
 @device_function
 def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, met: bool):
-    """Return (is known, is told, matrix) of the correlation of the new error of member n with that of member k.
+    """Return (is known, is broadcast, matrix) of the correlation of the new error of member n with that of member k.
 
-    Member n has told it; or k, which counts where they have just met; or, where neither hears the other, both have told
-    of a third one, of several that on which they depend most: that is only likely. What is told of reports far apart
-    does not count.
+    The source is a message of n, or a message of k if `met` is set. Without either, it is the product of both
+    correlations with the third vehicle on which n and k depend most; this value is an approximation. Correlations of
+    reports too far apart in time are not used.
     """
     sender = memory.member[world, i, n].vehicle
     other = memory.member[world, i, k].vehicle
@@ -223,7 +224,7 @@ INFLATION = 1.0 + constants.RELATIVE_NOISE
 
 @device_function
 def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
-    """Note the covariance with a member's error as the next that is known."""
+    """Store the covariance with a member's error as known regressor `at`."""
     memory.known[world, at].member = member
     memory.known[world, at].covariance = covariance
 
@@ -232,10 +233,10 @@ def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
 def note_correlations(
     model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool, count: int, broadcast: bool
 ):
-    """Note what is told (else what is only likely) of member n's new error; return how much is noted then."""
+    """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors."""
     A = factor(after)
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if k != n and memory.member[world, i, k].considered == 1:  # else it does not stand where its report puts it
+        if k != n and memory.member[world, i, k].considered == 1:  # otherwise it does not have its reported pose
             known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
             if known and is_broadcast == broadcast:
                 note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
@@ -245,9 +246,9 @@ def note_correlations(
 
 @device_function
 def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
-    """Note all of member n's new error: that with its last one, what is told, what is likely.
+    """Store all known covariances of member n's new error: with its previous one, broadcast, approximate.
 
-    Return how much that is, and how much of it is not only likely.
+    Return their number, and the number without the approximate ones.
     """
     count = int(0)
     if received:
@@ -259,7 +260,7 @@ def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any
 
 @wp.func
 def inflated(P: Any):
-    """Return a covariance with a little more on its diagonal."""
+    """Return a covariance with `RELATIVE_NOISE` added to its diagonal."""
     more = mat66d(P)
     for k in range(6):
         more[k, k] = P[k, k] * wp.float64(INFLATION)
@@ -268,7 +269,7 @@ def inflated(P: Any):
 
 @device_function
 def factorise(memory: Any, world: int, i: int, a: int):
-    """Set row a of the block Cholesky factor of the covariance of what is known; on its diagonal the inverse."""
+    """Set row a of the block Cholesky factor of the regressors' covariance; on its diagonal the inverse."""
     row = memory.known[world, a].member
     for b in range(a + 1):
         X = mat66d(memory.P[world, i, row, memory.known[world, b].member])
@@ -284,7 +285,7 @@ def factorise(memory: Any, world: int, i: int, a: int):
 
 @device_function
 def solve_known(memory: Any, world: int, i: int, count: int):
-    """Set the coefficients L of what is known."""
+    """Set the regression coefficients L."""
     for a in range(count):
         factorise(memory, world, i, a)
         Y = mat66d(memory.known[world, a].covariance)
@@ -320,9 +321,9 @@ def is_positive(P: Any) -> bool:
 
 @wp.func
 def excess(left: Any, after: Any):
-    """Return by how much a covariance is to be larger so that of what is left over a share of it is in all directions.
+    """Return the least inflation of a covariance `after` that keeps the residual `left` above a share of it.
 
-    All are 6x6, of left errors, rad and m. It is as little as possible: only in the directions in which it has to be.
+    All are 6x6, of left errors, rad and m. Only the directions that violate the bound are inflated.
     """
     more = mat66d()
     share = wp.float64(constants.LEAST_LEFT)
@@ -338,9 +339,9 @@ def excess(left: Any, after: Any):
 
 @device_function
 def dependence_inflation(memory: Any, world: int, i: int, n: int):
-    """Return the share of its covariance that is added to member n's: a little if it depends on others.
+    """Return the share by which member n's covariance is inflated for its dependence on other vehicles.
 
-    Where senders depend on this vehicle in turn, what they tell may be its own words, and all of them count once.
+    Senders that depend on this vehicle may return its own information; together they count as one.
     """
     depends_on = memory.member[world, i, n].report.depends_on
     if depends_on == wp.uint64(0):
@@ -356,7 +357,7 @@ def dependence_inflation(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
-    """Set the coefficients L of what is known; return what they leave over of a covariance."""
+    """Set the regression coefficients L; return the residual covariance."""
     solve_known(memory, world, i, count)
     left = mat66d(after)
     for a in range(count):
@@ -367,10 +368,10 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
 
 @device_function
 def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
-    """Set `scratch.row` to the covariance of member n's new error with all errors; return by how much more it has.
+    """Set `scratch.row` to the covariance of member n's new error with all errors; return the inflation of `after`.
 
-    That is added to the covariance that it states, `after`; both are 6x6, rad and m. Where what is only likely
-    contradicts the rest, it does not count.
+    `after` is the reported covariance; both are 6x6, rad and m. Approximate correlations that contradict the others are
+    not used.
     """
     count, sure = gather_known(model, memory, world, i, n, after, received)
     more = mat66d()
@@ -381,7 +382,7 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, rec
             if not is_positive(left - wp.float64(constants.LEAST_LEFT) * after):
                 count = sure
                 left = solve_for(memory, world, i, after, count)
-        larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # what is forgiven is the same error
+        larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
         more = larger * (after + excess(left, after)) - after
         growth = wp.sqrt(larger)
     if count > wp.where(received, 1, 0):

@@ -1,6 +1,6 @@
-"""A frame's bearings as measurements of the belief, or of one hypothesis in its place.
+"""Bearings of a frame as measurements of the belief, or of one search hypothesis in its place.
 
-A line of sight is set once per frame, with the point that the bearing is to, and linearised at the poses believed now.
+A measurement is set once per frame, with the point at which the bearing aims, and linearised at the current estimates.
 """
 
 from typing import Any
@@ -32,7 +32,7 @@ from coopenv.world.warp_internals import device_function
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 UNIFORM_VARIANCE = THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
-SEARCH, RESECTION, TRACKING = 0, 1, 2  # what bearings are for
+SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 
 @device_function
@@ -58,9 +58,9 @@ def tangent_basis(b: Any):
 
 @device_function
 def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
-    """Let the n-th bearing b be to a point in the body of a member, or (member 0) in the map.
+    """Set the n-th bearing b, to a point in the body frame of a member, or (member 0) in the map.
 
-    `variance` is that of the point per axis, m^2, besides the member's own.
+    `variance` is that of the point per axis, m^2, without the member's own.
     """
     memory.measurement[world, n].member = member
     memory.measurement[world, n].bearing = b
@@ -70,15 +70,15 @@ def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any
 
 @device_function
 def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether there is a message of a sender that knows where it is."""
+    """Return whether a fresh report of a sender is received and valid."""
     return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
 
 
 @device_function
 def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, tick: int, period: Any):
-    """Return the variance per axis, m^2, of where a sender says that it is, as it counts in the search.
+    """Return the variance per axis, m^2, of a sender's reported position, as it counts in the search.
 
-    Hypotheses are followed through many frames, in all of which that error is much the same.
+    Hypotheses are tracked through many frames, in all of which that error is nearly the same.
     """
     P = memory.inbox[world, i, sender].P
     variance = (wp.float64(P[3, 3]) + wp.float64(P[4, 4]) + wp.float64(P[5, 5])) * wp.float64(THIRD)
@@ -92,7 +92,7 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
 
 @wp.func
 def frames_in(time: Any, period: Any):
-    """Return how many frames, one every `period` (s), there are in a time (s): at least one."""
+    """Return the number of frames, one every `period` (s), in a time (s): at least 1."""
     return wp.max(time / period, wp.float64(1.0))
 
 
@@ -110,11 +110,11 @@ def set_measurement_of_member(
     period: Any,
     purpose: int,
 ) -> bool:
-    """Let a bearing be to a member, which has moved on since its last message that was fused; return whether it is.
+    """Set the n-th bearing as one to a member that has moved since its last fused report; return whether it is usable.
 
-    By its odometry as far as messages tell it, and from there by its last twist. Until a second message tells that,
-    its bearing says nothing, but for a resection: there it has gone as little as in the search that comes before.
-    What is the same for some frames, which follow one another by `period`, counts once in all of them.
+    The member is propagated by its broadcast odometry, and from there by its last twist. Before a second report its
+    twist is unknown: its bearing is then used for a resection only, with `MAX_SPEED` as in the search. Errors that are
+    the same in several frames, one every `period`, count once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
     sender = memory.member[world, i, member].vehicle
@@ -150,7 +150,7 @@ def set_measurement_of_member(
 def set_measurement_of_target(
     model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, period: Any, purpose: int
 ) -> bool:
-    """Let the n-th line be the bearing to a target in view; return whether that can be used now."""
+    """Set the n-th measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, target))
     sender = target - model.landmarks
     if sender < 0:
@@ -175,10 +175,10 @@ def set_measurement_of_target(
 def set_bearing_measurements(
     model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int
 ):
-    """Set the lines of sight of the bearings to landmarks and vehicles that can be used, and return their frame.
+    """Set the usable bearings to landmarks and vehicles as measurements, and return their frame.
 
-    In a search vehicles are where they say that they are, otherwise where they are believed to be. `period` is the time
-    since the last frame, s.
+    In a search, vehicles have their reported positions, otherwise their estimated ones. `period` is the time since the
+    last frame, s.
     """
     bearings = int(0)
     for n in range(model.target_count[i]):
@@ -197,18 +197,18 @@ def set_bearing_measurements(
 
 @device_function
 def time_between(model: Any, state: Any, world: int, i: int, now: Any):
-    """Return the time since the last frame that has corrected the belief, or a tick where that is more, s."""
+    """Return the time since the last frame that has corrected the belief, s, one tick at least."""
     since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
     return wp.max(since, now.period)
 
 
 @device_function
 def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
-    """Return the variance of what a bearing's linearisation leaves out, rad^2.
+    """Return the variance of a bearing's second-order linearisation error, rad^2.
 
-    With relative position uncertain by s along the line of sight u and by t across, its direction is t / (d + s), and
-    t s / d^2 of that no linear function of them. That error is the same for a while, so that all frames of that while,
-    which follow one another by `period`, count as one. `turn` is from the member's body to the vehicle's.
+    With errors s of the relative position along the line of sight u and t across it, the direction is t / (d + s). Its
+    term t s / d^2 is not linear. That error is correlated over a time, so that all frames of that time, one every
+    `period`, count as one. `turn` rotates from the member's body to the vehicle's.
     """
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     along = wp.dot(u, V * u)
@@ -280,7 +280,7 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
-    """Set a line's `gain` to H P."""
+    """Set a measurement's `gain` to H P."""
     H = memory.measurement[world, n].jacobian
     member = memory.measurement[world, n].member
     mounting = memory.measurement[world, n].mounting
@@ -295,7 +295,7 @@ def project(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
-    """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
+    """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
     S = memory.measurement[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
     member = memory.measurement[world, n].member
     if member > 0:
@@ -308,7 +308,7 @@ def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
 
 @device_function
 def innovation_with(memory: Any, world: int, n: int, more: Any):
-    """Return the normalised innovation squared of a line that has its `gain`, with more noise per axis, rad^2."""
+    """Return the normalised innovation squared of a projected bearing with more noise per axis, rad^2."""
     residual = memory.measurement[world, n].residual
     noise = memory.measurement[world, n].noise + more
     S = noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, n, n)
@@ -317,7 +317,7 @@ def innovation_with(memory: Any, world: int, n: int, more: Any):
 
 @device_function
 def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
-    """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead.
+    """Linearise a bearing and return its normalised innovation squared, infinite for a target behind the camera.
 
     Its `gain` is set to H P.
     """

@@ -1,13 +1,13 @@
-"""One tick of one vehicle's observer, and its start.
+"""One tick of one vehicle's observer, its start, and the observer as a plug-in.
 
-One vehicle keeps a joint belief about itself and the vehicles that it hears. Bearings, to landmarks and to vehicles,
-correct that belief; a neighbour's messages add what the neighbour has learnt since its last one, and no more. So
-nothing that was heard before counts twice, and the neighbour's slowly varying error is no white noise. Without a useful
-prior, or when most bearings contradict the belief, the pose is searched for; meanwhile the vehicle sends nothing.
+A vehicle estimates a joint state of itself and of the vehicles that it receives. Bearings to landmarks and to vehicles
+correct it. A neighbour's message adds the information that is new since its last message. So no information counts
+twice, and the neighbour's slowly varying error does not count as white noise. Without a useful prior, or if most
+bearings fail the gate, the pose is searched for; during a search the vehicle broadcasts nothing.
 
-After a search the vehicle's pose is taken from one frame alone, whatever was believed of it before. The other members
-stay. The vehicle's covariance becomes that of the solution, which inherits the members' errors,
-G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W, and so do its covariances with them, -G H_o P_o.
+After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
+that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
+cross-covariances become -G H_o P_o.
 """
 
 from typing import Any
@@ -78,9 +78,9 @@ from coopenv.world.warp_internals import device_function
 
 @device_function
 def gate(frame: Frame, memory: Any, world: int, i: int):
-    """Linearise the lines and mark those that fit; return the share of the others, how many fit, and their NIS.
+    """Linearise the bearings and gate them; return the share of rejected ones, the number of the others, and their NIS.
 
-    Bearings to distrusted senders do not count in the share; it is -1 if none counts.
+    Bearings to excluded senders do not count in the share, which is -1 if none counts.
     """
     counted = int(0)
     missed = int(0)
@@ -116,19 +116,19 @@ def is_valid(estimate: Estimate):
 
 @device_function
 def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Search anew, from where most bearings fitted, carried on by odometry since."""
+    """Begin a search whose prior is the anchor, propagated by odometry."""
     reset_monitors(memory, world, i)
     anchor = memory.anchor[world, i]
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
-    begin_errors(model, memory, world, i)  # what was believed of them may be as wrong
+    begin_errors(model, memory, world, i)  # their estimates may be wrong, too
     noise = odometry_noise(model, i, elapsed) + lasting_noise(memory, world, i, step, elapsed, elapsed)
     begin_search(memory, world, i, carried(anchor.estimate, step, noise))
 
 
 @device_function
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: Frame):
-    """Correct the belief by every bearing of a frame that fits it; search anew when most do not."""
+    """Correct the belief by the bearings of a frame that pass the gate; begin a search if most fail."""
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting
@@ -154,7 +154,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
 
 @device_function
 def weight_of(memory: Any, world: int, i: int, n: int):
-    """Return the weight of a bearing, to whose variance the error of the member that it is to adds."""
+    """Return the weight of a bearing, whose variance includes the error of its target."""
     N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
     member = memory.measurement[world, n].member
     if member > 0:
@@ -165,7 +165,7 @@ def weight_of(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, inverse: Any):
-    """Set the vehicle's covariance to that of the solution, the members' errors included."""
+    """Set the own covariance to that of the resection, members' errors included."""
     members = memory.belief[world, i].members
     own = mat66d()
     for k in range(members):
@@ -190,7 +190,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
 
 @device_function
 def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
-    """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
+    """Resect the own pose from a frame by least squares, from the current pose; return whether that converges."""
     bearings = frame.bearings
     inverse = mat66d()
     for step in range(constants.GAUSS_NEWTON_STEPS):
@@ -214,12 +214,12 @@ def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
     return True
 
 
-ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
+ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # status of the own pose; found: by the search, at this tick
 
 
 @device_function
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
-    """Believe in a pose alone; on all that may be heard it may depend."""
+    """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
     begin_belief(memory, world, i, estimate)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
     bits = wp.uint64(0)
@@ -231,9 +231,9 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estima
 
 @device_function
 def write(state: Any, memory: Any, world: int, i: int):
-    """Write the pose believed, while it is searched for that of the best hypothesis, as the state holds it.
+    """Write the own estimate to the state; during a search, that of the best hypothesis.
 
-    There positions are in the body, and covariances over (2 lambda, p), to first order.
+    The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
     estimate = own_estimate(memory, world, i)
     if memory.search[world, i].active == 1:
@@ -248,14 +248,16 @@ def write(state: Any, memory: Any, world: int, i: int):
 
 
 def make_start(begin_messages: Any, receive: Any) -> Any:
-    """Return the Warp function that starts an observer, given those that begin anew and take what the radio delivers.
+    """Return the Warp function that starts an observer.
 
-    The former is called with the belief that the vehicle starts with.
+    Args:
+        begin_messages: clears all messages; called after the belief has begun.
+        receive: receives the messages that the radio delivers.
     """
 
     @device_function
     def start(model: Any, state: Any, memory: Any, world: int, i: int):
-        """Start at the initial estimate, and take what the leaders have sent.
+        """Start at the initial estimate, and receive the leaders' messages.
 
         An estimate that is too uncertain to linearise about is only a prior for the search.
         """
@@ -280,7 +282,7 @@ def make_start(begin_messages: Any, receive: Any) -> Any:
 
 @device_function
 def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> int:
-    """Search for the pose; with one hypothesis left, believe in the prior if it is that, else in the hypothesis."""
+    """Search for the pose; a single hypothesis left becomes the estimate, or the prior does if both agree."""
     if not advance_search(model, state, memory, world, i, now):
         return SEARCHING
     prior = memory.search[world, i].prior
@@ -294,7 +296,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
 
 @device_function
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
-    """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
+    """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
     purpose = wp.where(standing == ESTIMATING, TRACKING, RESECTION)
     frame = set_bearing_measurements(
         model, state, memory, world, i, now.tick, time_between(model, state, world, i, now), purpose
@@ -312,9 +314,9 @@ def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
     """Return the Warp function of one tick.
 
     Args:
-        receive: takes what the radio delivers.
-        fuse_messages: fuses it.
-        separate: at last, holds the belief against what landmarks alone say.
+        receive: receives the messages that the radio delivers.
+        fuse_messages: fuses them.
+        separate: tests the belief against the solution from landmarks alone.
     """
 
     @device_function
@@ -341,7 +343,7 @@ def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
             if now.due:
                 correct(model, state, memory, world, i, now, standing)
             if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
-                declare_lost(model, memory, world, i, now.tick)  # a message that no honest vehicle sends
+                declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
         separate(model, state, memory, world, i, now)
         write(state, memory, world, i)
         if now.due:

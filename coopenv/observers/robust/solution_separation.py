@@ -1,23 +1,22 @@
-"""The belief against what landmarks and odometry alone say, and who is wrong of two that contradict each other.
+"""Solution separation: the belief against the solution from landmarks and odometry alone.
 
-A second estimate of the vehicle's pose takes no message; of the odometry's errors, where there are any, it takes what
-is believed. It is vaguer than the belief, but hardly to be misled, and it shares all its information with a belief that
-is right: so the belief is nearly always within its covariance. Where it is not, and where bearings contradict one
-sender, every sender in view is left out in turn: the one without whom the bearings to the others agree best with
-landmarks is believed no more. Then the belief is that estimate again. As long as somebody is not believed because
-bearings contradicted him, it is asked again whether it was him.
-Source: separation of solutions, Brown and McBurney, Self-contained GPS integrity check using maximum solution
-separation, Navigation 35(1), 1988.
+The landmark-only solution fuses no message. It takes the calibration states, if there are any, from the belief. Its
+covariance is larger, but a faulty sender hardly affects it, and all its information is also in a correct belief. A
+correct belief is therefore nearly always within its covariance. Two events start a leave-one-out test over all senders
+in view: the belief leaves that covariance, or bearings contradict a sender. The sender without which the remaining
+bearings agree best with landmarks is excluded, and the belief is reset to the landmark-only solution.
+Source: Brown and McBurney, Self-contained GPS integrity check using maximum solution separation, Navigation 35(1),
+1988.
 
-Who hears a liar first fits its own pose to what that one says, and then the honest ones contradict it. From then on its
-bearings agree with the liar, so nothing within the belief tells. But from where landmarks and odometry alone put the
-vehicle the bearings to all can be explained anew, every sender that is left out at the price of `MAX_BEARING_COST`.
-Where leaving out one sender alone explains them better than leaving out those that are not believed, and at another
-pose, that sender is believed no more, and the others are again. But those who have contradicted themselves, by a jump
-or a drift while they were believed, are not: two who collude explain as much as two who are honest. Nor are those whom
-bearings have contradicted more than `MAX_REVISIONS` times, so that nobody goes back and forth for ever.
-Source: the price of what is left out is that of consensus, Torr and Zisserman, MLESAC, Computer Vision and Image
-Understanding 78(1), 2000.
+Retest of exclusions. If the first received sender is faulty, the own pose is fitted to its reports, and correct senders
+then contradict the own pose. Within the belief this fault cannot be detected. From the landmark-only solution, the
+bearings to all senders are explained anew, at a cost of `MAX_BEARING_COST` for every sender left out. If one other
+sender left out explains them better than the present exclusions, and at another pose, that sender is excluded and the
+others are readmitted. Two kinds of senders are not readmitted this way. The first were excluded because their reports
+contradict their odometry: two colluding senders explain as much as two correct ones. The second have been excluded more
+than `MAX_RETESTED_EXCLUSIONS` times, which bounds the number of changes.
+Source: the cost of an outlier is that of Torr and Zisserman, MLESAC, Computer Vision and Image Understanding 78(1),
+2000.
 """
 
 from typing import Any
@@ -49,7 +48,7 @@ from coopenv.world.warp_internals import device_function
 
 @device_function
 def is_disputed(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether member n is not believed because of bearings, and has not been so too often before."""
+    """Return whether member n is excluded because of bearings, and its exclusion may still be retested."""
     monitor = memory.monitor[world, i, memory.member[world, i, n].vehicle]
     may_be_right = monitor.self_inconsistent == 0 and monitor.exclusions <= constants.MAX_RETESTED_EXCLUSIONS
     return memory.member[world, i, n].excluded == 1 and may_be_right
@@ -57,7 +56,7 @@ def is_disputed(memory: Any, world: int, i: int, n: int) -> bool:
 
 @device_function
 def readmit(model: Any, memory: Any, world: int, i: int, n: int):
-    """Put member n where it says to be; how often it has not been believed, and its drift, are not forgotten."""
+    """Readmit member n at its reported pose; the number of its exclusions and its drift are kept."""
     sender = memory.member[world, i, n].vehicle
     monitor = SenderMonitor()
     monitor.drift = memory.monitor[world, i, sender].drift
@@ -72,14 +71,14 @@ def readmit(model: Any, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def is_rejected(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether member n is not believed, or most bearings to it do not fit."""
+    """Return whether member n is excluded, or most bearings to it fail the gate."""
     share = memory.monitor[world, i, memory.member[world, i, n].vehicle].rejected_share
     return memory.member[world, i, n].excluded == 1 or share > wp.float64(constants.LOST_SHARE)
 
 
 @device_function
 def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Set the lines of sight to members in view that may be right, where they have said last; return their frame."""
+    """Set the bearings to members in view, at their last reported positions, as measurements; return their frame."""
     bearings = int(0)
     mounting = mounting_variances(model, i)
     for n in range(model.target_count[i]):
@@ -98,15 +97,15 @@ def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: 
                     memory.measurement[world, bearings].reported_by = member
                     bearings += 1
     variance = bearing_variance(model, i) + mounting[0]
-    once = wp.float64(constants.LINEARISATION_TIME)  # a period for which what linearisations leave out counts once
+    once = wp.float64(constants.LINEARISATION_TIME)  # s, a period for which the linearisation error counts once
     return Frame(bearings, 0, vec3d(model.camera[i].position), variance, once)
 
 
 @device_function
 def cost_of(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
-    """Return what an estimate and the lines that are marked as fitting cost together; put the own pose between them.
+    """Return the joint cost of an estimate and of the measurements that fit; set the own pose to their optimum.
 
-    Infinite where the target of one is not ahead. Every other line costs as much as a wrong bearing.
+    The cost is infinite if a target is behind the camera. Every other measurement costs as much as an outlier.
     """
     put_own(memory, world, i, landmark_only)
     cost = wp.float64(0.0)
@@ -130,7 +129,7 @@ def cost_of(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estima
 
 @device_function
 def least_cost(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
-    """Return the member without whom bearings to all others cost least, that cost, and the own pose then."""
+    """Return the member whose omission leaves the least cost, that cost, and the own pose at it."""
     faulty = int(0)
     least = wp.float64(wp.inf)
     pose = landmark_only.pose
@@ -149,9 +148,9 @@ def least_cost(frame: Frame, memory: Any, world: int, i: int, landmark_only: Est
 def find_alternative_hypothesis(
     model: Any, state: Any, memory: Any, world: int, i: int, tick: int, landmark_only: Estimate
 ):
-    """Return the frame, and without whom its bearings are explained much better than without those not believed.
+    """Return the frame and the index of the member to exclude in place of the present exclusions.
 
-    That is a member, 0 where all is well as it is. `alone` is what landmarks alone say; the own pose is back at last.
+    The index is 0 if no exclusion lowers the cost enough. The own pose is restored before returning.
     """
     frame = set_report_measurements(model, state, memory, world, i, tick)
     rejected = int(0)
@@ -177,12 +176,12 @@ def find_alternative_hypothesis(
 
 
 LASTING_FRAME = constants.LINEARISATION_TIME / constants.CONSIDERED_LINEARISATION_TIME
-"""Share of its period that a frame counts for, so that what a linearisation leaves out is the same for longer."""
+"""Factor of a frame's period, by which its linearisation error is correlated for longer."""
 
 
 @device_function
 def begin_landmark_only(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
-    """Begin with an estimate at a tick."""
+    """Begin the landmark-only solution with an estimate at a tick."""
     memory.landmark_only[world, i].begun = 1
     memory.landmark_only[world, i].tick = tick
     memory.landmark_only[world, i].odometry = memory.belief[world, i].odometry
@@ -191,9 +190,9 @@ def begin_landmark_only(memory: Any, world: int, i: int, estimate: Estimate, tic
 
 @device_function
 def begin_broadcasts(model: Any, memory: Any, world: int, i: int):
-    """Forget what was sent and received; begin with the initial estimate, unless the pose is searched for.
+    """Clear all messages; begin the landmark-only solution with the initial estimate, unless a search is active.
 
-    A search may use what anybody says; who begins with an estimate depends on nobody yet.
+    A search may use every sender. An initial estimate depends on no sender.
     """
     clear_broadcasts(model, memory, world, i)
     memory.landmark_only[world, i] = LandmarkOnlySolution()
@@ -204,7 +203,7 @@ def begin_broadcasts(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def propagate_landmark_only(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Carry the estimate on by odometry; return for which time, s."""
+    """Propagate the landmark-only solution by odometry; return the time since the last propagation, s."""
     landmark_only = memory.landmark_only[world, i]
     elapsed = wp.float64(tick - landmark_only.tick) * model.camera_period
     step = between(landmark_only.odometry, memory.belief[world, i].odometry)
@@ -215,10 +214,10 @@ def propagate_landmark_only(model: Any, memory: Any, world: int, i: int, tick: i
 
 @device_function
 def correct_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> int:
-    """Correct the estimate by the landmarks of a frame, elapsed (s) after the last one; return how many fit.
+    """Correct the landmark-only solution by a frame, `elapsed` (s) after the last one; return how many landmarks fit.
 
-    Where none fits that are in view, it begins anew.
-    It stands in the belief's place meanwhile. What is the same in all frames counts as one measurement.
+    If landmarks are in view and none fits, the solution begins anew. It takes the belief's place during the correction.
+    Errors that are the same in all frames count as one measurement.
     """
     own = own_estimate(memory, world, i)
     members = memory.belief[world, i].members
@@ -254,7 +253,7 @@ def correct_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: 
 
 @device_function
 def exchange_own(memory: Any, world: int, i: int, estimate: Estimate):
-    """Put the vehicle itself where an estimate says that depends on nobody; keep what it shared with others."""
+    """Set the own pose to an estimate that depends on no sender; keep its cross-covariances in `scratch.row`."""
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
         memory.scratch[world, k].row = memory.P[world, i, 0, k]
@@ -264,7 +263,7 @@ def exchange_own(memory: Any, world: int, i: int, estimate: Estimate):
 
 @device_function
 def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
-    """Put the vehicle back, with what it shared with others."""
+    """Restore the own pose and its cross-covariances."""
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
         memory.P[world, i, 0, k] = memory.scratch[world, k].row
@@ -273,14 +272,14 @@ def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
 
 @device_function
 def is_fused_sender(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether the n-th bearing is to a sender that is believed."""
+    """Return whether the n-th bearing is to a sender whose reports are fused."""
     member = memory.measurement[world, n].member
     return member > 0 and memory.member[world, i, member].considered == 1
 
 
 @device_function
 def cost_without(memory: Any, world: int, i: int, bearings: int, without: int):
-    """Return what the bearings to all senders cost that are believed, but for one line."""
+    """Return the cost of the bearings to all fused senders except the one of measurement `without`."""
     for n in range(bearings):
         fits = int(0)
         if n != without and is_fused_sender(memory, world, i, n):
@@ -291,11 +290,10 @@ def cost_without(memory: Any, world: int, i: int, bearings: int, without: int):
 
 @device_function
 def find_fault_hypothesis(frame: Frame, memory: Any, world: int, i: int, suspect: int):
-    """Return the sender without whom bearings to the others cost least, that cost, and that without the accused one.
+    """Return (member, its cost, cost without the suspect, bearings): the member whose omission leaves the least cost.
 
-    Besides how many bearings to senders there are. The own pose is what landmarks alone say meanwhile. The sender is a
-    member, 0 if none is in view; costs are normalised innovations squared, the last one infinite where the accused one
-    is out of view.
+    The member is 0 if no fused sender is in view. Costs are normalised innovations squared of the other bearings, about
+    the landmark-only solution. The cost without the suspect is infinite if the suspect is out of view.
     """
     own = own_estimate(memory, world, i)
     exchange_own(memory, world, i, memory.landmark_only[world, i].estimate)
@@ -325,7 +323,7 @@ def find_fault_hypothesis(frame: Frame, memory: Any, world: int, i: int, suspect
 
 @wp.func
 def consistent_cost(bearings: int):
-    """Return what so many bearings that agree cost at most: the 0.999 quantile of chi-square, by Wilson and Hilferty.
+    """Return the largest cost of consistent bearings: the 0.999 quantile of chi-square, by Wilson and Hilferty.
 
     Source: Wilson and Hilferty, The distribution of chi-square, Proc. National Academy of Sciences 17(12), 1931.
     """
@@ -339,7 +337,7 @@ def consistent_cost(bearings: int):
 
 @device_function
 def revert_to_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int, faulty: int):
-    """Believe what landmarks alone say, and a culprit and all that contradict landmarks by themselves no more."""
+    """Reset the belief to the landmark-only solution; exclude the faulty member and all that contradict landmarks."""
     landmark_only = memory.landmark_only[world, i].estimate
     away = wp.length(landmark_only.pose.p - memory.member[world, i, 0].pose.p)
     exchange_own(memory, world, i, landmark_only)
@@ -370,7 +368,7 @@ def revert_to_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i
 
 @device_function
 def test_suspect(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
-    """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
+    """Exclude the suspect, or another sender if landmarks contradict that one more clearly."""
     suspect = memory.belief[world, i].suspect
     propagate_landmark_only(model, memory, world, i, tick)
     faulty, least, without, _ = find_fault_hypothesis(frame, memory, world, i, suspect)
@@ -383,9 +381,10 @@ def test_suspect(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
 
 @device_function
 def test_separation(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
-    """Leave the belief where it is not what landmarks alone say.
+    """Reset the belief if it is separated from the landmark-only solution.
 
-    But where several senders contradict that and hardly a landmark is in view, odometry may be wrong: that begins anew.
+    If several senders contradict that solution and few landmarks are in view, its odometry may be wrong. The solution
+    then begins anew instead.
     """
     elapsed = propagate_landmark_only(model, memory, world, i, tick)
     landmarks = correct_landmark_only(model, frame, memory, world, i, elapsed)
@@ -403,7 +402,7 @@ def test_separation(model: Any, frame: Frame, memory: Any, world: int, i: int, t
 
 @device_function
 def retest_exclusion(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Believe others than so far where that explains this frame's bearings better."""
+    """Exclude another sender and readmit excluded ones, if that explains this frame's bearings better."""
     frame, faulty = find_alternative_hypothesis(
         model, state, memory, world, i, now.tick, memory.landmark_only[world, i].estimate
     )
@@ -422,7 +421,7 @@ def retest_exclusion(model: Any, state: Any, memory: Any, world: int, i: int, no
 
 @device_function
 def note_exposure(memory: Any, world: int, i: int):
-    """Note whether any sender is believed: then the belief may be misled."""
+    """Note whether the belief has fused any sender."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].considered == 1:
             memory.landmark_only[world, i].exposed = 1
@@ -430,7 +429,7 @@ def note_exposure(memory: Any, world: int, i: int):
 
 @device_function
 def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Judge whom this frame's bearings contradict, and now and then the belief as a whole."""
+    """Test the frame's suspect, or, every `LANDMARK_ONLY_PERIOD`, the belief as a whole."""
     if memory.search[world, i].active == 1:
         memory.landmark_only[world, i].begun = 0
     elif now.due:

@@ -1,10 +1,11 @@
-"""What vehicles send each other, and the information that is new in it.
+"""Reports that vehicles broadcast, and the new information in them.
 
-A sender sends its pose, the covariance of it, and its odometry: where it would be by dead reckoning alone. So a
-receiver can carry the sender's last message to the new one as the sender itself did, P- = F P F^T + Q, and what the
-sender has learnt in between is P^-1 - P-^-1, whatever messages were lost. Source: the information decorrelation of
-tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE 3163, 1997; the channel filter of Grime and
-Durrant-Whyte, Data fusion in decentralized sensor networks, Control Engineering Practice 2(5), 1994.
+A report holds a pose, its covariance, and the sender's dead reckoning. With the dead reckoning a receiver propagates
+the sender's last report to the new one as the sender itself did, P- = F P F^T + Q. The new information is P^-1 - P-^-1,
+whatever messages were lost.
+Source: the information decorrelation of tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE
+3163, 1997; the channel filter of Grime and Durrant-Whyte, Data fusion in decentralized sensor networks, Control
+Engineering Practice 2(5), 1994.
 """
 
 from typing import Any
@@ -56,7 +57,7 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
 
 @device_function
 def clear_messages(model: Any, memory: Any, world: int, i: int):
-    """Forget what was sent and received."""
+    """Clear all sent and received reports."""
     for slot in range(model.radio.slots):
         memory.outbox[world, i, slot] = Report()
     for sender in range(model.vehicles):
@@ -66,7 +67,7 @@ def clear_messages(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def broadcast_report(model: Any, state: Any, world: int, i: int, report: Report):
-    """Return a report as a vehicle broadcasts it, which may lie, see `[faults]`."""
+    """Return a report as a vehicle broadcasts it, its `lie` faults included, see `[faults]`."""
     R, p = as_broadcast(model, state, world, i, report.pose.R, report.pose.p)
     report.pose = Pose(R, p)
     std = wp.float32(claimed_std(model, state, world, i, report.tick))
@@ -94,7 +95,7 @@ def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
 
 @device_function
 def receive(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Take what the radio has delivered at this tick."""
+    """Receive the reports that the radio delivers at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
         sent = arrived(state, memory, world, i, sender)
@@ -106,7 +107,7 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
 
 @device_function
 def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
-    """Carry a member on to its new message by its odometry over dt, and average its twist."""
+    """Propagate a member to its new report by its odometry over dt, and average its twist."""
     averaged = wp.max(algebra.averaging_time(model, i), wp.float64(0.5) * dt)
     lag = wp.float64(constants.MAX_ACCELERATION) * averaged
     q = algebra.odometry_noise(model, i, wp.float64(1.0))[1]
@@ -125,7 +126,7 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: 
 
 @device_function
 def test_sender(memory: Any, world: int, i: int, n: int, reported: Estimate, dt: Any):
-    """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
+    """Exclude or readmit a sender by the distance of its new report, dt after the last one, from its estimate."""
     estimated = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
     agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.MESSAGE_GATE)
     agreed = wp.float64(0.0)
@@ -142,17 +143,17 @@ def test_sender(memory: Any, world: int, i: int, n: int, reported: Estimate, dt:
 
 @device_function
 def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether what member n says may be this vehicle's own words."""
+    """Return whether member n's report may contain this vehicle's own information."""
     return (memory.member[world, i, n].report.depends_on & bit_of(i)) != wp.uint64(0)
 
 
 @device_function
 def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether member n may say what this vehicle knows already, and knows its place hardly better.
+    """Return whether member n may return this vehicle's own information, and has no much smaller variance.
 
-    It may where it depends on this vehicle, and where this vehicle depends on it and nobody has told how.
-    In a circle of vehicles the one that knows its place best does not follow the one before it: the rest has an order,
-    as the paper's Assumption 1 has it for all.
+    It may if it depends on this vehicle, or if this vehicle depends on it with an unknown correlation. In a circle of
+    vehicles the one with the smallest variance then does not follow the one before it. The remaining dependences have
+    an order, as Assumption 1 of the paper requires.
     """
     shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].correlation_unknown == 1
     if memory.member[world, i, n].considered == 0 or not shares:
@@ -163,10 +164,10 @@ def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
 
 @device_function
 def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
-    """Return which share of its new information counts of a sender that depends on these vehicles.
+    """Return the share of new information that counts of a sender that depends on these vehicles.
 
-    All if on none, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each of n counts
-    1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+    It is 1 without dependence and `DEPENDENT_SHARE` for dependence on other vehicles. If n senders depend on this
+    vehicle, each counts 1 / (n + 1): information that returns round a loop then fades in any graph.
     """
     if depends_on == wp.uint64(0):
         return wp.float64(1.0)
@@ -182,5 +183,5 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
 
 @device_function
 def is_due(model: Any, before: int, sent: int) -> bool:
-    """Return whether a message comes long enough after the last one of the sender that was fused to be so, too."""
+    """Return whether a message is late enough after the sender's last fused one to be fused."""
     return wp.float64(sent - before) * model.camera_period > wp.float64(LEAST_TIME)
