@@ -25,7 +25,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.runs import record
-from coopenv.runs.markdown import table
+from coopenv.runs.page import table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import parse_scenario
 

@@ -13,10 +13,9 @@ from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
 from coopenv.base.errors import CoopenvError
+from coopenv.runs.reels import EngineReel
 from coopenv.runs.scenes import driver_of, open_source
-from coopenv.runs.view.reels import EngineReel
-from coopenv.runs.view.serving import serving
-from coopenv.runs.view.viewer import Viewer
+from coopenv.runs.view import Viewer, serving
 
 WARM_UP = 2.0  # s
 RATE = 20.0  # frames/s, to which shares are scaled

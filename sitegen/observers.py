@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import ZOO, Entry
-from coopenv.runs.markdown import bullets, table
+from coopenv.runs.page import bullets, table
 from sitegen.mirror import ROOT, relinked
 
 PACKAGE = "coopenv.observers"

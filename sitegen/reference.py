@@ -10,7 +10,7 @@ from coopenv.base.installation import list_envs
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.runs.markdown import table
+from coopenv.runs.page import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
 from sitegen.mirror import ROOT

@@ -22,7 +22,7 @@ from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
-from coopenv.runs import table
+from coopenv.runs import console
 from coopenv.runs.recorder import record
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
@@ -193,7 +193,7 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     errors, rates = (line.split() for line in out.splitlines() if line.startswith("vehicle_1 "))
     assert [float(x) for x in errors[1:5]] == pytest.approx([11.5, 90.0, 1.32, 2.93], rel=0.01)
     assert [float(x) for x in rates[1:]] == [
-        pytest.approx(metrics["vehicles"][0][key], rel=0.006) for key in table.RATE_COLUMNS
+        pytest.approx(metrics["vehicles"][0][key], rel=0.006) for key in console.RATE_COLUMNS
     ]
     assert "vehicle_5: not observable at 0-" in out
     assert "No steady state: it would begin at 35 s" in out
@@ -333,7 +333,7 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 def test_an_interrupted_run_leaves_the_earlier_result(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from coopenv.runs.episode import Views
+    from coopenv.runs.rollouts import Views
 
     take = Views.take
 

@@ -29,8 +29,8 @@ sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder
 import coopenv.api.engine
 import coopenv.policies
 import coopenv.runs.demo
-import coopenv.runs.driven
-import coopenv.runs.film
+import coopenv.runs.dataset
+import coopenv.runs.live
 from coopenv.cli import main
 """
 FLEET = ROOT / "examples" / "fleet" / "overtaking.toml"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.bench.learning.study import read_study
+from coopenv.bench.study import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.training.settings import Clone, read_settings

@@ -14,36 +14,15 @@ import pytest
 import coopenv
 import coopenv.observers
 import coopenv.runs
-from coopenv.cli import complete
+from coopenv.cli import options
 from tests.helpers.four_way import FOUR_WAY
 
 HEAVY = {"warp", "scipy", "numba", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
 LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts", "lazy", "seeds")}
 LIGHT |= {"base", "api", "api.registration"}
-LIGHT |= {
-    "cli",
-    *(
-        f"cli.{name}"
-        for name in (
-            "bags",
-            "bench",
-            "complete",
-            "dataset",
-            "evaluate",
-            "film",
-            "live",
-            "options",
-            "page",
-            "results",
-            "run",
-            "show",
-            "train",
-            "view",
-        )
-    ),
-}
-COMMANDS_OF_CARS = Path(coopenv.__file__).parent / "cli" / "svea"
-LIGHT |= {"cli.svea", *(f"cli.svea.{path.stem}" for path in COMMANDS_OF_CARS.glob("[a-z]*.py"))}
+COMMANDS = Path(coopenv.__file__).parent / "cli"
+LIGHT |= {"cli", "cli.svea", *(f"cli.{path.stem}" for path in COMMANDS.glob("[a-z]*.py"))}
+LIGHT |= {f"cli.svea.{path.stem}" for path in (COMMANDS / "svea").glob("[a-z]*.py")}
 
 
 def modules_after(statement: str) -> set[str]:
@@ -142,29 +121,29 @@ def test_every_public_name_is_found_and_listed() -> None:
 
 
 def test_the_shell_completes_without_the_simulation() -> None:
-    loaded = modules_after("from coopenv.cli.complete import *; environments(''), agents(''), policies('')")
+    loaded = modules_after("from coopenv.cli.options import *; environments(''), agents(''), policies('')")
     assert not {name for name in loaded if name.startswith("coopenv.")} - {f"coopenv.{name}" for name in LIGHT}
-    assert not HEAVY & modules_after("from coopenv.cli.complete import *; observers('')")
-    assert not HEAVY & modules_after("from coopenv.cli.complete import *; override_keys('')")
+    assert not HEAVY & modules_after("from coopenv.cli.options import *; observers('')")
+    assert not HEAVY & modules_after("from coopenv.cli.options import *; override_keys('')")
 
 
 def test_completions() -> None:
-    assert complete.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
-    assert complete.agents("route") == ["route_follower"]
-    assert complete.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
-    assert complete.policies("") == ["zero", "random", *complete.agents("")]
-    assert complete.observers("riccati,mek") == [
+    assert options.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
+    assert options.agents("route") == ["route_follower"]
+    assert options.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
+    assert options.policies("") == ["zero", "random", *options.agents("")]
+    assert options.observers("riccati,mek") == [
         "riccati,mekf",
         "riccati,mekf_covariance",
         "riccati,mekf_covariance_ungated",
     ]
-    assert "mekf" not in complete.observers("mekf,me")
-    assert complete.override_keys("noise.e") == ["noise.enabled="]
-    assert complete.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]
+    assert "mekf" not in options.observers("mekf,me")
+    assert options.override_keys("noise.e") == ["noise.enabled="]
+    assert options.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]
 
 
 def test_every_completed_key_is_one_that_the_loader_knows() -> None:
-    keys = [key.removesuffix("=") for key in complete.override_keys("") if "*" not in key]
+    keys = [key.removesuffix("=") for key in options.override_keys("") if "*" not in key]
     assert len(keys) > 50
     for key in keys:
         try:

@@ -8,7 +8,7 @@ from typing import Any
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import number
-from coopenv.runs.markdown import table
+from coopenv.runs.page import table
 
 BEGIN, END = "<!-- make gpu: begin -->", "<!-- make gpu: end -->"
 

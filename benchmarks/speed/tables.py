@@ -13,7 +13,7 @@ from benchmarks.speed.growth import Growth
 from benchmarks.speed.measure import Result
 from benchmarks.speed.peer_cases import VMAS
 from benchmarks.speed.startup import Startup
-from coopenv.runs.table import number_table
+from coopenv.runs.console import number_table
 
 CASE_WIDTH = 24
 """Columns of a case's name; the longest is highway-env's."""

@@ -21,8 +21,7 @@ from benchmarks.stages.rounds import alternate, ratio
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.cli.options import load, parse_overrides
-from coopenv.runs.console import Progress
-from coopenv.runs.table import number_table
+from coopenv.runs.console import Progress, number_table
 
 SENSED = {"topology.mode": "sensed"}
 RICCATI, ROBUST = {"observer.name": "riccati"}, {"observer.name": "robust"}

@@ -1,1 +1,1 @@
-"""Measurements: steps per second, and observers compared."""
+"""Benchmarks: drivers on held-out worlds, observers on the same records, trainings, many seeds."""

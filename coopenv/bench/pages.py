@@ -11,9 +11,9 @@ from coopenv.api.engine import Engine
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
 from coopenv.base.seeds import world_keys
-from coopenv.bench.agents.cards import dial_text, measure_dial, read_dial
+from coopenv.bench.cards import dial_text, measure_dial, read_dial
 from coopenv.policies import Policy
-from coopenv.runs.film import write_film
+from coopenv.runs.live import write_film
 from coopenv.runs.page import index_text, page_text
 from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.scenario import Scenario

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.estimation.metrics import SETTLED, settling_time
-from coopenv.runs.episode import Views, play
-from coopenv.runs.table import number_table
+from coopenv.runs.console import number_table
+from coopenv.runs.rollouts import Views, play
 from coopenv.scenario import Scenario
 
 

@@ -15,18 +15,12 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import show
-from coopenv.cli.bags import import_command
 from coopenv.cli.bench import bench
-from coopenv.cli.dataset import dataset
-from coopenv.cli.evaluate import evaluate
-from coopenv.cli.film import film
-from coopenv.cli.live import play, watch
-from coopenv.cli.page import page
-from coopenv.cli.results import export, figures
-from coopenv.cli.run import record_command, run
+from coopenv.cli.run import export, figures, import_command, record_command, run
+from coopenv.cli.show import page
 from coopenv.cli.svea import svea
-from coopenv.cli.train import train
-from coopenv.cli.view import view
+from coopenv.cli.train import dataset, evaluate, train
+from coopenv.cli.view import film, play, view, watch
 
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal

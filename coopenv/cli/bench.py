@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import complete, options
+from coopenv.cli import options
 
 bench = typer.Typer(help="Compare observers, study seeds.", no_args_is_help=True)
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
@@ -46,7 +46,7 @@ def bench_observers(
         typer.Option(
             help="Names of observers with commas between, or where classes stand, mine.py:Mine or package.module:Mine "
             "(default: all that suit).",
-            **complete.OBSERVERS,
+            **options.OBSERVERS,
         ),
     ] = None,
     variants: Annotated[
@@ -66,7 +66,7 @@ def bench_observers(
     ] = None,
     policy: Annotated[
         str | None,
-        typer.Option("--policy", help="Agent or policy that drives in the records.", **complete.POLICY),
+        typer.Option("--policy", help="Agent or policy that drives in the records.", **options.POLICY),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
     first: First = 0,
@@ -143,11 +143,11 @@ def bench_learning(
 ) -> None:
     """Train agents by environment, arm and seed, and write their cards; goes on where it was interrupted."""
     try:
-        from coopenv.bench.learning import command
+        from coopenv.bench import learning
     except ImportError as error:
         raise CoopenvError(f"coopenv bench learning needs the extra train: pip install '.[train]' ({error})") from None
     from coopenv.base.installation import available_cores
-    from coopenv.bench.learning.study import read_study
+    from coopenv.bench.study import read_study
 
     words = [word.strip() for word in only.split(",") if word.strip()] if only else []
     whole, log = read_study(study), options.console(stderr=True)
@@ -155,9 +155,9 @@ def bench_learning(
     with options.warned():
         for group in chosen.groups:
             options.load(group.environment, chosen.settings[group].scenario)
-    command.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
+    learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
     printed = options.console()
     if not printed.is_terminal:
-        printed.width = max(printed.width, command.WIDTH)
-    printed.print(command.results_table(chosen, folder))
+        printed.width = max(printed.width, learning.WIDTH)
+    printed.print(learning.results_table(chosen, folder))
     printed.print("Figures of the best seed, with 95 % intervals over worlds. More in every agent's card.md.")

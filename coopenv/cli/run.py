@@ -1,6 +1,11 @@
-"""`coopenv run | record`: simulate an environment, or keep what vehicles sense."""
+"""`coopenv run`, `record`, `import`, `figures` and `export`."""
+
+from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +16,9 @@ from coopenv.cli import options
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
+    from coopenv.cars.bags.log import TopicRow
     from coopenv.observers.recording import Recording
     from coopenv.runs.scenes import Onlooker
 
@@ -92,8 +99,15 @@ def record_command(
     """
     from coopenv.backends.mcap import check_target
     from coopenv.backends.sources import is_bag, is_recorded
-    from coopenv.runs.log import check_scene, observer_of, write_log
-    from coopenv.runs.scenes import Onlooker, pages_can_be_written, scene_of_recording, write_page
+    from coopenv.runs.scenes import (
+        Onlooker,
+        check_scene,
+        observer_of,
+        pages_can_be_written,
+        scene_of_recording,
+        write_log,
+        write_page,
+    )
 
     page = out.with_suffix(".html")
     check_target(out)
@@ -125,9 +139,9 @@ def _recording(
     policy: str,
     changes: dict[str, Any],
     recorded: tuple[Path | None, str | None, Path | None],
-    onlooker: "Onlooker",
-    log: "Console",
-) -> "Recording":
+    onlooker: Onlooker,
+    log: Console,
+) -> Recording:
     """Return what vehicles sense, simulated or read; `recorded` are data folder, variant and map of topics."""
     from coopenv.backends.sources import is_bag, is_recorded, open_recording
     from coopenv.runs.console import Progress
@@ -153,3 +167,181 @@ def _recording(
     scenario = options.load(environment, changes)
     with Progress(log, "recording", total=1.0) as progress:
         return record(scenario, seed, policy, progress.update, onlooker.on_tick)
+
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
+ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "layout": "foxglove-layout"})
+Exported = Annotated[
+    Path, typer.Argument(metavar="RUN|FILE.mcap", help="Folder that `coopenv run` has written, or log of `record`.")
+]
+LAYOUT_FILE = "foxglove_layout.json"
+
+
+def figures(
+    run: RunFolder,
+    file_format: Annotated[
+        options.FigureFormat, typer.Option("--format", help="Format of the files.")
+    ] = options.FigureFormat.pdf,
+    width: options.FigureWidth = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the figures (default: RUN/figures).")] = None,
+) -> None:
+    """Draw the figures of an earlier run again, for example for a paper."""
+    from coopenv.runs.command import Results, figure_words
+    from coopenv.runs.console import Progress
+
+    results, folder = Results.read(run), out or run / "figures"
+    with options.warned(), Progress(options.console(stderr=True), "drawing figures"):
+        from coopenv.viz.figures import save_figures
+
+        paths = save_figures(
+            results.trajectory,
+            folder,
+            scenario=results.scenario(),
+            ends=results.ends,
+            steady_from=results.steady_from,
+            file_format=file_format.value,
+            **figure_words(results.metrics, width and width.value),
+        )
+    options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
+
+
+def export(
+    source: Exported,
+    file_format: Annotated[
+        ExportFormat,
+        typer.Option(
+            "--format",
+            help="tum: true and estimated trajectories of a run, which evo reads. foxglove-layout: how Foxglove and "
+            "Lichtblick arrange a log.",
+        ),
+    ] = ExportFormat.tum,
+    out: Annotated[
+        Path | None,
+        typer.Option(help=f"Folder of the trajectories (default: RUN/tum), or file (default: {LAYOUT_FILE})."),
+    ] = None,
+) -> None:
+    """Write a run or a log in the formats of other programs."""
+    if file_format is ExportFormat.layout:
+        _export_layout(source, out or Path(LAYOUT_FILE))
+        return
+    from coopenv.runs.command import Results
+    from coopenv.runs.recorder import write_tum
+
+    folder = out or source / file_format.value
+    paths = write_tum(Results.read(source).trajectory, folder)
+    options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
+
+
+def _export_layout(log: Path, out: Path) -> None:
+    from coopenv.backends.mcap.format import topics_of
+    from coopenv.base.errors import DataError
+    from coopenv.base.files import replace_text
+    from coopenv.viz.foxglove.views import layout_text
+
+    topics = topics_of(log)
+    if "/scene/world" not in topics:
+        raise DataError(f"{log}: has no scene, `coopenv record --scene` writes one")
+    replace_text(out, layout_text(topics))
+    options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)
+
+
+WIDTH = 100
+"""Columns of a table that is not for a terminal."""
+
+
+def import_command(
+    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, such as one per car.")],
+    topics: options.TopicMap = None,
+    out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
+    seed: options.Seed = 0,
+    overrides: options.Overrides = None,
+    observer: options.LogObserver = None,
+    scene: options.LogScene = True,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Say what ROS bags hold, and make a recording of them.
+
+    Files and folders of ROS 1 and ROS 2. Without --map only their topics are listed.
+    """
+    if topics is None:
+        if out is not None or overrides:
+            raise CoopenvError(f"{'--out' if out else '--set'}: needs the map of the bags' topics, --map topics.toml")
+        _print(_topics(bags), as_json)
+        return
+    from coopenv.backends.sources import open_bags
+
+    if out is not None:
+        from coopenv.runs.scenes import check_scene
+
+        _check(out, force)
+        if scene:
+            check_scene(observer)
+    with options.warned():
+        bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    _print(bag.log.rows, as_json)
+    ticks = bag.capabilities.ticks or 0
+    seconds = (ticks - 1) / bag.scenario.rates.camera
+    vehicles = len(bag.binding.cars)
+    facts = f"{vehicles} vehicle{'s' * (vehicles > 1)}, {ticks} ticks, {seconds:.4g} s"
+    if out is not None:
+        from coopenv.runs.console import Progress
+        from coopenv.runs.recorder import record
+        from coopenv.runs.scenes import write_log
+
+        log = options.console(stderr=True)
+        with Progress(log, "recording", total=1.0) as progress:
+            recording = record(bag, seed, on_progress=progress.update)
+        write_log(recording, out, log, observer, scene)
+    if not as_json:
+        options.console().print(f"{out or bag.where}: {facts}", soft_wrap=True)
+
+
+def _check(out: Path, force: bool) -> None:
+    from coopenv.backends.mcap import check_target
+
+    check_target(out)
+    if out.exists() and not force:
+        raise OutputError(f"{out}: exists already; --force replaces it")
+
+
+def _topics(bags: Sequence[Path]) -> tuple[TopicRow, ...]:
+    """Return what bags hold, without knowing what it is."""
+    from coopenv.cars.bags.files import BagFile
+    from coopenv.cars.bags.log import rows_of
+
+    with ExitStack() as stack:
+        return rows_of([stack.enter_context(BagFile(path)) for path in bags])
+
+
+def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
+    if as_json:
+        options.print_json([*rows])
+        return
+    printed = options.console()
+    if not printed.is_terminal:
+        printed.width = max(printed.width, WIDTH)
+    printed.print(_table(rows))
+
+
+def _table(rows: Sequence[TopicRow]) -> Table:
+    from coopenv.runs.console import number_table
+
+    read = any(row.role for row in rows)
+    names = ["topic", *(["read as"] if read else []), *([] if read else ["type"])]
+    numbers = ["messages", "rate\n[Hz]", *(["used", "longest\ngap [s]", "gaps", "clock\n[ms]"] if read else [])]
+    table = number_table(names, numbers)
+    for column in table.columns[: len(names)]:
+        column.no_wrap, column.overflow = False, "fold"
+    for row in rows:
+        cells = [row.topic, f"{row.car} {row.role}" if row.role else "" if read else row.type]
+        cells += [str(row.messages), _shown(row.rate, 1)]
+        if read:
+            offset = None if row.offset is None else 1e3 * row.offset
+            cells += [_shown(row.used, 0), _shown(row.gap, 3), _shown(row.gaps, 0), _shown(offset, 1)]
+        table.add_row(*cells)
+    return table
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

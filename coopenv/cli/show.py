@@ -2,12 +2,17 @@
 
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
+
+if TYPE_CHECKING:
+    from coopenv.runs.console import Progress
 
 Kind = StrEnum("Kind", "envs observers agents variants scenes")
 
@@ -16,7 +21,7 @@ def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
     """List environments, observers, agents, variants or scenes."""
-    from coopenv.runs import listing
+    from coopenv.runs import summary
 
     if kind is Kind.variants:
         from coopenv.bench.observers.sources import variant_rows
@@ -28,16 +33,16 @@ def list_command(
         rows = scene_rows()
     else:
         makers = {
-            Kind.envs: listing.environment_rows,
-            Kind.observers: listing.observer_rows,
-            Kind.agents: listing.agent_rows,
+            Kind.envs: summary.environment_rows,
+            Kind.observers: summary.observer_rows,
+            Kind.agents: summary.agent_rows,
         }
         with options.warned():
             rows = makers[kind]()
     if as_json:
         options.print_json(rows)
     else:
-        options.console().print(listing.list_table(rows, listing.COLUMNS[kind]))
+        options.console().print(summary.list_table(rows, summary.COLUMNS[kind]))
 
 
 def describe(
@@ -51,8 +56,7 @@ def describe(
 ) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
     from coopenv.backends.sources import is_recorded, simulation_of
-    from coopenv.runs.describe import describe_scenario
-    from coopenv.runs.summary import document, summary
+    from coopenv.runs.summary import describe_scenario, document, summary
 
     name, changes = Path(environment).stem, options.parse_overrides(overrides)
     if is_recorded(environment) or any(option is not None for option in (data, variant, topics)):
@@ -105,3 +109,64 @@ def schema(out: Annotated[Path | None, typer.Option(help="File to write (default
         sys.stdout.write(schema_text())
     else:
         replace_text(out, schema_text())
+
+
+def page(
+    environments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="ENV...",
+            help="Names of environments or TOML files.",
+            show_default=False,
+            autocompletion=options.environments,
+            callback=options.known_environments,
+        ),
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for ENV.md, ENV.png and ENV.webp.")] = Path("out", "pages"),
+    measure: Annotated[
+        bool,
+        typer.Option("--measure", help="Measure what sensing is worth, for ENV.json; else what is there is shown."),
+    ] = False,
+    film: Annotated[
+        bool,
+        typer.Option("--film/--no-film", help="Film an episode for ENV.webp; else the film that is there is shown."),
+    ] = True,
+    worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
+) -> None:
+    """Write the pages of environments: what they are, a picture, a film, what sensing is worth."""
+    from coopenv.base.installation import list_envs
+    from coopenv.bench import pages
+    from coopenv.bench.cards import entrants, has_dial
+    from coopenv.runs.console import Progress
+
+    if bool(environments) == everything:
+        raise CoopenvError("name environments, or give --all for those that ship with coopenv")
+    names = list_envs() if everything else list(environments or ())
+    stems = {Path(text).stem: text for text in names}
+    if len(stems) < len(names):
+        raise CoopenvError("two environments have the same name")
+    scenarios = {name: options.load(text, {}) for name, text in stems.items()}
+    measured = [name for name in stems if measure and (has_dial(name) or not everything)]
+    for name in measured:
+        entrants(stems[name])
+    pages.prepare(out, list(stems))
+    log = options.console(stderr=True)
+    with Progress(log, "pages", total=len(stems)) as progress:
+        for number, (name, scenario) in enumerate(scenarios.items()):
+            progress.update(number, name)
+            if name in measured:
+
+                def told(done: float, who: str, number: int = number, name: str = name) -> None:
+                    progress.update(number + done, f"{name}, {who}")
+
+                pages.write_figures(stems[name], name, scenario, out, worlds, told)
+            pages.write_page(name, scenario, out, partial(_filming, progress, number, name) if film else None)
+    if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
+        pages.write_index(shipped, out)
+    options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
+
+
+def _filming(progress: "Progress", number: int, name: str, share: float) -> None:
+    """Say how far the film of an environment is."""
+    progress.update(number + share, f"{name}, film")

@@ -1,4 +1,4 @@
-"""`coopenv train`: learn to drive."""
+"""`coopenv dataset`, `train` and `evaluate`."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -6,12 +6,12 @@ from typing import Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cli import complete, options
+from coopenv.cli import options
 
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
 Agent = Annotated[
     str | None,
-    typer.Option(help="Agent beside which the settings stand, as train.toml.", autocompletion=complete.agents),
+    typer.Option(help="Agent beside which the settings stand, as train.toml.", autocompletion=options.agents),
 ]
 Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
 
@@ -124,3 +124,117 @@ def _told(results: list[Any]) -> str:
 def _interval(figure: Any, factor: float, digits: int) -> str:
     mean, low, high = (f"{factor * value:.{digits}f}" for value in (figure.mean, figure.ci_low, figure.ci_high))
     return f"{mean} [{low}, {high}]"
+
+
+def evaluate(
+    environment: options.Environment,
+    agents: Annotated[
+        str | None,
+        typer.Option(
+            help="Agents with commas between: names, folders, or mine.py:Mine or package.module:Mine (default: every "
+            "agent of agents/ that was made for ENV).",
+            **options.AGENTS,
+        ),
+    ] = None,
+    worlds: Annotated[
+        int, typer.Option(min=2, max=options.MOST_WORLDS, help="Number of held-out worlds, the same for every agent.")
+    ] = 256,
+    seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0,
+    overrides: options.Overrides = None,
+    ideal: Annotated[
+        bool, typer.Option("--ideal", help="Also let route_follower drive where everybody sees everything.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None,
+    figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png,
+    width: options.FigureWidth = None,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
+    film: Annotated[
+        bool, typer.Option("--film", help="Also write a film of the agents in one of the worlds, side by side.")
+    ] = False,
+    write_card: Annotated[
+        bool, typer.Option("--write-card", help="Write the results to card.json and card.md in the agents' folders.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an evaluation that is there.")] = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Compare agents on held-out worlds: arrivals, collisions, time, errors."""
+    from coopenv.bench import cards, evaluate
+
+    if film and out is None:
+        raise CoopenvError("--film: the film needs a folder, --out DIR")
+    names = [word.strip() for word in agents.split(",") if word.strip()] if agents else []
+    if agents is not None and not names:
+        raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
+    changes, log = options.parse_overrides(overrides), options.console(stderr=True)
+    request = evaluate.Request(environment, names, worlds, seed_block, tuple(overrides or ()), changes, ideal)
+    with options.warned():
+        entrants = request.entrants()
+    if write_card:
+        cards.check(entrants)
+    if out is None:
+        result = evaluate.run(request, entrants, log)
+    else:
+        form = None if no_figures else figures.value
+        result = evaluate.write(out, request, entrants, form, film, force, log, width and width.value)
+    written = cards.write(result, request.command()) if write_card else []
+    if as_json:
+        options.print_json(evaluate.document(request, result))
+        return
+    printed = options.console()
+    if not printed.is_terminal:
+        printed.width = max(printed.width, evaluate.WIDTH)
+    evaluate.report(result, printed)
+    if out is not None:
+        printed.print(f"Files in {out}:", soft_wrap=True)
+        printed.print(f"  {', '.join(sorted(path.name for path in out.iterdir()))}")
+    for path in written:
+        printed.print(f"Card: {path}", soft_wrap=True)
+
+
+def dataset(
+    environment: options.Environment,
+    policy: Annotated[
+        str,
+        typer.Option(
+            "--policy",
+            help="Who drives: random, the name of an agent, its folder, or mine.py:Mine.",
+            **options.POLICY,
+        ),
+    ] = "route_follower",
+    worlds: Annotated[
+        int, typer.Option(min=1, max=options.MOST_WORLDS, help="Worlds; an episode of each of their vehicles is kept.")
+    ] = 64,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the worlds.")] = 0,
+    overrides: options.Overrides = None,
+    identity: Annotated[
+        str | None, typer.Option("--id", help="NAMESPACE/NAME-v0 of the dataset (default: coopenv/ENV/POLICY-v0).")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of datasets (default: MINARI_DATASETS_PATH or ~/.minari/datasets).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a dataset that is there.")] = False,
+) -> None:
+    """Write episodes of a policy as a Minari dataset, one per vehicle."""
+    import shlex
+
+    name, log = Path(environment).stem, options.console(stderr=True)
+    scenario = options.load(environment, options.parse_overrides(overrides))
+    from coopenv.base.installation import list_envs
+    from coopenv.policies import load_policy
+    from coopenv.runs.console import Progress, compile_notice
+    from coopenv.runs.dataset import dataset_place, drive_vehicles, write_dataset
+
+    driver = load_policy(policy, scenario, seed)
+    own = Path(policy.rpartition(":")[2] or policy).name
+    identity = identity or f"coopenv/{name}/{own}-v0"
+    place = dataset_place(identity, out, force)
+    with Progress(log, "driving", total=1.0) as progress, compile_notice(log):
+        episodes = drive_vehicles(scenario, driver, seed, worlds, progress.update)
+    words = ["coopenv", "dataset", environment, "--policy", policy, "--worlds", str(worlds), "--seed", str(seed)]
+    words += [word for assignment in overrides or () for word in ("--set", assignment)]
+    facts = {"algorithm_name": own, "description": f"{scenario.title}: {shlex.join(words)}"}
+    registered = name if environment in list_envs() and not overrides else ""
+    write_dataset(episodes, scenario, registered, place, identity, facts)
+    steps = sum(len(episode.actions) for episode in episodes)
+    told = f"{len(episodes)} episodes, {steps:,} steps"
+    options.console().print(f"{place.parent}: {told}, minari.load_dataset('{identity}')", soft_wrap=True)

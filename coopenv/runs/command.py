@@ -1,7 +1,10 @@
 """`coopenv run`: simulate with progress shown, write the results, print the table."""
 
+import json
+import math
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -9,18 +12,18 @@ from typing import Any
 from rich.console import Console
 
 from coopenv.backends.base import Repeating
-from coopenv.base.errors import CoopenvError, listed
+from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.registry import states_covariance
-from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.metrics import run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.rollouts import Rollout
+from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
+from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, write_page
-from coopenv.runs.table import legend, metrics_table, rates, remarks
 from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
+from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz import FIGURE_NAMES, FORMATS
 from coopenv.viz.scene import SceneRecord, Source
 from coopenv.viz.scene.record import SCENE_FILE
@@ -171,3 +174,65 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))
     if (page := folder / REPLAY_FILE) in result["files"]:
         out.print(f"To watch it in a browser, open {page}", soft_wrap=True)
+
+
+_NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_from_s", "vehicles")
+
+
+@dataclass(frozen=True)
+class Results:
+    """A folder of `coopenv run`."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    trajectory: Trajectory
+    """Of the vehicles that were estimated, at the ticks at which their truth is known."""
+
+    @classmethod
+    def read(cls, folder: str | Path) -> "Results":
+        """Read a folder.
+
+        Raises:
+            DataError: it is no folder of a run, or a file of it cannot be read.
+        """
+        folder = Path(folder)
+        path = folder / METRICS_FILE
+        try:
+            metrics = json.loads(path.read_text(encoding="utf-8"))
+        except NotADirectoryError:
+            raise DataError(f"{folder}: a file; expected a folder that `coopenv run` has written") from None
+        except OSError as error:
+            raise DataError(f"{folder}: no folder of `coopenv run` ({METRICS_FILE}: {error.strerror})") from None
+        except ValueError as error:
+            raise DataError(f"{path}: not JSON ({error})") from None
+        missing = [key for key in _NEEDED if not isinstance(metrics, dict) or key not in metrics]
+        if missing:
+            raise DataError(f"{path}: not of a run, missing: {', '.join(missing)}")
+        whole = Trajectory.load(folder / TRAJECTORY_FILE)
+        names = whole.vehicles.tolist()
+        try:
+            judged = [names.index(row["vehicle"]) for row in metrics["vehicles"]]
+            metrics.setdefault("observer", "unknown observer")  # of a run before 0.2
+            ends = [row["ended_at_s"] for row in metrics["vehicles"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: vehicles are not those of {TRAJECTORY_FILE} ({error})") from None
+        if not all(end is None or isinstance(end, float | int) for end in ends):
+            raise DataError(f"{path}: ended_at_s: expected numbers")
+        return cls(folder, metrics, whole.of_vehicles(judged).where_truth_is_known())
+
+    @property
+    def ends(self) -> list[float]:
+        """When each vehicle ended, s; NaN: it did not."""
+        return [math.nan if row["ended_at_s"] is None else float(row["ended_at_s"]) for row in self.metrics["vehicles"]]
+
+    @property
+    def steady_from(self) -> float:
+        """Start of the steady state, s."""
+        return float(self.metrics["steady_from_s"])
+
+    def scenario(self) -> Scenario | None:
+        """Return the world of the run; None where only its file could tell, such as of a recording."""
+        try:
+            return load_scenario(self.metrics["environment"], self.metrics["overrides"])
+        except CoopenvError:
+            return None

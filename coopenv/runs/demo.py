@@ -4,26 +4,142 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.base.files import replacing_file, writing
+from coopenv.base.format import seconds
 from coopenv.base.installation import data_directory
 from coopenv.base.interrupts import also_kept
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.opening import open_svea
 from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.profile import Role
 from coopenv.cars.transport.zenoh import library
+from coopenv.estimation.metrics import live_ticks, summarise
 from coopenv.runs.command import NoTruthError, execute, report
-from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.links import STEADY_FROM, links_line, links_report, truth_report
+from coopenv.runs.console import Progress, compile_notice, number_table
 from coopenv.runs.rollouts import Rollout
-from coopenv.runs.side_by_side import Episodes, side_by_side
 from coopenv.scenario import Scenario
+
+STEADY_FROM = 2.0
+"""s: cars know their places by then."""
+
+
+def links_line(backend: Svea) -> str:
+    """Return the state of the links in a few words, for a line that is shown while it runs."""
+    parts = []
+    for vehicle in backend.binding.local:
+        notes = backend.notes(vehicle)
+        refused = sum(notes["gate_rejections"].values()) + sum(backend.intake.rejected[notes["name"]].values())
+        parts.append(f"{notes['name']} {notes['gate']}" + (f", {refused} refused" if refused else ""))
+    late = f"; {backend.link.missed} deadlines missed" if backend.link.missed else ""
+    return "; ".join(parts) + late
+
+
+def kept_drive(path: Path | None, backend: Svea) -> str:
+    """Return what is told of a drive's record when the drive is interrupted; empty where there is nothing to replay."""
+    if path is None or backend.recorder is None or not backend.recorder.begun:
+        return ""
+    return f"kept: {path}, the drive up to here: coopenv run {path}"
+
+
+def links_report(backend: Svea, out: Console) -> None:
+    """Print a table with a row per car, and a line on time and on why it ended."""
+    health, cars = backend.link, backend.binding
+    table = Table(title="Links", title_justify="left", box=None)
+    for name in ("car", "gate", "clock offset", "messages refused", "gate refused"):
+        table.add_column(name, justify="left" if name in ("car", "gate") else "right")
+    for vehicle in cars.local:
+        notes = backend.notes(vehicle)
+        offset = f"{1e3 * notes['clock_offset']:.1f} ms"
+        refused = str(sum(backend.intake.rejected[notes["name"]].values()))
+        table.add_row(notes["name"], notes["gate"], offset, refused, str(sum(notes["gate_rejections"].values())))
+    out.print(table)
+    late = 1e3 * backend.lateness(0.99)
+    out.print(
+        f"{health.received} messages, {health.ticks} ticks, {health.missed} missed deadlines, "
+        f"wake-up lateness p99 {late:.2f} ms",
+        soft_wrap=True,
+    )
+    if left_out := [f"{name} {count}" for name, count in health.refused.items() if count]:
+        out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
+    trip = backend.watchdog.trip
+    if trip is not None:
+        out.print(f"Stopped: {trip.reason}", soft_wrap=True)
+
+
+def truth_report(backend: Svea) -> str:
+    """Return why no tick has true poses: no car sends, or by topic of motion capture what came."""
+    names = list(backend.binding.cars)
+    if not backend.health.received:
+        where = ", ".join(backend.deployment.network.connect)
+        return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
+    topics = [backend.binding.profile.topic_of(name, Role.TRUTH) for name in names]
+    came = [topic for topic in topics if isfinite(backend.station.silence(topic))]
+    silent = [topic for topic in topics if topic not in came]
+    parts = [f"nothing came on {listed(silent)}"] if silent else []
+    parts += [f"messages on {listed(came)} came too late for the ticks"] if came else []
+    return "no true poses are known, so there are no errors to show: " + "; ".join(parts)
+
+
+class Episodes:
+    """What the episodes on one backend come to, one after the other."""
+
+    def __init__(self, steady_from: float) -> None:
+        """Say when the steady state begins, s."""
+        self._steady_from = steady_from
+        self._rows: list[list[dict[str, Any]]] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, run: Rollout) -> None:
+        """Take an episode that is over."""
+        trajectory = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known()
+        ends = [ending.time for ending in run.endings()]
+        static = np.array([k for k in range(len(run.scenario.landmarks)) if not trajectory.target_moving[k]])
+        rows = summarise(trajectory, self._steady_from, ends)
+        for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(rows), ends)):
+            seen = trajectory.visible[1:ticks, vehicle][:, static]
+            rows[vehicle]["hidden_share"] = float(1.0 - seen.all(axis=-1).mean()) if len(seen) else np.nan
+        self._rows.append(rows)
+
+    def values(self, vehicle: int, name: str) -> np.ndarray:
+        """Return (S,) a figure of a vehicle, per episode."""
+        return np.array([rows[vehicle][name] for rows in self._rows], dtype=float)
+
+
+def side_by_side(vehicles: list[str], backends: Mapping[str, Episodes]) -> Table:
+    """Return a row per vehicle and backend, of all episodes: the last settling; means with standard errors."""
+    headings = ("\nseeds", "settles\nby [s]", "RMSE [m]\nmean±SE", "RMSE [deg]\nmean±SE", "hidden [%]\nmean±SE")
+    table = number_table(("\nvehicle", "\non"), headings)
+    for i, vehicle in enumerate(vehicles):
+        for name, episodes in backends.items():
+            table.add_row(
+                vehicle,
+                name,
+                str(len(episodes)),
+                *seconds([float(episodes.values(i, "settle_time_s").max())]),
+                _mean(episodes.values(i, "steady_position_rmse_m"), 4),
+                _mean(episodes.values(i, "steady_orientation_rmse_deg"), 2),
+                _mean(100.0 * episodes.values(i, "hidden_share"), 1),
+            )
+    return table
+
+
+def _mean(values: np.ndarray, digits: int) -> str:
+    """Return mean and standard error in words; the latter needs two values."""
+    if len(values) < 2:
+        return f"{values.mean():.{digits}f}"
+    return f"{values.mean():.{digits}f}±{values.std(ddof=1) / np.sqrt(len(values)):.{digits}f}"
+
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
 """Deployment files of the experiments, in `examples/fleet`."""

@@ -1,24 +1,94 @@
-"""`coopenv watch | play`: an episode in a window, as it happens, or as a film."""
+"""Episodes in a window, driven by an agent or from the keyboard, and films."""
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 from rich.console import Console
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
+from coopenv.api.terms.layout import action_fields
 from coopenv.base.errors import CoopenvError
-from coopenv.base.files import replacing_folder
-from coopenv.policies import Policy, agents_for, load_policy
+from coopenv.base.files import replacing_file, replacing_folder
+from coopenv.policies import Policy, agents_for, load_policy, restart
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.episode import play
-from coopenv.runs.keyboard import AGAIN, HELP, LEAVE, Keyboard, Keys
-from coopenv.runs.video import frame_stride, open_film
+from coopenv.runs.rollouts import play
+from coopenv.runs.video import film_at, frame_stride, open_film
 from coopenv.scenario import Scenario
+from coopenv.viz.scene import SceneRecord
 from coopenv.viz.topview import TopView
 from coopenv.viz.window import Window
+
+LEAVE, AGAIN = {"escape", "q"}, {"r"}
+HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."
+FULL_SPEED, FULL_STEERING = 1.0, 0.4
+"""s that a key is held for the whole range: from standstill to top speed, from straight ahead to full steering."""
+
+
+class Keys:
+    """Which keys are held down, as the canvas of a window tells."""
+
+    def __init__(self, canvas: Any) -> None:
+        """Listen to a canvas of matplotlib."""
+        self.held: set[str] = set()
+        self.struck: set[str] = set()
+        """Keys that were pressed since somebody cleared this."""
+        canvas.mpl_connect("key_press_event", self._press)
+        canvas.mpl_connect("key_release_event", self._release)
+
+    def _press(self, event: Any) -> None:
+        if event.key is not None:
+            self.held.add(event.key)
+            self.struck.add(event.key)
+
+    def _release(self, event: Any) -> None:
+        self.held.discard(event.key)
+
+    def direction(self, plus: str, minus: str) -> float:
+        """Return 1, -1 or 0 by which of two keys is held."""
+        return float(plus in self.held) - float(minus in self.held)
+
+
+class Keyboard:
+    """A policy of one world that drives a vehicle by keys and leaves the others to another policy."""
+
+    def __init__(self, scenario: Scenario, vehicle: int, others: Policy, keys: Keys) -> None:
+        """Choose who is driven by whom; `vehicle` is an index."""
+        self.keys, self._vehicle, self._others = keys, vehicle, others
+        self._longitudinal = action_fields(scenario, scenario.limits[vehicle])[0]
+        self._period = 1.0 / scenario.rates.decision
+        self.reset(np.ones(len(scenario.vehicles), dtype=bool))
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin anew, standing, with straight wheels."""
+        low, high = self._longitudinal.low, self._longitudinal.high
+        self._level = -(high + low) / (high - low)  # of nothing: no speed, no acceleration
+        self._still, self._steering = self._level, 0.0
+        restart(self._others, mask)
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return the actions, (vehicles, A)."""
+        actions = np.array(self._others(observations), dtype=float)
+        pedal, wheel = self.keys.direction("up", "down"), self.keys.direction("left", "right")
+        if self._longitudinal.name == "speed":
+            self._level = float(
+                np.clip(self._level + pedal * (1.0 - self._still) * self._period / FULL_SPEED, -1.0, 1.0)
+            )
+            if pedal < 0.0 and self._longitudinal.low == 0.0:
+                self._level = max(self._level, self._still)
+        else:
+            self._level = pedal
+        step = self._period / FULL_STEERING
+        self._steering = float(np.clip(wheel, self._steering - step, self._steering + step))
+        actions[self._vehicle] = 0.0
+        actions[self._vehicle, :2] = self._level, self._steering
+        return actions
+
 
 FILMS = ("video.mp4", "video.gif")
 
@@ -170,3 +240,56 @@ def others_of(scenario: Scenario, environment: str, name: str | None, seed: int)
     if name is None:
         name = "route_follower" if "route_follower" in agents_for(environment) else "zero"
     return load_policy(name, scenario, seed)
+
+
+def write_film(
+    record: SceneRecord,
+    path: Path,
+    fps: float,
+    speed: float = 1.0,
+    width: int = 896,
+    panel: bool = True,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> int:
+    """Write a film of a scene; return how many pictures it has.
+
+    Args:
+        record: the scene.
+        path: of the film, which is replaced as a whole; its suffix is the format.
+        fps: pictures a second; frames of the scene are repeated where it has fewer.
+        speed: times real time.
+        width: of the pictures, pixels, at most.
+        panel: table and legend beside the map.
+        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
+
+    Raises:
+        CoopenvError: unknown format, or it needs an extra.
+        OutputError: the file cannot be written.
+    """
+    film_at(path, fps)  # before anything is drawn
+    chosen = frames_at(record.time, fps, speed)
+    with (
+        replacing_file(path) as new,
+        closing(TopView(record.scenario, panel=panel)) as view,
+        film_at(new, fps) as film,
+    ):
+        for done, k in enumerate(chosen, start=1):
+            film.add(_within(view.paint(record.frame(int(k))), width))
+            on_progress(done / len(chosen))
+        film.close()
+    return len(chosen)
+
+
+def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
+    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
+    count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
+    moments = time[0] + np.arange(count) * speed / fps
+    return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)
+
+
+def _within(picture: np.ndarray, width: int) -> np.ndarray:
+    """Return a picture that is no wider than that."""
+    if picture.shape[1] <= width:
+        return picture
+    size = width, round(picture.shape[0] * width / picture.shape[1])
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))

@@ -1,17 +1,40 @@
 """The page of an environment, in Markdown, from its scenario."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_envs
-from coopenv.runs import scenario_rows
-from coopenv.runs.describe import shown_sections
-from coopenv.runs.drawn_text import drawn, graded
-from coopenv.runs.markdown import bullets, plain, table
-from coopenv.runs.summary import facts
+from coopenv.runs import scenario_text
+from coopenv.runs.scenario_text import drawn, graded
+from coopenv.runs.summary import facts, shown_sections
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS, Term
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table; lines within a cell come one after the other, with semicolons between."""
+    lines = [_row(columns), "|---" * len(columns) + "|", *map(_row, rows)]
+    return "\n".join(lines)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list."""
+    return "\n".join(f"- {plain(line)}" for line in lines)
+
+
+def plain(text: str) -> str:
+    """Return a text on one line, without what would be read as a tag."""
+    return " ".join(text.split()).replace("<", "&lt;")
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(_cell(cell) for cell in cells)} |"
+
+
+def _cell(text: str) -> str:
+    return plain("; ".join(text.splitlines())).replace("|", "\\|")
+
 
 GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
 """Facts that no table below repeats."""
@@ -54,7 +77,7 @@ def _scene(scenario: Scenario) -> Iterator[str]:
     if lines := list(graded(scenario)):
         yield f"With the difficulty (here {number(scenario.difficulty.number)}; [draws](../draws.md)):"
         yield bullets(lines)
-    for listing in scenario_rows.scene(scenario, grouped=False):
+    for listing in scenario_text.scene(scenario, grouped=False):
         yield f"## {listing.title}"
         yield table(listing.columns, listing.rows)
     yield "## Settings"
@@ -62,7 +85,7 @@ def _scene(scenario: Scenario) -> Iterator[str]:
     rows = [
         (f"`{section}.{key}`", value, meaning)
         for section in shown_sections(scenario)
-        for key, value, meaning, differs in scenario_rows.settings(getattr(scenario, section))
+        for key, value, meaning, differs in scenario_text.settings(getattr(scenario, section))
         if differs and f"{section}.{key}" not in TOLD and not key.startswith("weights.")
     ]
     yield table(("key", "value", "meaning"), rows)

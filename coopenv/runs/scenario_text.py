@@ -1,11 +1,14 @@
-"""Parts of a scenario in words."""
+"""The setting of a scenario in words: texts, rows of fields, and what is drawn anew in every episode."""
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel
 
+from coopenv.api.terms.layout import observation_layout
+from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.scenario.bodies import (
     Body,
@@ -20,8 +23,10 @@ from coopenv.scenario.bodies import (
     Vehicle,
     WaypointMotion,
 )
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.scenario.routes import Route
 from coopenv.scenario.schema import Scenario
+from coopenv.scenario.sensing import Camera
 from coopenv.scenario.starts import neighbour_sets
 
 MANY_LANDMARKS = 4  # from this number on, `all landmarks` stands for their names
@@ -196,3 +201,205 @@ def neighbours(scenario: Scenario) -> list[str]:
             names = [f"all {L} landmarks", *names[L:]]
         result.append(", ".join(names) or "none")
     return result
+
+
+def drawn(scenario: Scenario) -> Iterator[str]:
+    """Yield one line per thing that every world draws for itself at every reset."""
+    yield from _of_vehicles(scenario)
+    yield from _of_landmarks(scenario)
+    yield from _of_errors(scenario)
+    for name, (what, _, _) in PARAMETERS.items():
+        low, high = scenario.randomisation.factors(name)
+        if (low, high) != (1.0, 1.0):
+            yield f"a factor of {what}: {number(low)} to {number(high)}"
+
+
+def graded(scenario: Scenario) -> Iterator[str]:
+    """Yield one line per thing that grows with the difficulty."""
+    for name, (what, _, _) in PARAMETERS.items():
+        low, high = scenario.difficulty.factors(name)
+        if (low, high) != (1.0, 1.0):
+            yield f"a factor of {what}: {number(low)} at difficulty 0, {number(high)} at 1"
+
+
+def _of_vehicles(s: Scenario) -> Iterator[str]:
+    if s.highway is not None:
+        yield f"roads and traffic, by highway-env's `{s.highway.id}`"
+    several = [name for name, v in zip(s.vehicle_names, s.vehicles, strict=True) if len(v.routes) > 1]
+    if several:
+        yield f"one of its routes, for {listed(several)}"
+    yield from _spans("shift of a route to either side", s.routes, lambda r: r.lateral_spread, "m")
+    yield from _spans("further deviation of a route", s.routes, lambda r: r.wander, "m")
+    yield from _spans("start along a route", s.routes, lambda r: r.start_spread, "m")
+    poses = [vehicle.initial_pose for vehicle in s.vehicles if vehicle.initial_pose is not None]
+    yield from _spans("a vehicle's start along its own axis", poses, lambda p: p.position_spread[0], "m", "+- ")
+    yield from _spans("a vehicle's start to either side", poses, lambda p: p.position_spread[1], "m", "+- ")
+    yield from _spans("a vehicle's start in height", poses, lambda p: p.position_spread[2], "m", "+- ")
+    yield from _spans("a vehicle's heading", poses, lambda p: math.degrees(p.yaw_spread), "deg", "+- ")
+    motions = [vehicle.motion for vehicle in s.vehicles]
+    yield from _spans(
+        "a vehicle's first speed", motions, lambda m: getattr(m, "initial_speed_spread", 0.0), "m/s", "+- "
+    )
+    moving = [*s.vehicles, *s.landmarks]
+    yield from _spans("pace of a prescribed motion", moving, lambda m: 100.0 * m.pace_spread, "%", "+- ")
+    yield from _absent("a vehicle", s.vehicles)
+
+
+def _of_landmarks(s: Scenario) -> Iterator[str]:
+    for group in s.landmark_groups:
+        sort, count = ("areas", len(group.boxes)) if group.boxes else ("lines", len(group.lines))
+        where = f"{count} {sort}" if count > 1 else f"one {sort.removesuffix('s')}"
+        yield f"the places of {group.count} landmarks `{group.name}`, over {where}"
+    spread = [mark for mark in s.landmarks if any(mark.position_spread)]
+    yield from _spans("place of a landmark along an axis", spread, lambda m: max(m.position_spread), "m", "+- ")
+    yield from _absent("a landmark", s.landmarks)
+
+
+def _of_errors(s: Scenario) -> Iterator[str]:
+    beliefs = [vehicle.initial_estimate for vehicle in s.vehicles]
+    yield from _spans("offset of an initial estimate", beliefs, lambda b: b.position_radius, "m")
+    if any(belief.orientation_angle == "uniform" for belief in beliefs):
+        yield "turn of an initial estimate: over SO(3)"
+    turned = [belief for belief in beliefs if belief.orientation_angle != "uniform"]
+    yield from _spans("turn of an initial estimate", turned, lambda b: math.degrees(b.orientation_angle), "deg")
+    noises = [noise for noise in s.noises if noise.enabled]
+    cameras = [camera for camera, noise in zip(s.cameras, s.noises, strict=True) if noise.enabled]
+    deviation = "standard deviation "
+    yield from _spans("scale error of the odometry", noises, lambda n: 100.0 * n.odometry_scale, "%", deviation)
+    yield from _spans("bias of the gyro", noises, lambda n: math.degrees(np.max(n.gyro_bias)), "deg/s", deviation)
+    yield from _spans("turn of a camera", cameras, lambda c: math.degrees(c.extrinsics_error), "deg", deviation)
+    yield from _spans("offset of a camera", cameras, lambda c: c.extrinsics_position_error, "m", deviation)
+
+
+def _spans(what: str, parts: Sequence[Any], of: Callable[[Any], float], unit: str, kind: str = "") -> Iterator[str]:
+    """Yield one line that says how large a spread is, from the least to the largest of those that are not 0."""
+    values = sorted({float(of(part)) for part in parts} - {0.0})
+    if values:
+        low, high = number(values[0]), number(values[-1])
+        kind = kind or "up to "
+        yield f"{what}: {kind}{high if low == high else f'{low} .. {high}'} {unit}"
+
+
+def _absent(what: str, parts: Sequence[Any]) -> Iterator[str]:
+    chances = sorted({part.presence for part in parts} - {1.0})
+    if chances:
+        low, high = (number(100.0 * chance) for chance in (chances[0], chances[-1]))
+        yield f"whether {what} is there: with {low if low == high else f'{low} .. {high}'} %"
+
+
+IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
+"""Settings of a camera that matter only where it has an image, as a pinhole camera does."""
+
+
+class Listing(NamedTuple):
+    """A table of texts; cells may have several lines."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Listing]:
+    """Yield the tables of who and what is there; those without rows are left out, as are their empty columns.
+
+    `grouped` says whether landmarks that a group draws have rows of their own.
+    """
+    marks = landmarks(scenario, grouped)
+    tables = (vehicles(scenario), routes(scenario), marks, groups(scenario), motions(scenario), buildings(scenario))
+    yield from (_without_empty_columns(table) for table in tables if table.rows)
+
+
+def _without_empty_columns(table: Listing) -> Listing:
+    kept = [i for i in range(len(table.columns)) if any(row[i] for row in table.rows)]
+    rows = [tuple(row[i] for i in kept) for row in table.rows]
+    return Listing(table.title, tuple(table.columns[i] for i in kept), rows)
+
+
+def vehicles(scenario: Scenario) -> Listing:
+    """Return one row per vehicle: start, initial estimate, motion, neighbours."""
+    columns = ("vehicle", "start", "initial estimate", "motion", "may measure")
+    targets_of = neighbours(scenario)
+    rows = [
+        (name, start(vehicle), estimate(vehicle.initial_estimate), vehicle_motion(vehicle), targets)
+        for name, vehicle, targets in zip(scenario.vehicle_names, scenario.vehicles, targets_of, strict=True)
+    ]
+    return Listing("Vehicles (m)", columns, rows)
+
+
+def routes(scenario: Scenario) -> Listing:
+    """Return one row per route."""
+    rows = []
+    for route in scenario.routes:
+        points = ", ".join(vector(point) for point in route.waypoints)
+        rows.append((route.name, points, f"radius {number(route.corner_radius)}", drawn_route(route)))
+    return Listing("Routes (m)", ("route", "waypoints", "corners", "drawn"), rows)
+
+
+def landmarks(scenario: Scenario, grouped: bool = True) -> Listing:
+    """Return one row per landmark, those of groups included or not."""
+    rows = [
+        (mark.name, place(mark), motion(mark.motion), body(mark.body) or "none")
+        for mark in scenario.landmarks
+        if grouped or mark.group is None
+    ]
+    return Listing("Landmarks (m)", ("landmark", "position", "motion", "body"), rows)
+
+
+def groups(scenario: Scenario) -> Listing:
+    """Return one row per group of landmarks."""
+    rows = [
+        (group.name, str(group.count), areas(group), " to ".join(number(z) for z in group.height))
+        for group in scenario.landmark_groups
+    ]
+    return Listing("Groups of landmarks (m)", ("group", "landmarks", "drawn in", "height"), rows)
+
+
+def motions(scenario: Scenario) -> Listing:
+    """Return one row per stage of every motion that is prescribed stage by stage."""
+    moving = [*(v.motion for v in scenario.vehicles), *(m.motion for m in scenario.landmarks)]
+    names = [*scenario.vehicle_names, *(m.name for m in scenario.landmarks)]
+    rows = [
+        ("" if i else name, time, stage)
+        for name, motion in zip(names, moving, strict=True)
+        for i, (time, stage) in enumerate(stages(motion))
+    ]
+    return Listing("Stages of motion (s)", ("who", "time", "motion"), rows)
+
+
+def buildings(scenario: Scenario) -> Listing:
+    """Return one row per building."""
+    rows = []
+    for obstacle in scenario.obstacles:
+        yaw = orientation(obstacle.yaw, None) or ""
+        size = " x ".join(number(edge) for edge in obstacle.size)
+        rows.append((obstacle.name, vector(obstacle.center), size, yaw.removeprefix("yaw ")))
+    return Listing("Buildings (m)", ("building", "centre", "size", "yaw"), rows)
+
+
+def observation(scenario: Scenario) -> Listing:
+    """Return one row per field of the flat observation."""
+    layout, rows = observation_layout(scenario), []
+    for name, field in layout.items():
+        shape, part = "x".join(map(str, field.shape)), f"{field.start}:{field.stop}"
+        meaning = f"{field.meaning}; center {number(field.center)}" if field.center else field.meaning
+        rows.append((name, part, shape, field.unit, number(field.scale), meaning))
+    title = f"Observation: {layout.size} entries per vehicle, each (value - center) / scale, clipped"
+    return Listing(title, ("field", "slice", "shape", "unit", "scale", "meaning"), rows)
+
+
+def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str, bool]]:
+    """Yield (dotted key, value, meaning, whether it differs from the default) of a section's fields that matter."""
+    unused = IMAGE_FIELDS if isinstance(part, Camera) and part.model != "pinhole" else ()
+    for name, info in type(part).model_fields.items():
+        if name in unused:
+            continue
+        value = getattr(part, name)
+        if isinstance(value, BaseModel):
+            yield from settings(value, f"{prefix}{name}.")
+        elif name == "custom":
+            yield from ((f"custom.{key}", setting(row.function), row.meaning, True) for key, row in value.items())
+        else:
+            meaning = " ".join((info.description or "").split())
+            yield f"{prefix}{name}", setting(value), meaning, value != info.get_default()
+    for name, value in (part.model_extra or {}).items():
+        yield f"{prefix}{name}", setting(value), "A term of one's own, see docs/terms.md", True

@@ -1,11 +1,13 @@
-"""The first screen of `coopenv describe`: what matters about a scenario, and the same as data."""
+"""Environments, drivers, observers and scenes for the terminal: one line, a table, every field."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from textwrap import shorten
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
+from rich import box
 from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -13,7 +15,11 @@ from rich.text import Text
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
-from coopenv.base.installation import environment_id, list_envs
+from coopenv.base.installation import environment_id, list_agents, list_envs
+from coopenv.observers.registry import description, observer_names
+from coopenv.policies import find_agent
+from coopenv.runs import scenario_text
+from coopenv.runs.scenario_text import Listing, settings
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensing import Noise
 
@@ -168,3 +174,137 @@ def document(name: str, scenario: Scenario) -> dict[str, Any]:
         "action": [vars(entry) for entry in layout.action],
         "scenario": scenario.model_dump(mode="json"),
     }
+
+
+SECTIONS = ("camera", "rates", "noise", "topology", "v2x", "observer", "observation", "reward", "termination")
+DRIVEN_SECTIONS = ("dynamics", "action")
+"""Sections that matter only where actions drive a vehicle."""
+
+DRAWN_SECTIONS = ("randomisation", "difficulty")
+"""Sections that are shown only where they say something."""
+
+VALUE_WIDTH = 17
+WHOLE_COLUMNS = {"vehicle", "who", "time", "field", "slice", "shape", "unit", "scale"}
+"""Columns that are not broken into lines."""
+
+
+def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
+    """Yield everything about a scenario, part by part."""
+    yield Text(f"{scenario.title}\n", "bold")
+    for text in (scenario.description, scenario.source and f"Source: {scenario.source.strip()}"):
+        if text:
+            yield f"{' '.join(text.split())}\n"
+    steps = round(scenario.horizon * scenario.rates.decision)
+    yield f"Horizon: {scenario.horizon:g} s, {steps} decisions of {scenario.ticks_per_decision} camera ticks each.\n"
+    for listing in scenario_text.scene(scenario):
+        yield listing_table(listing)
+        yield ""
+    yield Text("Settings (* differs from the default)\n", "bold")
+    names = shown_sections(scenario)
+    width = max(len(key) for name in names for key, *_ in settings(getattr(scenario, name))) + 2
+    for name in names:
+        yield section_table(name, getattr(scenario, name), width)
+        yield ""
+    yield listing_table(scenario_text.observation(scenario))
+
+
+def shown_sections(scenario: Scenario) -> list[str]:
+    """Return the names of the sections that matter in a scenario."""
+    names = [*SECTIONS, *(DRIVEN_SECTIONS if scenario.driven else ())]
+    return names + [name for name in DRAWN_SECTIONS if getattr(scenario, name) != type(getattr(scenario, name))()]
+
+
+def listing_table(listing: Listing) -> Table:
+    """Return a listing as a table."""
+    table = _table(*listing.columns, title=listing.title)
+    for name, column in zip(listing.columns, table.columns, strict=True):
+        column.no_wrap = name in WHOLE_COLUMNS
+    for row in listing.rows:
+        table.add_row(*row)
+    return table
+
+
+def section_table(name: str, part: BaseModel, key_width: int) -> Table:
+    """Return one row per setting of a section: key, value, meaning with its unit."""
+    doc = " ".join((type(part).__doc__ or "").split())
+    table = _table(f"[{name}]", "value", "meaning", title=doc)
+    table.columns[0].width, table.columns[1].width = key_width, VALUE_WIDTH
+    for key, value, meaning, differs in settings(part):
+        table.add_row(f"{key} *" if differs else key, value, meaning, style="bold" if differs else None)
+    return table
+
+
+def _table(*columns: str, title: str | None = None) -> Table:
+    look: dict[str, Any] = {"title_justify": "left", "title_style": "italic"}
+    return Table(*columns, title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, **look)
+
+
+COLUMNS = {
+    "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
+    "observers": ("name", "about"),
+    "agents": ("name", "kind", "about"),
+    "variants": ("name", "of", "about"),
+    "scenes": ("name", "options", "about"),
+}
+"""What the tables show of the rows."""
+
+
+def environment_rows() -> list[dict[str, Any]]:
+    """Return what `list envs` says of every environment that ships with coopenv."""
+    from coopenv.scenario import load_scenario
+
+    rows = []
+    for name in list_envs():
+        scenario = load_scenario(name)
+        rows.append(
+            {
+                "name": name,
+                "title": scenario.title,
+                "id": environment_id(name),
+                "vehicles": len(scenario.vehicles),
+                "landmarks": len(scenario.landmarks),
+                "motion": "driven" if scenario.driven else "prescribed",
+                "horizon_s": scenario.horizon,
+            }
+        )
+    return rows
+
+
+def observer_rows() -> list[dict[str, Any]]:
+    """Return what `list observers` says of every observer."""
+    return [{"name": name, "about": description(name)} for name in observer_names()]
+
+
+def agent_rows() -> list[dict[str, Any]]:
+    """Return what `list agents` says of every agent."""
+    return [
+        {
+            "name": agent.name,
+            "kind": agent.kind,
+            "environments": list(agent.environments),
+            "about": _sentence(agent.description),
+        }
+        for agent in map(find_agent, list_agents())
+    ]
+
+
+def _sentence(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".")
+
+
+def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
+    """Return one row per entry; texts of the last column that do not fit into the width are wrapped."""
+    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    for key in columns:
+        heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
+        number = bool(rows) and isinstance(rows[0][key], int | float)
+        table.add_column(heading, justify="right" if number else "left", no_wrap=key != columns[-1])
+    for row in rows:
+        table.add_row(*(_text(row[key]) for key in columns))
+    return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -13,7 +13,7 @@ from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.runs import Rollout
-from coopenv.runs.metrics import outcome_line
+from coopenv.runs.rollouts import outcome_line
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from tests.helpers.builders import constant, landmark, scenario, vehicle

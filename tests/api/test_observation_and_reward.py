@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.agents.cards import has_dial
+from coopenv.bench.cards import has_dial
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from coopenv.base.installation import list_envs
-from coopenv.bench.agents.cards import DRIVERS, METRICS, SETTINGS, dial_text, fingerprint, has_dial
+from coopenv.bench.cards import DRIVERS, METRICS, SETTINGS, dial_text, fingerprint, has_dial
 from coopenv.bench.pages import environment_page
 from coopenv.cli import main
 from coopenv.runs.page import index_text

@@ -21,7 +21,7 @@ from coopenv.cars.limits import USUAL
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Hub
 from coopenv.runs.command import execute, report
-from coopenv.runs.links import links_line, links_report
+from coopenv.runs.demo import links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet

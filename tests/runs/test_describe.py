@@ -18,8 +18,8 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
 from coopenv.cli import main
 from coopenv.runs import scenario_text as words
-from coopenv.runs.describe import describe_scenario
-from coopenv.runs.scenario_rows import settings
+from coopenv.runs.scenario_text import settings
+from coopenv.runs.summary import describe_scenario
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario, schema_text
 from tests.helpers.four_way import FOUR_WAY

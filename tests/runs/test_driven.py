@@ -10,7 +10,7 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.policies import load_agent
-from coopenv.runs.driven import drive_vehicles
+from coopenv.runs.dataset import drive_vehicles
 from tests.helpers.four_way import FOUR_WAY
 
 OVERRIDES: dict[str, Any] = {"horizon": 8.0, "termination.after_arrival": "park"}

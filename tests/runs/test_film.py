@@ -11,7 +11,7 @@ from PIL import Image
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.runs.film import frames_at, write_film
+from coopenv.runs.live import frames_at, write_film
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source
 from coopenv.viz.topview import TopView

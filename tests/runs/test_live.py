@@ -18,8 +18,7 @@ from coopenv.cli import main
 from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
-from coopenv.runs.keyboard import Keyboard, Keys
-from coopenv.runs.live import Clock, drive_by_hand, watch
+from coopenv.runs.live import Clock, Keyboard, Keys, drive_by_hand, watch
 from coopenv.viz.window import Window
 from tests.helpers.four_way import FOUR_WAY
 

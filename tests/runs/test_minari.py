@@ -13,7 +13,7 @@ import pytest
 import coopenv
 from coopenv.cli import main
 from coopenv.policies import load_agent
-from coopenv.runs.driven import drive_vehicles
+from coopenv.runs.dataset import drive_vehicles
 
 IDENTITY = "coopenv/facade/route_follower-v0"
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from coopenv.cli import main
-from coopenv.runs.results import Results
+from coopenv.runs.command import Results
 from coopenv.viz import FIGURE_NAMES
 
 

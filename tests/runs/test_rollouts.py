@@ -22,9 +22,8 @@ from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs import Rollout, rollout
-from coopenv.runs.metrics import outcome_line, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.rollouts import Ending
-from coopenv.runs.table import legend, metrics_table, rates, remarks
+from coopenv.runs.console import legend, metrics_table, rates, remarks
+from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.synthetic import make_trajectory

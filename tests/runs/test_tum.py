@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.runs.tum import write_tum
+from coopenv.runs.recorder import write_tum
 from tests.helpers.synthetic import make_trajectory
 
 

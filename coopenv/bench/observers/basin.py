@@ -22,7 +22,7 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable
 from coopenv.observers.runner import run
-from coopenv.runs.table import number_table
+from coopenv.runs.console import number_table
 
 RADIUS = 15.0  # m
 ANGLE_BINS = tuple(range(0, 181, 30))  # deg

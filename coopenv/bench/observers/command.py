@@ -34,10 +34,9 @@ from coopenv.bench.observers.basin import (
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import basin_figure, chart_data, page_file, plotly
-from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard, headline, quality
 from coopenv.bench.observers.rows import Row, spread
 from coopenv.bench.observers.sources import ALL, find_source
-from coopenv.bench.observers.tables import csv_text, failures, honest_line
+from coopenv.bench.observers.tables import BOUNDS, Leaderboard, csv_text, failures, headline, honest_line, quality
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress

@@ -24,8 +24,8 @@ from coopenv.base.format import jsonable, number
 from coopenv.bench.observers.basin import ANGLE_BINS, RADIUS, Draw, basins_of, by_angle
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import Sample
-from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import FAILED, mean_of, short_name
+from coopenv.bench.observers.tables import BOUNDS, Leaderboard
 from coopenv.estimation.metrics import mean_bounds, wilson_interval
 from coopenv.estimation.poses import Array
 from coopenv.viz import style

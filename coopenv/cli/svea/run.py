@@ -47,7 +47,7 @@ def run(
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.opening import open_svea
     from coopenv.runs.command import NoTruthError, execute, report
-    from coopenv.runs.links import kept_drive, links_line, links_report, truth_report
+    from coopenv.runs.demo import kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)

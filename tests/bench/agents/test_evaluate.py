@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from coopenv.base.installation import data_directory
-from coopenv.bench.agents.cards import shown
-from coopenv.bench.agents.figures import tiled
+from coopenv.bench.cards import shown
+from coopenv.bench.evaluate_figures import tiled
 from coopenv.cli import main
 from coopenv.evaluation import METRICS
 

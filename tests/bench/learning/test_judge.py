@@ -8,7 +8,7 @@ from weakref import ref
 
 import pytest
 
-from coopenv.bench.learning.judge import Judge
+from coopenv.bench.study import Judge
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
 
 AGENTS = ("constant_speed", "route_follower")
@@ -22,7 +22,7 @@ def test_figures_stay_and_episodes_go(monkeypatch: pytest.MonkeyPatch) -> None:
         driven.append(ref(episodes))
         return episodes
 
-    monkeypatch.setattr("coopenv.bench.learning.judge.drive", watched)
+    monkeypatch.setattr("coopenv.bench.study.drive", watched)
     judge = Judge(2)
 
     def told(environment: str) -> tuple[list[Result], list[Difference]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.learning.study import Group, Run, Study, read_study
+from coopenv.bench.study import Group, Run, Study, read_study
 
 STUDY = """
 settings = "train.toml"

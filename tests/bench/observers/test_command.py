@@ -20,8 +20,8 @@ from coopenv.bench.observers import compare
 from coopenv.bench.observers.command import figure_files, report_text
 from coopenv.bench.observers.figures import PLOTLY, chart_data, page_file
 from coopenv.bench.observers.judge import Series
-from coopenv.bench.observers.leaderboard import headline, quality
 from coopenv.bench.observers.rows import Row
+from coopenv.bench.observers.tables import headline, quality
 from coopenv.cli import main
 from coopenv.observers import registry
 from tests.bench.observers.test_compare import Raises

@@ -22,7 +22,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.codec import encode, make
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, Role, presence_of
 from coopenv.runs.command import execute, report
-from coopenv.runs.links import links_report
+from coopenv.runs.demo import links_report
 from coopenv.runs.rollouts import Rollout
 from tests.helpers.cars import cars, fakes, write_fleet
 

@@ -24,7 +24,7 @@ from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.samples import Detections
 from coopenv.cli import main
-from coopenv.cli.bags import _print
+from coopenv.cli.run import _print
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
 from tests.helpers.bags import MAP

@@ -1,16 +1,20 @@
-"""The loop of the live view: frames at their pace, and what the user wishes."""
+"""`coopenv view`: the server and what it shows."""
 
+import errno
+import socket
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, told
+from coopenv.runs.reels import FAULTS, Reel
 from coopenv.runs.video import MAX_FPS
-from coopenv.runs.view.reels import FAULTS, Reel
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
+from coopenv.viz.web.extra import guarded_server
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.panel import NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
@@ -241,3 +245,49 @@ class Viewer:
         self._panel.tell_source(self._reel.source)
         self._panel.tell("")
         self._due = monotonic()
+
+
+PORT, PORTS = 8080, 20
+"""The first port that is tried where none is asked for, and how many."""
+
+
+def serving(host: str, port: int | None) -> AbstractContextManager[tuple[Any, str]]:
+    """Return a context of viser's server and the address of its page, with the token that it needs.
+
+    Args:
+        host: address of this computer.
+        port: the one to listen on (None: the first free one from `PORT` on).
+
+    Raises:
+        CoopenvError: the port is taken, or the address is none of this computer's.
+    """
+    return guarded_server(host, free_port(host, port))
+
+
+def free_port(host: str, port: int | None) -> int:
+    """Return a port that nobody listens on; arguments and errors as for `serving`."""
+    for candidate in (port,) if port is not None else range(PORT, PORT + PORTS):
+        reason = _obstacle(host, candidate)
+        if not reason:
+            return candidate
+        if port is not None:
+            raise CoopenvError(f"--port {port}: {reason}")
+    raise CoopenvError(f"--port: {PORT} to {PORT + PORTS - 1} are taken; name another one")
+
+
+def _obstacle(host: str, port: int) -> str:
+    """Return why nobody can listen on a port; empty: one can. Raises CoopenvError: there is no such address here."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except socket.gaierror:
+        raise CoopenvError(f"--host {host}: no such address") from None
+    except PermissionError:
+        return "ports below 1024 are for the administrator; name another one"
+    except OSError as error:
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise CoopenvError(f"--host {host}: is no address of this computer") from None
+        return "another program listens there; name another one"
+    return ""

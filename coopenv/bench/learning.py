@@ -13,16 +13,13 @@ from rich.table import Table
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
 from coopenv.base.installation import version
-from coopenv.bench.agents import cards as agents_cards
-from coopenv.bench.agents.cards import cell, percent
+from coopenv.bench import cards as agents_cards
+from coopenv.bench.cards import cell, percent
 from coopenv.bench.executors import Local
-from coopenv.bench.learning.judge import REPORTED, Judge
-from coopenv.bench.learning.study import Group, Run, Study
-from coopenv.bench.learning.work import is_finished, perform, tasks
+from coopenv.bench.study import REPORTED, Group, Judge, Run, Study, is_finished, perform, tasks
 from coopenv.evaluation import Difference, Result
 from coopenv.policies.loader import AGENT_FILE
-from coopenv.runs.console import Progress
-from coopenv.runs.table import number_table
+from coopenv.runs.console import Progress, number_table
 from coopenv.training.settings import SETTINGS_FILE
 
 BASELINES = ("route_follower", "peek", "look_ahead")

@@ -8,7 +8,7 @@ from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.policies import Policy
-from coopenv.runs.episode import play
+from coopenv.runs.rollouts import play
 from coopenv.runs.video import MAX_FPS
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import Frame, SceneRecord, Source

@@ -13,12 +13,12 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
-from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation, contest, enter
+from coopenv.bench.contest import IDEAL, Entrant, Evaluation, contest, enter
 from coopenv.evaluation import Difference, Result
 from coopenv.policies import agents_for
 from coopenv.policies.loader import CARD_FILES
-from coopenv.runs.markdown import plain, table
-from coopenv.runs.table import number_table
+from coopenv.runs.console import number_table
+from coopenv.runs.page import plain, table
 from coopenv.scenario import Scenario
 
 COLUMNS = {

@@ -15,13 +15,13 @@ from PIL import Image
 from rich.console import Console
 
 from coopenv.api.engine import Engine
-from coopenv.bench.agents.contest import Entrant, Evaluation
+from coopenv.bench.contest import Entrant, Evaluation
 from coopenv.evaluation import held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import Quantile, interval, resamples
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
-from coopenv.runs.episode import play
+from coopenv.runs.rollouts import play
 from coopenv.runs.scenes import scene_of, write_page
 from coopenv.runs.video import frame_stride, open_film
 from coopenv.viz import style

@@ -11,8 +11,8 @@ from coopenv.base.errors import OutputError
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import version, versions
-from coopenv.bench.agents.cards import EXPLANATIONS, differences_table, results_table
-from coopenv.bench.agents.contest import Entrant, Evaluation, contest, enter
+from coopenv.bench.cards import EXPLANATIONS, differences_table, results_table
+from coopenv.bench.contest import Entrant, Evaluation, contest, enter
 from coopenv.evaluation import METRICS
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
@@ -107,13 +107,13 @@ def write(
         evaluation = run(request, entrants, log)
         replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
         if figures is not None:
-            from coopenv.bench.agents.figures import save_figures, write_replays
+            from coopenv.bench.evaluate_figures import save_figures, write_replays
 
             with Progress(log, "drawing figures"):
                 save_figures(evaluation, new, figures, width)
             write_replays(evaluation, new, log)
         if film:
-            from coopenv.bench.agents.figures import write_film
+            from coopenv.bench.evaluate_figures import write_film
 
             write_film(evaluation, new, log)
     return evaluation

@@ -1,1 +1,0 @@
-"""`coopenv evaluate`: drivers on the same held-out worlds, with intervals, figures, a film and cards."""

@@ -1,1 +1,0 @@
-"""Learned agents by environment, arm and seed: trained side by side, resumed, judged, and told on cards."""

@@ -1,1 +1,0 @@
-"""`coopenv view`: an episode, a record or cars, live in the browser."""
