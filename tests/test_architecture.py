@@ -1,4 +1,4 @@
-"""The rooms of the package: which may import which, and that nothing goes round in a circle."""
+"""The rooms of the package: which may import which, no import cycles, and how large each wing may be."""
 
 from __future__ import annotations
 
@@ -82,3 +82,40 @@ def test_imports_point_downwards(imports: dict[str, set[str]]) -> None:
 
 def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -> None:
     TopologicalSorter({name: found & MODULES.keys() for name, found in imports.items()}).prepare()
+
+
+LINES_AND_FILES = {
+    ".": (150, 2),
+    "api": (4300, 23),
+    "backends": (3400, 19),
+    "base": (1250, 11),
+    "bench": (4850, 21),
+    "cars": (8700, 47),
+    "cli": (2150, 15),
+    "estimation": (1850, 12),
+    "evaluation": (450, 3),
+    "observers": (12150, 48),
+    "policies": (1350, 7),
+    "runs": (3600, 15),
+    "scenario": (2950, 14),
+    "training": (1300, 7),
+    "viz": (5050, 29),
+    "world": (4300, 17),
+}
+"""Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
+
+
+def test_wings_keep_their_budgets() -> None:
+    counts: dict[str, list[int]] = {}
+    for path in MODULES.values():
+        inside = path.relative_to(PACKAGE).parts
+        count = counts.setdefault(inside[0] if len(inside) > 1 else ".", [0, 0])
+        count[0] += len(path.read_text(encoding="utf-8").splitlines())
+        count[1] += 1
+    above = {wing: count for wing, count in counts.items() if not _within(wing, count)}
+    assert not above, f"lines and files of wings above their budgets: {above}"
+
+
+def _within(wing: str, count: list[int]) -> bool:
+    lines, files = LINES_AND_FILES.get(wing, (0, 0))
+    return count[0] <= lines and count[1] <= files
