@@ -16,9 +16,6 @@ from coopenv.bench.contest import IDEAL_SENSING
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
-from coopenv.training.checkpoint import read
-from coopenv.training.command import possible, train
-from coopenv.training.export import scenario_digest
 from coopenv.training.settings import SETTINGS_FILE, Plan, Settings, read_settings
 
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
@@ -126,6 +123,8 @@ def tasks(study: Study, folder: Path, logs: Path) -> list[Task]:
     Raises:
         CoopenvError: one of them is not possible: better now than when the others have been waited for.
     """
+    from coopenv.training.command import possible  # needs the extra `train`
+
     runs = [run for run in study.runs if not is_finished(study, run, folder)]
     for run in runs:
         try:
@@ -137,6 +136,8 @@ def tasks(study: Study, folder: Path, logs: Path) -> list[Task]:
 
 def is_finished(study: Study, run: Run, folder: Path) -> bool:
     """Return whether a run's agent is there, trained as the study and its environment's file say now."""
+    from coopenv.training.export import scenario_digest  # needs the extra `train`
+
     place, plan = folder / run.folder, study.plan(run)
     if not (place / AGENT_FILE).is_file() or not (place / SETTINGS_FILE).is_file():
         return False
@@ -157,6 +158,9 @@ def perform(task: Task) -> None:
     Raises:
         CoopenvError: what `train` raises.
     """
+    from coopenv.training.checkpoint import read  # needs the extra `train`
+    from coopenv.training.command import train
+
     path = task.out / CHECKPOINT_FILE
     resume = path.is_file() and read(path).plan == task.plan
     if not resume:
