@@ -18,7 +18,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-MODULES_AT_MOST = 100
+MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
 STARTED = time.time()
 COMPILED = pytest.StashKey[int]()
