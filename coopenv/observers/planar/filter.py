@@ -1,4 +1,4 @@
-"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry (`motion.py` has its state).
+"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry (`PlanarMotion` has its state).
 
 Its state is
 
@@ -13,7 +13,7 @@ over a tick: W is the integral of w + share (g - 1) w, g the wheels' gain as it 
 share of 0 is another kind), G is that of g over the time in which a turn is commanded, T is that time, V and U are the
 integrals of v and v |w|. A robot told to drive straight does so. A step of the commanded rate takes effect a jitter
 sooner or later, which leaves an error in the heading. All of this noise is as large as the innovations say
-(`level.py`). With no spread in the last nine numbers and a fixed level it is the textbook filter.
+(`NoiseLevel`). With no spread in the last nine numbers and a fixed level it is the textbook filter.
 
 The logarithm l of a factor on the noise's standard deviation follows the gradient of the innovations' likelihood. With
 a share s of the innovation's variance that is due to motion and r the normalised innovation squared,

@@ -337,7 +337,7 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
 
 @device_function
 def accept(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Accept the belief: its members are estimated along with the vehicle itself, and none is held to what it says."""
+    """Accept the belief: its members are estimated along with the vehicle itself."""
 
 
 ROBUST_JOINT = Embedded(
