@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.make import make_vec
@@ -18,7 +16,9 @@ from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Outcome
 
 try:
+    from stable_baselines3.common.buffers import RolloutBuffer
     from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.type_aliases import RolloutBufferSamples
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
