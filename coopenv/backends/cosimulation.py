@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.backends.feed import recall_truth
 from coopenv.backends.simulated import SimulatedWorld
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
@@ -30,13 +31,13 @@ def cosimulation_struct(p: Precision) -> Any:
     scalar, vec3, mat33 = p.scalar, p.vec3, p.mat33
 
     @wp.struct
-    class Moved:
+    class HostMotion:
         """W worlds, N vehicles, Z bodies of the traffic; lengths in m, angles in rad, map and body frames as named."""
 
-        rotation: array("WN", mat33)  # body to map
-        position: array("WN", vec3)  # map
-        velocity: array("WN", vec3)  # held over the tick, body, m/s
-        angular_velocity: array("WN", vec3)  # likewise, rad/s
+        true_rotation: array("WN", mat33)  # body to map
+        true_position: array("WN", vec3)  # map
+        true_velocity: array("WN", vec3)  # held over the tick, body, m/s
+        true_angular_velocity: array("WN", vec3)  # likewise, rad/s
         speed: array("WN", scalar)  # m/s
         steering: array("WN", scalar)
         crashed: array("WN", wp.int32)
@@ -45,33 +46,30 @@ def cosimulation_struct(p: Precision) -> Any:
         traffic_rotation: array("WZ", mat33)
         traffic_half: array("WZ", vec3)
 
-    return Moved
+    return HostMotion
 
 
 @wp.func
-def take_poses(model: Any, state: Any, moved: Any, world: int):
+def take_poses(model: Any, state: Any, motion: Any, world: int):
     """Write the true poses and twists, and where the traffic is; a twist holds for all odometry samples of the tick."""
     for vehicle in range(model.vehicles):
         agent = model.landmarks + vehicle
-        state.rotation[world, agent] = moved.rotation[world, vehicle]
-        state.position[world, agent] = moved.position[world, vehicle]
-        state.velocity[world, agent] = moved.velocity[world, vehicle]
-        state.angular_velocity[world, agent] = moved.angular_velocity[world, vehicle]
-        state.speed[world, vehicle] = moved.speed[world, vehicle]
-        state.steering[world, vehicle] = moved.steering[world, vehicle]
-        if moved.left[world, vehicle] != 0:
+        recall_truth(model, state, motion, world, vehicle, world)
+        state.speed[world, vehicle] = motion.speed[world, vehicle]
+        state.steering[world, vehicle] = motion.steering[world, vehicle]
+        if motion.left[world, vehicle] != 0:
             state.present[world, agent] = 0
         for sample in range(model.samples_per_tick):
-            state.sampled_velocity[world, vehicle, sample] = moved.velocity[world, vehicle]
-            state.sampled_angular_velocity[world, vehicle, sample] = moved.angular_velocity[world, vehicle]
+            state.sampled_velocity[world, vehicle, sample] = motion.true_velocity[world, vehicle]
+            state.sampled_angular_velocity[world, vehicle, sample] = motion.true_angular_velocity[world, vehicle]
     for k in range(model.traffic):
-        state.traffic_position[world, k] = moved.traffic_position[world, k]
-        state.traffic_rotation[world, k] = moved.traffic_rotation[world, k]
-        state.traffic_half[world, k] = moved.traffic_half[world, k]
+        state.traffic_position[world, k] = motion.traffic_position[world, k]
+        state.traffic_rotation[world, k] = motion.traffic_rotation[world, k]
+        state.traffic_half[world, k] = motion.traffic_half[world, k]
 
 
 @wp.func
-def renew_sample(model: Any, state: Any, moved: Any, world: int, vehicle: int, tick: int):
+def renew_sample(model: Any, state: Any, motion: Any, world: int, vehicle: int, tick: int):
     """Let an odometry sample that fell on the last frame measure the twist that began there, its noise kept.
 
     Twists jump from tick to tick, and that of the new one was not known when the sample was taken.
@@ -79,30 +77,30 @@ def renew_sample(model: Any, state: Any, moved: Any, world: int, vehicle: int, t
     agent = model.landmarks + vehicle
     taken = wp.float64(state.odometry_samples[world, vehicle] - 1) * model.odometry_period
     if wp.abs(taken - wp.float64(tick - 1) * model.camera_period) < wp.float64(1.0e-9):
-        v = moved.velocity[world, vehicle] - state.velocity[world, agent]
-        w = moved.angular_velocity[world, vehicle] - state.angular_velocity[world, agent]
+        v = motion.true_velocity[world, vehicle] - state.velocity[world, agent]
+        w = motion.true_angular_velocity[world, vehicle] - state.angular_velocity[world, agent]
         state.odometry_velocity[world, vehicle] = state.odometry_velocity[world, vehicle] + v
         state.odometry_angular_velocity[world, vehicle] = state.odometry_angular_velocity[world, vehicle] + w
 
 
 @wp.func
-def judge(model: Any, state: Any, moved: Any, world: int, vehicle: int):
+def judge(model: Any, state: Any, motion: Any, world: int, vehicle: int):
     """Judge contact and arrival; whoever moves the vehicles may know of contacts that are over, and who has left."""
     if state.ended[world, vehicle] == UNDER_WAY:
-        if moved.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
+        if motion.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
             state.ended[world, vehicle] = COLLIDED
-        elif moved.left[world, vehicle] != 0 and model.scene.end_on_arrival == 1:
+        elif motion.left[world, vehicle] != 0 and model.scene.end_on_arrival == 1:
             state.ended[world, vehicle] = ARRIVED
     referee(model, state, world, vehicle)
-    if moved.crashed[world, vehicle] != 0:
+    if motion.crashed[world, vehicle] != 0:
         state.collided[world, vehicle] = 1
 
 
 @wp.func
-def begin_moved(model: Any, state: Any, moved: Any, world: int):
+def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     place_everybody(model, state, world)
-    take_poses(model, state, moved, world)
+    take_poses(model, state, motion, world)
     for vehicle in range(model.vehicles):
         agent = model.landmarks + vehicle
         state.start_rotation[world, agent] = state.rotation[world, agent]
@@ -111,25 +109,25 @@ def begin_moved(model: Any, state: Any, moved: Any, world: int):
 
 
 @wp.func
-def sense_moved(model: Any, state: Any, moved: Any, world: int, tick: int):
+def sense_cosimulation(model: Any, state: Any, motion: Any, world: int, tick: int):
     """Take the poses of a tick and measure there."""
     depart(model, state, world)
     for landmark in range(model.landmarks):
         if model.motion.kind[landmark] == PRESCRIBED:
             prescribe(model, state, world, landmark, wp.float64(tick) * model.camera_period)
     for vehicle in range(model.vehicles):
-        renew_sample(model, state, moved, world, vehicle, tick)
-    take_poses(model, state, moved, world)
+        renew_sample(model, state, motion, world, vehicle, tick)
+    take_poses(model, state, motion, world)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
     for vehicle in range(model.vehicles):
-        judge(model, state, moved, world, vehicle)
+        judge(model, state, motion, world, vehicle)
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, tick)
     transmit(model, state, world, tick)
 
 
-COSIMULATED = Source("moved", begin_moved, sense_moved, cosimulation_struct)
+COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct)
 """Ticks of vehicles that a program on the host moves."""
 
 
@@ -162,7 +160,7 @@ class CosimulatedWorld(SimulatedWorld):
     def _build_record(self) -> Any:
         struct, model = cosimulation_struct(self.precision), self.model
         record = allocate(struct, {"W": self.worlds, "N": model.vehicles, "Z": model.traffic}, self.device)
-        self._moved = {name: getattr(record, name).numpy() for name in fields(struct)}
+        self._motion = {name: getattr(record, name).numpy() for name in fields(struct)}
         self._xy, self._heading = np.zeros((self.worlds, model.vehicles, 2)), np.zeros((self.worlds, model.vehicles))
         return PerWorld(record)
 
@@ -187,11 +185,11 @@ class CosimulatedWorld(SimulatedWorld):
         self._put(world, poses, way * rate, turned * rate)
 
     def _put(self, world: int, poses: Poses, velocity: Array, yaw_rate: Array) -> None:
-        row = {name: values[world] for name, values in self._moved.items()}
+        row = {name: values[world] for name, values in self._motion.items()}
         self.remember(world, poses)
-        row["rotation"][...] = _about_z(poses.heading)
-        row["position"][..., :2] = poses.xy
-        row["velocity"][..., :2], row["angular_velocity"][..., 2] = velocity, yaw_rate
+        row["true_rotation"][...] = _about_z(poses.heading)
+        row["true_position"][..., :2] = poses.xy
+        row["true_velocity"][..., :2], row["true_angular_velocity"][..., 2] = velocity, yaw_rate
         row["traffic_rotation"][...] = _about_z(poses.traffic_heading)
         for name in ("speed", "steering", "crashed", "left", "traffic_position", "traffic_half"):
             row[name][...] = getattr(poses, name)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
-from coopenv.backends.replay_kernels import RECORDED, samples_taken, upload
+from coopenv.backends.feed import RECORDED, Feed
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.observers.recording import Briefing, Recording, Sensed, check_recording, is_due
 from coopenv.observers.registry import find_embedded
@@ -147,7 +147,10 @@ class ReplayWorld(SensingWorld):
         return model
 
     def _build_record(self) -> Any:
-        return upload(self._recording, self.scenario.rates.odometry, self.precision, self.device)
+        rate = self.scenario.rates.odometry
+        feed = Feed(self._recording.ticks, self.model, rate, self.precision, self.device)
+        feed.fill_recording(self._recording)
+        return feed.record
 
 
 class Replay(TickGenerator):
@@ -171,9 +174,8 @@ class Replay(TickGenerator):
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the recording tick by tick."""
-        recording, rate = self.recording, self.scenario.rates.odometry
-        taken = samples_taken(recording.t, rate)
-        age = np.where(taken > 0, recording.t - (taken - 1) / rate, np.inf)
+        recording = self.recording
+        age = recording.odometry_age(self.scenario.rates.odometry)
         for k in range(self.scenario.horizon_ticks + 1):
             yield replace(recording.at(k), odometry_age=np.full(len(recording.setups), age[k]))
 

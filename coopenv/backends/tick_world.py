@@ -8,7 +8,6 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from coopenv.backends.base import (
-    MEASURED,
     Backend,
     Command,
     Conversing,
@@ -16,20 +15,18 @@ from coopenv.backends.base import (
     SensingWorld,
     Told,
     WorldBackend,
-    check_tick,
-    is_sound,
+    is_valid_message,
 )
-from coopenv.backends.replay_kernels import BY_RADIO, RECORDED, record_struct, true_twists
+from coopenv.backends.feed import RECORDED, Feed, unknown_truth
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_se3
 from coopenv.observers.contract import Message, compiled_checks
 from coopenv.observers.kernel_observer import views_of
-from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
+from coopenv.observers.recording import MEASURED, Briefing, Sensed, check_tick, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
-from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.embedded import HOST
-from coopenv.world.state import allocate, fields, state_fields
+from coopenv.world.state import fields, state_fields
 from coopenv.world.world import Keys, Options
 
 
@@ -78,13 +75,8 @@ class TickWorld(SensingWorld):
         return model
 
     def _build_record(self) -> Any:
-        struct, model = record_struct(self.precision), self.model
-        sizes = {"K": 1, "N": model.vehicles, "T": model.agents, "L": model.landmarks, "Q": len(PARAMETERS)}
-        record = allocate(struct, sizes, self.device)
-        for start in (record.start_rotation, record.start_position):
-            start.fill_(np.nan)
-        self._row = {n: getattr(record, n).numpy()[0] for n, field in fields(struct).items() if field.axes[0] == "K"}
-        return record
+        self._feed = Feed(1, self.model, self.scenario.rates.odometry, self.precision, self.device)
+        return self._feed.record
 
     def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Begin an episode of the backend, see `World.reset`."""
@@ -157,22 +149,8 @@ class TickWorld(SensingWorld):
         except CoopenvError as error:
             raise CoopenvError(f"{self._name}: {error}") from None
         last, self._present = self._present, self._completed(tick)
-        now, rate = self._present, self.scenario.rates.odometry
-        for name in MEASURED:
-            self._row[name][...] = getattr(now, name)
-        known = _truth_of(now)
-        before = known if k == 0 else _truth_of(last)
-        pair = Truth(np.stack([before.rotation, known.rotation]), np.stack([before.position, known.position]))
-        linear, angular = true_twists(pair, now.dt)
-        self._row["true_rotation"][...], self._row["true_position"][...] = known.rotation, known.position
-        self._row["true_velocity"][...], self._row["true_angular_velocity"][...] = linear[1], angular[1]
-        sampled = (now.index * now.dt - np.asarray(now.odometry_age) + 1e-9) * rate
-        just_before = ~np.asarray(now.missing) & np.isfinite(np.asarray(now.odometry_age))  # the first tick
-        self._row["samples"][...] = np.where((sampled >= 0.0) | just_before, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
-        self._row["bearing_lag"][...] = np.round(np.minimum(np.asarray(now.bearing_age) / now.dt, now.index))
-        if now.pan is not None:  # of who is missing it stays
-            self._row["pan"][...] = np.where(np.asarray(now.missing), self._row["pan"], now.pan)
-        self._row["inbox_tick"][...] = BY_RADIO if now.inbox_tick is None else now.inbox_tick
+        now = self._present
+        self._feed.fill(now, (now if k == 0 else last).truth or unknown_truth(now))
         self.late += now.late
         self.missing += now.missing
 
@@ -188,6 +166,8 @@ class TickWorld(SensingWorld):
         for name in ("velocity", "angular_velocity"):
             arrays[name][missing] = getattr(last, name)[missing]
         arrays["odometry_age"][missing] = np.asarray(last.odometry_age)[missing] + tick.dt
+        if tick.pan is not None:
+            arrays["pan"] = np.where(missing, 0.0 if last.pan is None else last.pan, tick.pan)
         arrays["visible"][missing] = False
         arrays["bearings"][~arrays["visible"]] = np.nan
         for values in arrays.values():
@@ -200,7 +180,7 @@ class TickWorld(SensingWorld):
         now, accepted = self._present, {}
         for (receiver, sender), received in now.messages.items():
             message, sent = received.message, max(0, now.index - round(received.age / now.dt))
-            if not (is_sound(message) and self._read(receiver, sender, message, sent)):
+            if not (is_valid_message(message) and self._read(receiver, sender, message, sent)):
                 self._backend.health.rejected += 1
                 continue
             accepted[receiver, sender] = received
@@ -273,11 +253,6 @@ def _nothing(briefing: Briefing) -> Sensed:
         landmarks=np.zeros((briefing.setups[0].landmarks, 3)),
         odometry_age=np.full(N, np.inf),
     )
-
-
-def _truth_of(tick: Sensed) -> Truth:
-    shape = tick.translation.shape
-    return tick.truth or Truth(np.full((*shape, 3), np.nan), np.full(shape, np.nan))
 
 
 def _or_zeros(values: Any, count: int) -> np.ndarray:

@@ -1,12 +1,16 @@
-"""Which entries of arrays are numbers, unit vectors, rotations or covariances at all: for what comes from outside."""
+"""Validity of arrays from outside: numbers, unit vectors, rotations, covariances, and the rules of their elements."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.format import LARGEST
-from coopenv.estimation.poses import Array
 
+Array = NDArray[Any]
 Mask = NDArray[np.bool_]
+Fields = Mapping[str, Array]
 
 MAX_BEND = 1e-6
 """By how much entries of R^T R may differ from those of I, and the squared length of a direction from 1."""
@@ -14,6 +18,35 @@ MOST_LOPSIDED = 1e-6
 """By how much a covariance and its transpose may differ, relative to it, in Frobenius' norm."""
 MAX_ASYMMETRY = 1e-6
 """By how much entries of a covariance may differ from its transpose, relative to the standard deviations."""
+
+
+class Rule(NamedTuple):
+    """Condition on every element of an array of a saved state, a recording or a tick."""
+
+    must_be: str  # in words, for errors
+    holds: Callable[[Array, Fields, Any], Mask]
+    """Returns which elements satisfy it, from the array, all arrays by name, and the model (None: there is none)."""
+    axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
+    used: str = ""
+    """Array that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
+    be finite."""
+    of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
+
+    def elements(self, mask: Mask) -> Mask:
+        """Return of which elements a mask of numbers holds."""
+        return everywhere(mask, *range(-self.axes, 0))
+
+    def valid(self, array: Array, fields: Fields, model: Any, knows_truth: bool) -> Mask:
+        """Return which elements satisfy it, do not count, or are not known."""
+        valid = self.holds(array, fields, model)
+        if self.used:
+            used = fields[self.used]
+            if used.ndim < valid.ndim:
+                used = np.arange(valid.shape[-1]) < used[..., None]
+            valid = valid | ((used == 0) & self.elements(np.isfinite(array)))
+        if self.of_truth and not knows_truth:
+            valid = valid | self.elements(np.isnan(array))
+        return valid
 
 
 def are_numbers(values: Array) -> Mask:

@@ -1,18 +1,27 @@
 """What vehicles sense, tick by tick: of one tick, and of a whole record."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import DataError, shown
+from coopenv.base.errors import CoopenvError, DataError, shown
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import Array
-from coopenv.estimation.validity import are_covariances, are_numbers, are_rotations, are_unit_vectors, everywhere
+from coopenv.estimation.validity import (
+    Fields,
+    Mask,
+    Rule,
+    are_covariances,
+    are_numbers,
+    are_rotations,
+    are_unit_vectors,
+    everywhere,
+)
 from coopenv.observers.contract import Received, Setup, Tick
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.scenario.starts import neighbour_sets, processing_order
@@ -118,10 +127,6 @@ class Drawn:
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
 
 
-PER_TICK = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks", "inbox_tick")
-"""Arrays of a recording that have a row per tick."""
-
-
 @dataclass(frozen=True)
 class Recording:
     """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
@@ -181,6 +186,22 @@ class Recording:
             sensed["pan"] = sealed(self.pan[k])
         return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
 
+    def odometry_age(self, rate: float) -> Array:
+        """Return (K,) the age of the last odometry sample at each tick, s; samples are taken at 0, 1 / rate, ... s."""
+        taken = np.floor((self.t + 1e-9) * rate) + 1.0
+        return np.where(self.t > 0.0, self.t - (taken - 1.0) / rate, np.inf)
+
+    def stacked(self, odometry_rate: float) -> Sensed:
+        """Return all ticks as one whose arrays have the leading axis K, for an odometry rate in Hz."""
+        return Sensed(
+            index=np.arange(self.ticks)[:, None],  # type: ignore[arg-type]
+            dt=self.dt,
+            pan=self.pan,
+            odometry_age=self.odometry_age(odometry_rate)[:, None],
+            truth=self.truth,
+            **{name: getattr(self, name) for name in PER_TICK},
+        )
+
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
         """Return what one vehicle senses at tick k, with the messages that it has."""
         return self.at(k).tick(self.setups[vehicle], messages)
@@ -192,29 +213,154 @@ def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
     return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))
 
 
-SHAPES: dict[str, tuple[str | int, ...]] = {
-    "rotation": ("K", "N", 3, 3),
-    "translation": ("K", "N", 3),
-    "velocity": ("K", "N", 3),
-    "angular_velocity": ("K", "N", 3),
-    "bearings": ("K", "N", "T", 3),
-    "visible": ("K", "N", "T"),
-    "landmarks": ("K", "L", 3),
-    "inbox_tick": ("K", "N", "N"),
-    "due": ("K",),
-    "start_rotation": ("N", 3, 3),
-    "start_position": ("N", 3),
-    "start_covariance": ("N", 6, 6),
-    "truth.rotation": ("K", "N", 3, 3),
-    "truth.position": ("K", "N", 3),
+LARGEST_PAN = 3.15  # rad, after rounding
+LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
+
+
+def _vector(values: Array, fields: Fields, model: Any) -> Mask:
+    return everywhere(are_numbers(values), -1)
+
+
+def _direction(values: Array, fields: Fields, model: Any) -> Mask:
+    return are_unit_vectors(values) | (everywhere(np.isnan(values), -1) & ~fields["visible"])
+
+
+def _sent(values: Array, fields: Fields, model: Any) -> Mask:
+    return np.asarray((values == -1) | ((values >= 0) & (values <= fields["now"]) & (values % fields["period"] == 0)))
+
+
+VECTOR = Rule(f"finite numbers of at most {LARGEST:g}", _vector, axes=1)
+ROTATION = Rule("a rotation", lambda values, fields, model: are_rotations(values), axes=2)
+DIRECTION = Rule("unit vectors, or NaN where nothing is visible", _direction, axes=1)
+COVARIANCE = Rule(
+    "a symmetric and positive definite matrix",
+    lambda values, fields, model: are_covariances(values, LEAST_EIGENVALUE),
+    axes=2,
+)
+SENT = Rule("-1, nor a multiple of the message period up to now", _sent)
+FLAG = Rule("true or false", lambda values, fields, model: np.ones(values.shape, dtype=bool))
+AGE = Rule("a number of at least 0", lambda values, fields, model: values >= 0.0)
+ANGLE = Rule(f"within {LARGEST_PAN} rad", lambda values, fields, model: np.abs(values) <= LARGEST_PAN)
+
+
+class ArraySpec(NamedTuple):
+    """One array of a tick, of a recording and of its log."""
+
+    axes: str  # K ticks (in a tick: none), N vehicles, T targets, L landmarks, or a length
+    rule: Rule
+    kind: str = "f"  # NumPy's
+    recorded: bool = True  # False: only ticks have it
+
+    def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
+        """Return the shape by the lengths of the axes; an axis without one is left out."""
+        return tuple(int(axis) if axis.isdigit() else sizes[axis] for axis in self.axes if axis != "K" or axis in sizes)
+
+
+ARRAYS = {
+    "rotation": ArraySpec("KN33", ROTATION),
+    "translation": ArraySpec("KN3", VECTOR),
+    "velocity": ArraySpec("KN3", VECTOR),
+    "angular_velocity": ArraySpec("KN3", VECTOR),
+    "bearings": ArraySpec("KNT3", DIRECTION),
+    "visible": ArraySpec("KNT", FLAG, "b"),
+    "landmarks": ArraySpec("KL3", VECTOR),
+    "inbox_tick": ArraySpec("KNN", SENT, "i"),
+    "due": ArraySpec("K", FLAG, "b"),
+    "pan": ArraySpec("KN", ANGLE),
+    "truth.rotation": ArraySpec("KN33", ROTATION._replace(of_truth=True)),
+    "truth.position": ArraySpec("KN3", VECTOR._replace(of_truth=True)),
+    "odometry_age": ArraySpec("KN", AGE, recorded=False),
+    "bearing_age": ArraySpec("KN", AGE, recorded=False),
+    "missing": ArraySpec("KN", FLAG, "b", recorded=False),
+    "late": ArraySpec("KN", FLAG, "b", recorded=False),
+    "start_rotation": ArraySpec("N33", ROTATION),
+    "start_position": ArraySpec("N3", VECTOR),
+    "start_covariance": ArraySpec("N66", COVARIANCE),
 }
-KINDS = {"visible": "b", "due": "b", "inbox_tick": "i"}  # NumPy's kind of the arrays that do not hold floats
+"""Arrays by name; those of the truth are fields of `Truth`."""
+MEASURED = tuple(ARRAYS)[:7]
+"""Arrays that every tick has."""
+PER_TICK = (*MEASURED, "inbox_tick")
+"""Arrays of a recording that every tick of it has."""
+ROWS_OF_MISSING = (*MEASURED[:6], "pan", "odometry_age", "bearing_age")
+"""Arrays of a tick of which the row of a missing vehicle is not read."""
+KINDS_OF_TICKS = {"f": "fiu", "i": "iu", "b": "b"}
+
+
+def sizes_of(setups: Sequence[Setup]) -> dict[str, int]:
+    """Return the lengths of the axes N, T and L."""
+    return {"N": len(setups), "T": len(setups[0].target_names), "L": setups[0].landmarks}
+
+
+def _value_of(source: Any, name: str) -> Any:
+    whole, _, part = name.partition(".")
+    value = getattr(source, whole)
+    return getattr(value, part) if part and value is not None else value
+
+
+def _misshapen(values: Mapping[str, Any], sizes: Mapping[str, int], kinds: Mapping[str, str]) -> Iterator[str]:
+    """Yield what is wrong with arrays that have another shape or type than the table says."""
+    for name, value in values.items():
+        spec = ARRAYS[name]
+        shape, kind = spec.shape(sizes), kinds[spec.kind]
+        if not (isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in kind):
+            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            yield f"{name}: expected an array of shape {shape} and kind {kind}, got {got}"
+
+
+def _invalid(values: Mapping[str, Array], about: Mapping[str, Any], ticks: bool) -> Iterator[tuple[str, Mask, str]]:
+    """Yield (name, which rows are valid, what the others are not); rows are those of ticks, if there are many, and N.
+
+    Args:
+        values: arrays by name.
+        about: what rules need besides: the tick `now` and the message period.
+        ticks: whether arrays have the axis K.
+    """
+    for name, array in values.items():
+        axes, rule = ARRAYS[name].axes, ARRAYS[name].rule
+        valid = rule.valid(array, {**values, **about}, None, knows_truth=False)
+        rows = (axes[0] == "K" and ticks) + ("N" in axes)
+        unless = " or unknown (NaN)" if rule.of_truth else ""
+        yield name, everywhere(valid, *range(rows, valid.ndim)), f"not {rule.must_be}{unless}"
+
+
+def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
+    """Refuse a tick that is not number `index` or holds what no kernel may read; rows of the missing are not read.
+
+    Raises:
+        CoopenvError: one line that names tick, field and vehicle.
+    """
+    if tick.index != index:
+        raise CoopenvError(f"tick {index}: index: got {tick.index!r:.40}")
+    names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
+    given = {name: _value_of(tick, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
+    for problem in _misshapen(given, sizes_of(briefing.setups), KINDS_OF_TICKS):
+        raise CoopenvError(f"tick {index}: {problem}")
+    absent = given.get("missing", np.zeros(len(briefing.setups), bool))
+    seen = tick.visible & ~absent[:, None]
+    given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
+    problems = _invalid(given, {"now": index, "period": 1}, ticks=False)
+    for name, valid, problem in chain(problems, _invalid_messages(tick, len(absent))):
+        valid = valid | absent if valid.ndim and name in ROWS_OF_MISSING else valid
+        if not valid.all():
+            whose = f" of {briefing.setups[int(np.argmin(valid))].name}" if valid.ndim else ""
+            raise CoopenvError(f"tick {index}: {name}{whose}: {problem}")
+
+
+def _invalid_messages(tick: Sensed, vehicles: int) -> Iterator[tuple[str, Any, str]]:
+    if tick.messages and tick.inbox_tick is None:
+        yield "messages", np.False_, "where some come from elsewhere, inbox_tick says what became of the others"
+    known = range(vehicles)
+    for (receiver, sender), received in tick.messages.items():
+        possible = receiver in known and sender in known and receiver != sender
+        yield "messages", np.bool_(possible), f"({receiver!r:.20}, {sender!r:.20}) are not two vehicles"
+        yield "messages", (np.arange(vehicles) != receiver) | (received.age >= 0.0), "of negative age"
+
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 TICK_LENGTHS_S = (1e-5, 1e3)
-LARGEST_PAN = 3.15  # rad, after rounding
 MAX_PERIOD_TICKS = 100_000
-LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
 
 
 def check_recording(recording: Recording, where: str) -> None:
@@ -224,10 +370,8 @@ def check_recording(recording: Recording, where: str) -> None:
     """
     try:
         _check_setups(recording.setups)
-        _check_arrays(recording)
         _check_radio(recording)
-        _check_start(recording)
-        _check_ticks(recording)
+        _check_arrays(recording)
         _check_scenario(recording)
         _check_drawn(recording)
     except _RecordingError as error:
@@ -291,33 +435,32 @@ def _is_array(values: Any, shape: tuple[int, ...]) -> bool:
     return array.shape == shape and array.dtype.kind == "f" and bool(are_numbers(array).all())
 
 
-def _check_arrays(r: Recording) -> None:
-    sizes = {"K": r.ticks, "N": len(r.setups), "T": len(r.setups[0].target_names), "L": r.setups[0].landmarks}
-    for name, axes in SHAPES.items():
-        array, kind, shape = attrgetter(name)(r), KINDS.get(name, "f"), tuple(sizes.get(str(n), n) for n in axes)
-        fits = array.shape == shape and array.dtype.kind == kind
-        _require(fits, f"{name}: shape {array.shape} of {array.dtype}, expected {shape} of {kind}")
-
-
 def _check_radio(r: Recording) -> None:
     N = len(r.setups)
     _require(sorted(r.order) == list(range(N)), f"order: {shown(r.order)} is no order of 0 .. {N - 1}")
     _between("dt", r.dt, *TICK_LENGTHS_S)
     _between("period", r.period, 1, MAX_PERIOD_TICKS)
     _require(r.staleness > 0.0, f"staleness: {r.staleness} is not positive")
-    sent, now = r.inbox_tick, np.arange(r.ticks)[:, None, None]
-    received = (sent == -1) | ((sent >= 0) & (sent <= now) & (sent % r.period == 0))
-    _require_all(r, everywhere(received, 2), "inbox_tick", f"not -1, nor a multiple of the period {r.period} up to now")
-    later = np.diff(sent, axis=0, prepend=-1) >= 0
-    _require_all(r, everywhere(later, 2), "inbox_tick", "sent before what had been heard")
 
 
-def _check_start(r: Recording) -> None:
-    for i, setup in enumerate(r.setups):
-        _require(are_rotations(r.start_rotation[i]), f"start_rotation: of {setup.name} is no rotation")
-        _require(are_numbers(r.start_position[i]).all(), f"start_position: of {setup.name} is not finite or too large")
-        definite = are_covariances(r.start_covariance[i], LEAST_EIGENVALUE)
-        _require(definite, f"start_covariance: of {setup.name} is not symmetric and positive definite")
+def _check_arrays(r: Recording) -> None:
+    names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
+    values = {name: _value_of(r, name) for name in names}
+    for problem in _misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
+        raise _RecordingError(problem)
+    about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}
+    for name, valid, problem in _invalid(values, about, ticks=True):
+        _require_all(r, name, valid, problem)
+    later = np.diff(r.inbox_tick, axis=0, prepend=-1) >= 0
+    _require_all(r, "inbox_tick", everywhere(later, 2), "sent before an earlier received message")
+
+
+def _require_all(r: Recording, name: str, valid: Mask, problem: str) -> None:
+    """Raise an error about the first row that is not valid."""
+    if not valid.all():
+        tick, *row = np.argwhere(~valid)[0].tolist() if ARRAYS[name].axes[0] == "K" else (None, *np.argwhere(~valid)[0])
+        whose = "".join(f" of {r.setups[i].name}" for i in row)
+        raise _RecordingError(f"{name}{whose}{'' if tick is None else f', tick {tick}'}: {problem}")
 
 
 def _check_drawn(r: Recording) -> None:
@@ -327,31 +470,6 @@ def _check_drawn(r: Recording) -> None:
         _require(len(r.drawn.parameters) == len(PARAMETERS), f"drawn.parameters: not {len(PARAMETERS)} numbers")
         for factor in r.drawn.parameters:
             _between("drawn.parameters", factor, 0.0, MOST**3)
-
-
-def _check_ticks(r: Recording) -> None:
-    _require_all(r, are_rotations(r.rotation), "rotation", "not a rotation")
-    for name in ("translation", "velocity", "angular_velocity"):
-        _require_all(r, everywhere(are_numbers(getattr(r, name)), -1), name, "not finite or too large")
-    unseen = everywhere(np.isnan(r.bearings), -1) & ~r.visible
-    _require_all(r, everywhere(are_unit_vectors(r.bearings) | unseen, -1), "bearings", "not unit vectors")
-    if r.pan is not None:
-        fits = r.pan.shape == r.visible.shape[:2] and r.pan.dtype.kind == "f"
-        _require(fits, f"pan: shape {r.pan.shape} of {r.pan.dtype}, expected {r.visible.shape[:2]} of f")
-        _require_all(r, np.abs(r.pan) <= LARGEST_PAN, "pan", f"not within {LARGEST_PAN} rad")
-    _require_all(r, everywhere(are_numbers(r.landmarks), 1, 2), "landmarks", "not finite or too large")
-    R, p = r.truth.rotation, r.truth.position
-    unknown_R, unknown_p = everywhere(np.isnan(R), -1, -2), everywhere(np.isnan(p), -1)
-    _require_all(r, are_rotations(R) | unknown_R, "truth.rotation", "neither a rotation nor unknown (NaN)")
-    _require_all(r, everywhere(are_numbers(p), -1) | unknown_p, "truth.position", "neither finite nor unknown (NaN)")
-
-
-def _require_all(r: Recording, valid: NDArray[np.bool_], field: str, problem: str) -> None:
-    """Blame the first tick, and its first vehicle, at which something is not valid: (K, N), or (K,) of everybody."""
-    if not valid.all():
-        k, *vehicle = np.argwhere(~valid)[0].tolist()
-        whose = "".join(f" of {r.setups[i].name}" for i in vehicle)
-        raise _RecordingError(f"{field}{whose}, tick {k}: {problem}")
 
 
 def _check_scenario(r: Recording) -> None:

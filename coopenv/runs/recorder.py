@@ -12,12 +12,10 @@ from coopenv.base.files import replace_text, writing
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.interference import Interference, interference_of, stacked
-from coopenv.observers.recording import Drawn, Recording, Sensed, Truth, is_due
+from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.rollouts import Views, play
 from coopenv.scenario import Scenario
-
-SENSED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
 
 
 def record(
@@ -57,7 +55,7 @@ def record(
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
-    names = SENSED if scenario.action.pan is None else (*SENSED, "pan")
+    names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
     start_rotation = views["estimate_rotation"][0, 0]
     for values in (*kept.values(), start_rotation):

@@ -10,12 +10,12 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.poses import Coordinates
+from coopenv.estimation.validity import Rule
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import depart, move, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import reset_world
-from coopenv.world.state import Rule
 from coopenv.world.v2x import transmit
 from coopenv.world.warp_internals import device_function
 

@@ -9,18 +9,26 @@ rule that each field of a saved state must satisfy; all rules are checked before
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import LARGEST
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.validity import are_covariances, are_rotations, are_unit_vectors, everywhere
+from coopenv.estimation.validity import (
+    Array,
+    Fields,
+    Mask,
+    Rule,
+    are_covariances,
+    are_rotations,
+    are_unit_vectors,
+    everywhere,
+)
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.world.model import Precision
 
@@ -115,27 +123,10 @@ def repeated(row: Any, axis: int, count: int) -> Any:
     return result
 
 
-Array = NDArray[Any]
-Mask = NDArray[np.bool_]
-Fields = Mapping[str, Array]
-
 TOLERANCE = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-6}
 """How far rotations and directions may be off in a precision."""
 LEAST_EIGENVALUE = {np.dtype(np.float32): -1e-4, np.dtype(np.float64): -1e-9}
 """Least eigenvalue of the correlations of a covariance, after rounding in a precision."""
-
-
-class Rule(NamedTuple):
-    """What every element of a field must be."""
-
-    must_be: str  # in words, for errors
-    holds: Callable[[Array, Fields, Any], Mask]
-    """Returns which elements are so, from the field's values, all fields, and the model."""
-    axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
-    used: str = ""
-    """Field that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
-    be finite."""
-    of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
 
 
 def whole(low: int, high: int | str) -> Rule:
@@ -200,8 +191,8 @@ def checked_state(
     begun = has_begun(fields["start_rotation"])
     for name, array in fields.items():
         rule = rules.get(name) or (NUMBER if array.dtype.kind == "f" else ANYTHING)
-        valid = _valid(array, rule, fields, model, knows_truth)
-        valid[~begun] |= _elements(array[~begun] == 0, rule)
+        valid = rule.valid(array, fields, model, knows_truth)
+        valid[~begun] |= rule.elements(array[~begun] == 0)
         if not valid.all():
             index = tuple(np.argwhere(~valid)[0].tolist())
             value = f": {shown(array[index].item())}" if array[index].ndim == 0 else ""
@@ -216,7 +207,7 @@ def has_begun(start_rotation: Array) -> Mask:
 
 def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
     if name not in values:
-        raise CoopenvError(f"state: field '{name}' is missing")
+        raise CoopenvError(f"state: field '{name}' is missing: saved by another version of coopenv, or no saved state")
     try:
         given = np.asarray(values[name])
         if given.shape != like.shape:
@@ -229,24 +220,6 @@ def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
     if array is None or (like.dtype.kind != "f" and (array != given).any()):
         raise CoopenvError(f"state: field '{name}' of {given.dtype} does not fit into {like.dtype}")
     return array
-
-
-def _elements(mask: Array, rule: Rule) -> Mask:
-    """Return of which elements a mask of numbers holds."""
-    return everywhere(mask, *range(-rule.axes, 0))
-
-
-def _valid(array: Array, rule: Rule, fields: Fields, model: Any, knows_truth: bool) -> Mask:
-    """Return which elements of a field are what they must be, do not count, or are not known."""
-    valid = rule.holds(array, fields, model)
-    if rule.used:
-        used = fields[rule.used]
-        if used.ndim < valid.ndim:
-            used = np.arange(valid.shape[-1]) < used[..., None]
-        valid = valid | ((used == 0) & _elements(np.isfinite(array), rule))
-    if rule.of_truth and not knows_truth:
-        valid = valid | _elements(np.isnan(array), rule)
-    return valid
 
 
 @cache

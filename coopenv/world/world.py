@@ -8,6 +8,7 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.estimation.outcomes import UNKNOWN
+from coopenv.estimation.validity import Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
@@ -17,7 +18,6 @@ from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
     VALID,
-    Rule,
     allocate,
     allocate_state,
     checked_state,

@@ -23,7 +23,7 @@ from coopenv.backends.mcap.format import (
     topic,
 )
 from coopenv.base.errors import CoopenvError, DataError, check_memory, shown
-from coopenv.observers.recording import KINDS, SHAPES, Recording, Truth, check_recording
+from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording
 
 if TYPE_CHECKING:
     from coopenv.backends.mcap.container import Container
@@ -35,16 +35,16 @@ class TickArrays:
     def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int, pan: bool) -> None:
         """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
         sizes = {"K": ticks, "N": len(vehicles), "T": targets, "L": landmarks}
-        shapes = {name: [int(sizes.get(str(n), n)) for n in shape] for name, shape in SHAPES.items() if shape[0] == "K"}
-        shapes |= {"pan": [ticks, len(vehicles)]} if pan else {}
+        kept = [n for n, spec in ARRAYS.items() if spec.recorded and spec.axes[0] == "K" and (n != "pan" or pan)]
+        shapes = {name: ARRAYS[name].shape(sizes) for name in kept}
         exact = EXACT | PAN if pan else EXACT
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())
         check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {targets} targets")
         self._shape_of_landmarks = shapes.pop("landmarks")[1:]
-        shapes["due"].append(len(vehicles))
-        dtypes: dict[str, Any] = {"b": np.bool_, "i": np.int64}
+        shapes["due"] = (ticks, len(vehicles))
+        dtypes: dict[str, Any] = {"b": np.bool_, "i": np.int64, "f": np.float64}
         # zeros take no memory before they are written to
-        self._arrays = {name: np.zeros(n, dtypes.get(KINDS.get(name, ""), np.float64)) for name, n in shapes.items()}
+        self._arrays = {name: np.zeros(shape, dtypes[ARRAYS[name].kind]) for name, shape in shapes.items()}
         self._ticks, self._targets = ticks, targets
         self._landmarks: dict[int, np.ndarray] = {}
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in exact}

@@ -1,4 +1,7 @@
-"""A tick from elsewhere: what was sensed and what arrived is copied, everything after that is as in the simulation."""
+"""Ticks from outside the simulation: a `Feed` writes them to a record, and kernels fill the state of worlds from it.
+
+What was measured and received is copied. Everything after that is as in the simulation.
+"""
 
 from functools import cache
 from typing import Any
@@ -7,7 +10,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.camera import (
     MISSED,
@@ -24,11 +27,11 @@ from coopenv.world.model import Precision
 from coopenv.world.random import COUNT as PARAMETER_COUNT
 from coopenv.world.random import draw_parameters
 from coopenv.world.reset import believe, draw_presence, place_agent, place_vehicle
-from coopenv.world.state import array, fields
+from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
 
 BY_RADIO = wp.constant(-2)
-"""In place of the ticks of sending of messages that a receiver heard: the scenario's radio decides."""
+"""In place of the ticks of sending of received messages: the scenario's radio decides."""
 
 
 @wp.func
@@ -206,50 +209,77 @@ def record_struct(p: Precision) -> Any:
     return Record
 
 
-def upload(recording: Recording, odometry_rate: float, p: Precision, device: str) -> Any:
-    """Return the `Record` of a recording."""
-    linear, angular = true_twists(recording.truth, recording.dt)
-    shape = recording.ticks, len(recording.setups)
-    values: dict[str, np.ndarray] = {
-        "samples": np.broadcast_to(samples_taken(recording.t, odometry_rate)[:, None], shape),
-        "bearing_lag": np.zeros(shape),
-        "pan": np.zeros(shape) if recording.pan is None else recording.pan,
-        "true_rotation": recording.truth.rotation,
-        "true_position": recording.truth.position,
-        "true_velocity": linear,
-        "true_angular_velocity": angular,
-    }
-    record = record_struct(p)()
-    record.last = recording.ticks - 1
-    values["parameter"] = np.ones(len(PARAMETERS))
-    if recording.drawn is not None:
-        record.drawn, record.key, record.episode = 1, recording.drawn.key, recording.drawn.episode
-        values["parameter"] = np.array(recording.drawn.parameters)
-    for name, field in fields(record_struct(p)).items():
-        data = values[name] if name in values else getattr(recording, name)
-        kind = {wp.int32: np.int32, wp.uint8: np.uint8}.get(field.dtype, p.numpy)
-        setattr(record, name, wp.array(np.array(data, dtype=kind), dtype=field.dtype, device=device))
-    return record
+class Feed:
+    """The record of a world whose ticks come from outside: all of a recording, or the present one of a live source."""
+
+    def __init__(self, ticks: int, model: Any, odometry_rate: float, p: Precision, device: str) -> None:
+        """Allocate room for ticks; odometry samples come at a rate in Hz."""
+        sizes = {"K": ticks, "N": model.vehicles, "T": model.agents, "L": model.landmarks, "Q": len(PARAMETERS)}
+        self.record = allocate(record_struct(p), sizes, device)
+        self.record.last = ticks - 1
+        self._odometry_rate = odometry_rate
+        self._views: dict[str, np.ndarray] = {}
+        for name in fields(record_struct(p)):
+            array = getattr(self.record, name)
+            if name.startswith("start_"):
+                array.fill_(np.nan)
+            self._views[name] = array.numpy()
+
+    def fill(self, tick: Sensed, before: Truth) -> None:
+        """Write a tick, or all ticks of a recording as one, and the twists that lead there from the truth before."""
+        truth = tick.truth or unknown_truth(tick)
+        linear, angular = mean_twists(before, truth, tick.dt)
+        age = np.zeros(1) if tick.odometry_age is None else np.asarray(tick.odometry_age)
+        missing = np.zeros(1, bool) if tick.missing is None else np.asarray(tick.missing)
+        sampled = (tick.index * tick.dt - age + 1e-9) * self._odometry_rate
+        just_before = ~missing & np.isfinite(age)  # the first tick
+        samples = np.where((sampled >= 0.0) | just_before, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
+        lag = np.zeros(1) if tick.bearing_age is None else np.asarray(tick.bearing_age) / tick.dt
+        values = {
+            **{name: getattr(tick, name) for name in MEASURED},
+            "samples": samples,
+            "bearing_lag": np.round(np.minimum(lag, tick.index)),
+            "pan": 0.0 if tick.pan is None else tick.pan,
+            "inbox_tick": BY_RADIO if tick.inbox_tick is None else tick.inbox_tick,
+            "true_rotation": truth.rotation,
+            "true_position": truth.position,
+            "true_velocity": linear,
+            "true_angular_velocity": angular,
+        }
+        for name, value in values.items():
+            self._views[name][...] = value
+
+    def fill_recording(self, recording: Recording) -> None:
+        """Write all ticks of a recording, its initial estimates and its draws."""
+        R, position = recording.truth.rotation, recording.truth.position
+        before = Truth(np.concatenate([R[:1], R[:-1]]), np.concatenate([position[:1], position[:-1]]))
+        self.fill(recording.stacked(self._odometry_rate), before)
+        views = self._views
+        views["start_rotation"][...], views["start_position"][...] = recording.start_rotation, recording.start_position
+        views["parameter"][...] = 1.0
+        if recording.drawn is not None:
+            drawn = recording.drawn
+            self.record.drawn, self.record.key, self.record.episode = 1, drawn.key, drawn.episode
+            views["parameter"][...] = drawn.parameters
+        if not self.record.rotation.device.is_cpu:
+            for name, values in views.items():
+                getattr(self.record, name).assign(values)
 
 
-def samples_taken(t: np.ndarray, rate: float) -> np.ndarray:
-    """Return (K,) how many odometry samples, at 0, 1 / rate, ..., a vehicle has at each tick; none at the start."""
-    taken = np.floor((t + 1e-9) * rate).astype(np.int32) + 1
-    taken[0] = 0
-    return taken
+def unknown_truth(tick: Sensed) -> Truth:
+    """Return the truth of a tick of which it is not known: NaN."""
+    return Truth(np.full_like(tick.rotation, np.nan, dtype=float), np.full_like(tick.translation, np.nan, dtype=float))
 
 
-def true_twists(truth: Truth, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean velocities (K, N, 3) over the last tick, body frame, m/s and rad/s; NaN where truth is."""
-    R, position = truth.rotation, truth.position
-    linear, angular = np.zeros_like(position), np.zeros_like(position)
-    backwards = np.swapaxes(R[:-1], -1, -2)
-    linear[1:] = (backwards @ np.diff(position, axis=0)[..., None])[..., 0] / dt
-    turn = backwards @ R[1:]
+def mean_twists(before: Truth, now: Truth, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean velocities (..., N, 3) over a tick of dt s, body frame, m/s and rad/s; NaN where truth is."""
+    backwards = np.swapaxes(before.rotation, -1, -2)
+    linear = (backwards @ (now.position - before.position)[..., None])[..., 0] / dt
+    turn = backwards @ now.rotation
     known = np.isfinite(turn).all(axis=(-1, -2))
-    angular[1:] = np.nan
+    angular = np.full_like(linear, np.nan)
     if known.any():
-        angular[1:][known] = Rotation.from_matrix(turn[known]).as_rotvec() / dt
+        angular[known] = Rotation.from_matrix(turn[known]).as_rotvec() / dt
     return linear, angular
 
 
