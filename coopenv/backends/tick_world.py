@@ -20,7 +20,7 @@ from coopenv.backends.base import (
 from coopenv.backends.feed import RECORDED, Feed, unknown_truth
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_se3
-from coopenv.observers.contract import Message, compiled_checks
+from coopenv.observers.contract import Message
 from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.recording import MEASURED, Briefing, Sensed, check_tick, is_due
 from coopenv.observers.registry import find_embedded
@@ -97,7 +97,6 @@ class TickWorld(SensingWorld):
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
         super().load()
-        compiled_checks()
         self.mask.fill_(1)  # so that nothing moves: in real time the first tick must not wait for its launch
         self.decide()
         self.mask.zero_()

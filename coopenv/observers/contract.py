@@ -6,7 +6,6 @@ in the BODY frame (the paper's g_ij is the negative).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from math import isfinite
 from operator import index
 from typing import Any, Protocol, runtime_checkable
@@ -18,7 +17,7 @@ from scipy.linalg.lapack import dpotrf
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import Array, Coordinates
-from coopenv.estimation.validity import MOST_LOPSIDED, are_rotations
+from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED, are_rotations
 
 BYTES_PER_NUMBER = 8
 MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation
@@ -241,90 +240,62 @@ LEAST_VARIANCE, LARGEST_VARIANCE = 1e-16, 1e12  # rad^2 and m^2, of a plausible 
 
 POSITION, ROTATION, COVARIANCE = (3,), (3, 3), (6, 6)
 SENT_COVARIANCES = (ROTATION, COVARIANCE)  # shapes: of the marker's position, or of the whole pose
-PRECISIONS = (np.dtype(np.float64), np.dtype(np.float32))
-
-
-@cache
-def compiled_checks() -> Any:
-    """Return the compiled checks, with which Numba is loaded; whoever must not wait later calls this beforehand."""
-    from coopenv.estimation import compiled_validity
-
-    return compiled_validity
+IDENTITY = np.eye(3)
 
 
 def check_estimate(estimate: Estimate) -> None:
-    """Refuse what is no estimate, with a CoopenvError that names the field and what is wrong with it."""
-    R, p, P, valid = estimate.rotation, estimate.position, estimate.covariance, compiled_checks()
-    if not (valid.is_plain(R, 2) and valid.is_rotation(R)):
-        _check_array("rotation", R, LARGEST, ROTATION)
-        _check_rotation(R)
-    if not (valid.is_plain(p, 1) and valid.is_position(p, LARGEST)):
-        _check_array("position", p, LARGEST, POSITION)
+    """Refuse an invalid estimate with a CoopenvError that names the field and the reason."""
+    _check_rotation(_checked_array("rotation", estimate.rotation, LARGEST, ROTATION))
+    _checked_array("position", estimate.position, LARGEST, POSITION)
     if not isinstance(estimate.coordinates, Coordinates):
         raise CoopenvError(f"coordinates are {shown(estimate.coordinates)}, not a member of Coordinates")
-    if P is not None and not (valid.is_plain(P, 2) and P.shape == COVARIANCE and is_definite(P, 0.0, LARGEST**2)):
-        _check_array("covariance", P, LARGEST**2, COVARIANCE)
-        _check_covariance(np.asarray(P))
+    if estimate.covariance is not None:
+        _check_covariance(_checked_array("covariance", estimate.covariance, LARGEST**2, COVARIANCE))
     if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
         raise CoopenvError("nis is not finite, or nis_dof negative")
 
 
 def check_message(message: Message) -> None:
-    """Refuse what is no message; `extra` is the observer's own business, as long as it holds numbers."""
-    if not _is_valid(message):
-        _check_fields(message)
+    """Refuse an invalid message with a CoopenvError; of `extra` only the kind of the arrays is checked."""
+    _check_pose(message)
     for name, value in message.extra.items():
         if np.asarray(value).dtype.kind not in "biufc":
             raise CoopenvError(f"message: extra '{name}' is no array of numbers")
 
 
 def check_received(message: Message, planar: bool = False) -> None:
-    """Refuse what a receiver must not work with, with a CoopenvError: whoever sent it may be broken, or hostile.
+    """Refuse a message that a receiver cannot use with a CoopenvError: its sender may be faulty or hostile.
 
-    Besides what no message may be: a rotation that is none, a covariance that is not positive definite or of no
-    plausible size, and anything that is not finite. Robots on a plane know their height: theirs may be semidefinite.
+    In addition to `check_message`: a matrix that is no rotation, a covariance that is not positive definite or not of a
+    plausible size, and numbers that are not finite. The covariance of a robot on a plane may be semidefinite, because
+    its height is known.
     """
-    if not _is_valid(message):
-        _check_fields(message)
-        if message.position is not None and np.abs(message.position).max() > FARTHEST:
-            raise CoopenvError(f"message: position beyond {FARTHEST:g} m")
-        if message.rotation is not None:
-            _check_rotation(message.rotation)
-        if message.covariance is not None:
-            P = np.asarray(message.covariance, np.float64)
-            _check_covariance(P)
-            implausible = P.diagonal().max() > LARGEST_VARIANCE
-            if implausible or not (planar or is_definite(P, LEAST_VARIANCE, LARGEST_VARIANCE)):
-                raise CoopenvError("message: covariance is not positive definite, or not plausible")
+    position, R, P = _check_pose(message)
+    if position is not None and np.abs(position).max() > FARTHEST:
+        raise CoopenvError(f"message: position beyond {FARTHEST:g} m")
+    if R is not None:
+        _check_rotation(R)
+    if P is not None:
+        _check_covariance(P)
+        implausible = P.diagonal().max() > LARGEST_VARIANCE
+        if implausible or not (planar or is_definite(P, LEAST_VARIANCE, LARGEST_VARIANCE)):
+            raise CoopenvError("message: covariance is not positive definite, or not plausible")
     for name, value in message.extra.items():
         _check_extra(name, np.asarray(value))
 
 
-def _check_fields(message: Message) -> None:
-    """Refuse a pose or a covariance that is none."""
-    if message.position is not None:
-        _check_array("message: position", message.position, LARGEST, POSITION)
-    if message.rotation is not None:
-        _check_array("message: rotation", message.rotation, LARGEST, ROTATION)
-    if message.covariance is not None:
-        _check_array("message: covariance", message.covariance, LARGEST**2, *SENT_COVARIANCES)
-
-
-def _is_valid(message: Message) -> bool:
-    """Return whether pose and covariance are certainly valid; `extra` is not checked."""
-    valid, p, R, P = compiled_checks(), message.position, message.rotation, message.covariance
-    if p is not None and not (valid.is_plain(p, 1) and valid.is_position(p, FARTHEST)):
-        return False
-    if R is not None and not (valid.is_plain(R, 2) and valid.is_rotation(R)):
-        return False
-    if P is None:
-        return True
-    plain = type(P) is np.ndarray and P.shape in SENT_COVARIANCES and P.dtype in PRECISIONS
-    return plain and is_definite(P.astype(np.float64), LEAST_VARIANCE, LARGEST_VARIANCE)
+def _check_pose(message: Message) -> tuple[Array | None, Array | None, Array | None]:
+    """Return position, rotation and covariance in float64; refuse other shapes, and numbers that are too large."""
+    p, R, P = message.position, message.rotation, message.covariance
+    return (
+        None if p is None else _checked_array("message: position", p, LARGEST, POSITION),
+        None if R is None else _checked_array("message: rotation", R, LARGEST, ROTATION),
+        None if P is None else _checked_array("message: covariance", P, LARGEST**2, *SENT_COVARIANCES),
+    )
 
 
 def _check_extra(name: str, value: NDArray[Any]) -> None:
-    """Refuse what is no array of finite numbers; a sum of squares tells it sooner, unless that is large."""
+    """Refuse an array that does not hold finite numbers; a sum of squares is faster, but may overflow."""
     kind = value.dtype.kind
     if kind not in "biufc":
         raise CoopenvError(f"message: extra '{name}' is no array of numbers")
@@ -333,39 +304,45 @@ def _check_extra(name: str, value: NDArray[Any]) -> None:
 
 
 def is_definite(P: Array, least: float, largest: float) -> bool:
-    """Return whether P (n, n) is a positive definite covariance, of variances from the least on, none larger."""
-    return bool(compiled_checks().is_covariance(P, least, largest))
+    """Return whether P (n, n) is symmetric and positive definite with variances from `least` to `largest`."""
+    variances = P.diagonal()
+    return bool(variances.min() >= least and variances.max() <= largest and _is_symmetric(P) and dpotrf(P)[1] == 0)
 
 
-def _are_bounded(values: NDArray[Any], largest: float) -> bool:
-    """Return whether numbers are finite and not too large; a sum of squares tells it sooner, unless that is large."""
-    if values.dtype.kind == "f" and np.vdot(values, values) <= largest * largest:
-        return True
-    return bool((np.abs(values.astype(float)) <= largest).all())
+def _is_symmetric(P: Array) -> bool:
+    lopsided = P - P.T
+    return bool(np.vdot(lopsided, lopsided) <= MOST_LOPSIDED**2 * np.vdot(P, P))
 
 
-def _check_array(name: str, value: ArrayLike, largest: float, *shapes: tuple[int, ...]) -> None:
+def _checked_array(name: str, value: ArrayLike, largest: float, *shapes: tuple[int, ...]) -> Array:
+    """Return an array in float64; refuse other kinds and shapes, and numbers beyond `largest`."""
     array = np.asarray(value)
     kind = array.dtype.kind
     if kind == "c":
         raise CoopenvError(f"{name} is complex")
-    if array.shape not in shapes or kind not in "iuf" or not _are_bounded(array, largest):
-        shape = " or ".join(map(str, shapes))
-        raise CoopenvError(f"{name} is not a finite array of shape {shape} with numbers up to {largest:g}")
+    if array.shape in shapes and kind in "iuf":
+        numbers = np.asarray(array, np.float64)
+        # the sum of squares is faster, but may exceed the bound of its terms
+        if np.vdot(numbers, numbers) <= largest * largest or (np.abs(numbers) <= largest).all():
+            return numbers
+    shape = " or ".join(map(str, shapes))
+    raise CoopenvError(f"{name} is not a finite array of shape {shape} with numbers up to {largest:g}")
 
 
-def _check_rotation(R: ArrayLike) -> None:
-    matrix = np.asarray(R, np.float64)
-    if not are_rotations(matrix):
-        raise CoopenvError("rotation is a reflection" if are_rotations(-matrix) else "rotation is not orthogonal")
+def _check_rotation(R: Array) -> None:
+    bend = R.T.dot(R) - IDENTITY
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0.0 and np.vdot(bend, bend) <= MAX_BEND**2:
+        return  # sufficient, and fast
+    if not are_rotations(R):
+        raise CoopenvError("rotation is a reflection" if are_rotations(-R) else "rotation is not orthogonal")
 
 
 def _check_covariance(P: Array) -> None:
-    lopsided = P - P.T
-    if np.vdot(lopsided, lopsided) > MOST_LOPSIDED**2 * np.vdot(P, P):
+    if not _is_symmetric(P):
         raise CoopenvError("covariance is not symmetric")
     if dpotrf(P)[1] == 0 or dpotrf(P + MOST_NEGATIVE * P.diagonal().max() * np.eye(len(P)))[1] == 0:
-        return  # the second one for those that are singular, as robots' on a plane are
+        return  # the second condition is for singular matrices, as of robots on a plane
     eigenvalues = np.linalg.eigvalsh(P)
     if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
         raise CoopenvError("covariance is not positive semidefinite")

@@ -13,6 +13,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Message
+from coopenv.observers.interference import altered
 from coopenv.observers.recording import Recording
 
 NOMINAL = "nominal"
@@ -88,19 +89,8 @@ class Lie:
         return vehicle == self.sender and time >= self.start
 
     def told(self, observer: Any, message: Message) -> Message:
-        """Return the message as it is broadcast.
-
-        The position is moved, and a covariance of whatever size becomes std^2 I. Other entries only their observer can
-        change: if it has a method `tampered(message)`, that one makes them agree with the lie.
-        """
-        position, P = message.position, message.covariance
-        lie = replace(
-            message,
-            position=None if position is None else position + np.array(self.offset),
-            covariance=None if P is None else self.std**2 * np.eye(len(P), dtype=P.dtype),
-        )
-        tampered = getattr(observer, "tampered", None)
-        return lie if tampered is None else tampered(lie)
+        """Return the message as it is broadcast, see `interference.altered`."""
+        return altered(observer, message, np.array(self.offset), std=self.std)
 
 
 def liar(recording: Recording) -> int:
