@@ -236,7 +236,7 @@ def _export_layout(log: Path, out: Path) -> None:
     from coopenv.backends.mcap.format import topics_of
     from coopenv.base.errors import DataError
     from coopenv.base.files import replace_text
-    from coopenv.viz.foxglove.views import layout_text
+    from coopenv.viz.foxglove import layout_text
 
     topics = topics_of(log)
     if "/scene/world" not in topics:

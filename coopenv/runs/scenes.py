@@ -228,7 +228,7 @@ _ON_A_PLANE = "planar_robust"
 
 def check_scene(observer: str | None) -> None:
     """Refuse before any work what `write_log` would refuse. Raises CoopenvError: no such observer, or no SDK."""
-    from coopenv.viz.foxglove.views import check_installed
+    from coopenv.viz.foxglove import check_installed
 
     check_installed()
     if observer is not None:
@@ -258,7 +258,7 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
     start = time.time()
     shown = []
     if scene:
-        from coopenv.viz.foxglove.views import views
+        from coopenv.viz.foxglove import views
 
         name = named(observer or observer_of(recording))
         with Progress(log, f"estimating with {name}"):

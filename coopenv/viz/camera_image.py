@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from coopenv.estimation.lens import distort
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario.base import rotation_of
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.scene import Frame, Stage
-from coopenv.viz.scene.stage import Box
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.topview_geometry import Box
 from coopenv.viz.topview_ground import GROUND, ROOF, TRAFFIC, WALL
 
 SKY = "#E6EEF5"
@@ -18,6 +19,8 @@ _ALL_AROUND = (360, 120)  # pixels of the image of a camera that sees everything
 _HIGH = 30.0  # deg that such an image reaches up and down
 _SCALE = 2  # of the drawing, which is made smaller at the end
 _NEAR = 0.05  # m before the camera, where boxes are cut
+_AHEAD = 1e-3  # of the distance: depth from which on a point is ahead of the camera
+_WIDEST = 2.0  # radius of the image plane at distance 1 from which on the polynomial of the lens means nothing
 _EDGES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
@@ -68,17 +71,15 @@ class Lens:
             up = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
             width, height = self.size
             return np.column_stack([(180.0 - azimuth) * width / 360.0, (_HIGH - up) * height / (2 * _HIGH)])
-        ahead = np.where(points[:, 2] > 0.5 * _NEAR, points[:, 2], np.nan)
-        return self._distorted(points[:, 0] / ahead, points[:, 1] / ahead)
+        return pixels(points, self._camera)
 
-    def _distorted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        k1, k2, p1, p2, k3 = self._camera.distortion
-        r2 = np.minimum(x * x + y * y, 4.0)  # beyond the image the polynomial means nothing
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        (fx, fy), (cx, cy) = self._camera.focal_length, self._camera.principal_point
-        return np.column_stack([fx * u + cx, fy * v + cy])
+
+def pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the pixels (K, 2) of points (K, 3) in the optical frame of a pinhole camera; NaN of those behind it."""
+    ahead = np.where(points[:, 2] > _AHEAD * np.linalg.norm(points, axis=1), points[:, 2], np.nan)
+    flat = points[:, :2] / ahead[:, None]
+    beyond = np.maximum(1.0, np.linalg.norm(flat, axis=1, keepdims=True) / _WIDEST)
+    return np.asarray(beyond * distort(flat / beyond, camera.distortion) * camera.focal_length + camera.principal_point)
 
 
 def _boxes(stage: Stage, frame: Frame, vehicle: int) -> list[tuple[Box, str, str]]:

@@ -1,30 +1,40 @@
 """The geometry behind the top view: everything in plan (x east, y north), in the map frame, m."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from coopenv.estimation.lens import largest_radius, undistort
 from coopenv.scenario import Scenario
-from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
+from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.routes import TwistTable, compile_motion, even_points, left_jacobian
 from coopenv.scenario.sensing import Camera
 from coopenv.scenario.starts import agent_starts
 
 SIGMAS = 3.0
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
+_ROUNDING = 1e-12  # of the largest eigenvalue: so far below zero is zero
 _FAN_RAYS = 65
 _PATH_SAMPLES = 121
 _MARGIN = 0.05  # share of the scene around it
 
 
-def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 3-sigma outlines (N, 97, 2) of covariances (N, 2, 2) and major semi-axes (N,); NaN where one is none."""
+def semi_axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 3-sigma semi-axes of covariances (N, D, D): lengths (N, D), ascending, and axes (N, D, D).
+
+    Axes are rotation matrices. Lengths are NaN where a matrix is not finite, or has a negative eigenvalue.
+    """
     finite = np.isfinite(covariance).all(axis=(-1, -2))
     variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
-    good = finite & (variance[:, 0] >= 0.0)
-    semi = np.where(good[:, None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
+    valid = finite & (variance[:, 0] >= -_ROUNDING * variance[:, -1])
+    return np.where(valid[:, None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan), axes
+
+
+def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return 3-sigma outlines (N, 97, 2) of covariances (N, 2, 2) and major semi-axes (N,); NaN where one is none."""
+    semi, axes = semi_axes(covariance)
     circle = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
     return center[:, None] + np.swapaxes((axes * semi[:, None]) @ circle, 1, 2), semi[:, 1]
 
@@ -90,34 +100,44 @@ def camera_fan(camera: Camera) -> np.ndarray:
     return np.asarray(rays @ camera.to_body().T)
 
 
-def free_lengths(
-    origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, obstacles: Sequence[Obstacle], shift: np.ndarray
-) -> np.ndarray:
-    """Return how far rays (N, K, 3) from cameras (N, 3) get before a building stops them, (N, K) m, up to `reach`.
+class Box(NamedTuple):
+    """A box that hides what is behind it."""
 
-    `reach` is one for all, or (N,) of each camera. Rays are unit vectors; they and the cameras are in the map frame,
-    whose origin is at `shift` in the coordinates of the buildings, those of the scenario's file, m.
+    name: str
+    rotation: np.ndarray  # (3, 3) to map
+    center: np.ndarray  # (3,) map, m
+    size: Any  # (3,) m
+
+
+def crossings(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> tuple[np.ndarray, np.ndarray]:
+    """Return at which shares of straight paths boxes are entered and left, (B, K) each.
+
+    A path misses a box where the first share is not below the second one.
+
+    Args:
+        start: (K, 3) map, m.
+        path: (K, 3) from there to the ends, map, m.
+        boxes: B of them, at least one.
+    """
+    turn, center = np.array([box.rotation for box in boxes]), np.array([box.center for box in boxes])
+    half = np.array([box.size for box in boxes], float)[:, None] / 2
+    a, along = (start - center[:, None]) @ turn, path @ turn
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    one, other = (-half - a) / along, (half - a) / along
+    return np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+
+
+def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, boxes: Sequence[Box]) -> np.ndarray:
+    """Return how far rays (N, K, 3) from cameras (N, 3) get before a box stops them, (N, K) m, up to `reach`.
+
+    `reach` is one for all, or (N,) of each camera. Rays are unit vectors in the map frame.
     """
     length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
-    if not obstacles:
+    if not boxes:
         return length
-    turn, center, half = _boxes(tuple(obstacles))
-    center = center - shift
-    start = (origin - center[:, None])[:, :, None] @ turn  # (boxes, N, 1, 3)
-    way = rays @ turn  # (boxes, N, K, 3)
-    way = np.where(np.abs(way) < 1e-9, 1e-9, way)
-    one, other = (-half - start) / way, (half - start) / way
-    enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
-    free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
-    return np.asarray(np.minimum(length, free.min(axis=0)))
-
-
-@lru_cache(maxsize=4)
-def _boxes(obstacles: tuple[Obstacle, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotations (B, 1, 3, 3), centres (B, 3) and half edges (B, 1, 1, 3) of buildings, which stand still."""
-    turn = np.array([about_z(obstacle.yaw) for obstacle in obstacles])[:, None]
-    half = np.array([obstacle.size for obstacle in obstacles])[:, None, None] / 2
-    return turn, np.array([obstacle.center for obstacle in obstacles]), half
+    enter, leave = crossings(np.repeat(origin, rays.shape[1], axis=0), rays.reshape(-1, 3), boxes)
+    free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf).min(axis=0)
+    return np.asarray(np.minimum(length, free.reshape(length.shape)))
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -22,11 +22,11 @@ from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import error_coordinates, position_covariance
 from coopenv.scenario import load_scenario
-from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
 from coopenv.viz.topview_geometry import (
+    Box,
     camera_fan,
     ellipses,
     free_lengths,
@@ -277,11 +277,10 @@ def test_field_of_view_is_that_of_the_calibration() -> None:
 
 
 def test_field_of_view_ends_at_walls() -> None:
-    wall = Obstacle(name="wall", center=(6.0, 1.0, 1.0), size=(2.0, 4.0, 2.0))
-    low_wall = Obstacle(name="low", center=(0.0, 3.0, 0.1), size=(9.0, 1.0, 0.2))
+    wall = Box("wall", np.eye(3), np.array([5.0, 0.0, 1.0]), (2.0, 4.0, 2.0))
+    low_wall = Box("low", np.eye(3), np.array([-1.0, 2.0, 0.1]), (9.0, 1.0, 0.2))
     rays = np.array([[[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [np.cos(1.2), np.sin(1.2), 0]]])
-    shift = np.array([1.0, 1.0, 0.0])
-    length = free_lengths(np.array([[0.0, 0.0, 0.5]]), rays, 8.0, [wall, low_wall], shift)
+    length = free_lengths(np.array([[0.0, 0.0, 0.5]]), rays, 8.0, [wall, low_wall])
     np.testing.assert_allclose(length, [[4.0, 8.0, 8.0, 8.0]])
 
 

@@ -12,6 +12,9 @@ from coopenv.base.files import replacing_file
 from coopenv.base.format import jsonable
 from coopenv.base.npz import read_npz
 from coopenv.base.sections import Section, validated
+from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.poses import covariance_in_map
+from coopenv.observers import Recording, Run
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import parse_scenario
@@ -148,6 +151,46 @@ _AXES = {
 }
 """By field of a frame its axes; F: all frames, K: all of them, or one where nothing changes."""
 _TABLE = {name: f"{'i' if name in WHOLE_FIELDS else 'f'} {axes}" for name, axes in _AXES.items()}
+
+
+def frames_of(recording: Recording, run: Run, ticks: np.ndarray) -> list[Frame]:
+    """Return frames of a recording and of a run of an observer on it.
+
+    A vehicle whose truth is never known has the pose of its estimate. There are no goals, routes and reward terms.
+
+    Args:
+        recording: of N vehicles and L landmarks, whose positions are the points that cameras see.
+        run: on that recording.
+        ticks: (K,) to be shown.
+    """
+    r, K, N, L = recording, len(ticks), len(recording.setups), recording.landmarks.shape[1]
+    known = np.atleast_1d(r.truth.known.any(axis=0))
+    R_hat, p_hat = run.rotation[ticks], run.position[ticks]
+    R = np.where(known[:, None, None], r.truth.rotation[ticks], R_hat)
+    p = np.where(known[:, None], r.truth.position[ticks], p_hat)
+    P = covariance_in_map(run.coordinates, R_hat, p_hat, run.covariance[ticks])
+    unseen = np.where(np.eye(N, N + L, L, dtype=bool), Sight.NOT_A_NEIGHBOUR, Sight.OUT_OF_VIEW)
+    fields = {
+        "tick": ticks,
+        "rotation": np.concatenate([np.broadcast_to(np.eye(3), (K, L, 3, 3)), R], axis=1),
+        "position": np.concatenate([r.landmarks[ticks], p], axis=1),
+        "estimate_rotation": R_hat,
+        "estimate_position": p_hat,
+        "position_covariance": P[..., :3, :3],
+        **{name: getattr(run, name)[ticks] for name in ("position_error", "orientation_error", "nees")},
+        "sight": np.where(r.visible[ticks], Sight.VISIBLE, unseen),
+        "pan": np.zeros((K, N)) if r.pan is None else r.pan[ticks],
+        "ended": np.full((K, N), Outcome.UNDER_WAY),
+        "inbox_tick": r.inbox_tick[ticks],
+        "terms": np.zeros((K, N, 0)),
+        "goal": np.full((K, N, 3), np.nan),
+        "route": np.zeros((K, N, 0, 3)),
+        "route_count": np.zeros((K, N), int),
+        "route_drawn": np.full((K, N), -1),
+        "traffic_rotation": np.zeros((K, 0, 3, 3)),
+        **dict.fromkeys(("traffic_position", "traffic_half"), np.zeros((K, 0, 3))),
+    }
+    return [Frame(**{name: values[k] for name, values in fields.items()}) for k in range(K)]
 
 
 class SceneWriter:

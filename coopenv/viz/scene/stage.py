@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from coopenv.estimation.poses import position_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.viz import topview_geometry as geometry
+from coopenv.viz.topview_geometry import Box
 
 
 class Shown(Protocol):
@@ -98,15 +99,7 @@ class Frame:
     @property
     def three_sigma(self) -> np.ndarray:
         """(N,) m: three standard deviations of the estimated position in plan, along the axis where it is worst."""
-        return three_sigma(self.position_covariance)
-
-
-def three_sigma(covariance: np.ndarray) -> np.ndarray:
-    """Return (N,) m of covariances (N, 3, 3), m^2: three standard deviations in plan along the worst axis, or NaN."""
-    plan = covariance[:, :2, :2]
-    finite = np.isfinite(plan).all(axis=(-1, -2))
-    variance = np.linalg.eigvalsh(np.where(finite[:, None, None], plan, 0.0))
-    return np.where(finite & (variance[:, 0] >= 0.0), 3.0 * np.sqrt(np.maximum(variance[:, 1], 0.0)), np.nan)
+        return geometry.semi_axes(self.position_covariance[:, :2, :2])[0][:, -1]
 
 
 _FLOATS = (
@@ -125,15 +118,6 @@ _SHORTEST = 0.035  # of the picture's side, drawn length of a vehicle
 _CAR = Body(size=(4.4, 1.9, 1.5), center=(0.0, 0.0, 0.75))  # stands in for a vehicle without a body
 
 _ALL = slice(None)
-
-
-class Box(NamedTuple):
-    """A box that hides what is behind it."""
-
-    name: str
-    rotation: np.ndarray  # (3, 3) to map
-    center: np.ndarray  # (3,) map, m
-    size: Any  # (3,) m
 
 
 class Stage:
@@ -214,7 +198,7 @@ class Stage:
         eye = self.eyes(frame)[of]
         turned = np.array([geometry.about_z(pan) for pan in frame.pan[of]])
         rays = self._fan[of, ::every] @ np.swapaxes(frame.vehicle_rotation[of] @ turned, 1, 2)
-        length = geometry.free_lengths(eye, rays, self.reach[of], self.scenario.obstacles, self.origin)
+        length = geometry.free_lengths(eye, rays, self.reach[of], self.buildings)
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
 
     def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:
@@ -254,12 +238,8 @@ class Stage:
 
 
 def entry(start: np.ndarray, end: np.ndarray, box: Box) -> float:
-    """Return at which share of the way from start to end (3,) a box is entered; infinite where it is not."""
-    half = np.asarray(box.size, float) / 2
-    a, way = box.rotation.T @ (start - box.center), box.rotation.T @ (end - start)
-    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
-    sides = np.sort(np.stack([(-half - a) / way, (half - a) / way]), axis=0)
-    enter, leave = float(sides[0].max()), float(sides[1].min())
+    """Return at which share of a straight path from start to end (3,) a box is entered; infinite where it is not."""
+    enter, leave = (float(share[0, 0]) for share in geometry.crossings(start[None], (end - start)[None], [box]))
     return max(enter, 0.0) if enter < leave and leave > 0.0 and enter < 1.0 else np.inf
 
 

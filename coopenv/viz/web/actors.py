@@ -6,6 +6,7 @@ import numpy as np
 
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import DARK_BLUE
+from coopenv.viz.topview_geometry import semi_axes
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import ROOT, Ground, Look, Mesh, arrow, box, car, linear, pole, rgb, sphere
 from coopenv.viz.web.sent import Sent
@@ -158,12 +159,9 @@ class Actors:
         return fine(points, self._step)
 
     def _place_ellipsoids(self, frame: Frame, look: Look) -> None:
-        covariance = frame.position_covariance
-        finite = np.isfinite(covariance).all(axis=(-1, -2))
-        variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, np.eye(3)))
-        axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
-        semi = look.magnification * 3.0 * np.sqrt(np.maximum(variance, 0.0))
-        drawn = finite & (variance[:, 0] >= 0.0) & (semi[:, 2] <= _LARGEST * self._stage.side)
+        semi, axes = semi_axes(frame.position_covariance)
+        semi *= look.magnification
+        drawn = semi[:, 2] <= _LARGEST * self._stage.side
         steps = np.log2(np.maximum(np.where(drawn[:, None], semi, np.nan), self._step / 4)) * _STEPS
         semi = 2.0 ** (np.round(steps) / _STEPS)
         self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi, _TURN), look.ellipsoids)

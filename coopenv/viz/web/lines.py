@@ -8,8 +8,8 @@ import numpy as np
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.viz.scene import Frame, Stage
-from coopenv.viz.scene.stage import Box
 from coopenv.viz.style import GREY, INK
+from coopenv.viz.topview_geometry import Box, crossings
 from coopenv.viz.web import ground
 from coopenv.viz.web.actors import Batch, fine, placed
 from coopenv.viz.web.ground import ROOT, Look, in_turn, linear, rgb
@@ -92,12 +92,7 @@ def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
     """Return where the ways from start to end (K, 3) enter a box first, not one that they begin in; or the end."""
     if not len(start) or not boxes:
         return np.asarray(end)
-    turn, center = np.stack([box.rotation for box in boxes]), np.stack([box.center for box in boxes])
-    half = np.array([box.size for box in boxes], float)[:, None] / 2
-    a, way = (start - center[:, None]) @ turn, (end - start) @ turn  # (boxes, K, 3)
-    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
-    one, other = (-half - a) / way, (half - a) / way
-    enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    enter, leave = crossings(start, end - start, boxes)
     share = np.where((enter < leave) & (enter > 1e-6) & (enter < 1.0), enter, 1.0).min(axis=0)
     return np.asarray(start + share[:, None] * (end - start))
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from coopenv.viz.error_figures import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Source
-from coopenv.viz.scene.stage import three_sigma
 from coopenv.viz.style import BLUE, GREY, VEHICLE_COLOURS
+from coopenv.viz.topview_geometry import semi_axes
 from coopenv.viz.web.ground import swatch
 
 _LONGEST = 600  # frames that are kept
@@ -42,9 +42,11 @@ class History:
     def of(self, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
         """Return times (K,) and error, three sigma, NEES and terms, (K, 3 + R), of a vehicle."""
         frames = [frame for _, frame in self._frames]
-        sigma = three_sigma(np.array([frame.position_covariance[vehicle] for frame in frames]).reshape(-1, 3, 3))
-        told = [(frame.position_error[vehicle], frame.nees[vehicle], *frame.terms[vehicle]) for frame in frames]
-        return np.array([time for time, _ in self._frames]), np.insert(np.array(told), 1, sigma, axis=1)
+        plan = np.array([frame.position_covariance[vehicle, :2, :2] for frame in frames]).reshape(-1, 2, 2)
+        rows = [(frame.position_error[vehicle], frame.nees[vehicle], *frame.terms[vehicle]) for frame in frames]
+        return np.array([time for time, _ in self._frames]), np.insert(
+            np.array(rows), 1, semi_axes(plan)[0][:, -1], axis=1
+        )
 
 
 class Plots:

@@ -244,12 +244,12 @@ def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> 
 
 
 def test_distortion_moves_the_targets() -> None:
-    from coopenv.viz.foxglove.camera import pixels
+    from coopenv.viz.camera_image import pixels
 
     rays = np.array([[0.3, 0.2, 0.9], [0.0, 0.0, 1.0], [0.1, 0.1, -0.5]])
-    straight, ahead = pixels(rays, Camera(model="pinhole"))
-    bent, _ = pixels(rays, Camera(model="pinhole", distortion=(-0.35, 0.14, 0.0, 0.0, 0.0)))
-    assert ahead.tolist() == [True, True, False]
+    straight = pixels(rays, Camera(model="pinhole"))
+    bent = pixels(rays, Camera(model="pinhole", distortion=(-0.35, 0.14, 0.0, 0.0, 0.0)))
+    assert np.isfinite(straight).all(axis=1).tolist() == [True, True, False]
     np.testing.assert_allclose(straight[1], Camera().principal_point)
     assert np.linalg.norm(bent[0] - straight[0]) > 4.0
 
