@@ -165,7 +165,7 @@ def view(
     from coopenv.runs.console import compile_notice
     from coopenv.runs.reels import vehicle_index
     from coopenv.runs.view import Viewer, serving
-    from coopenv.viz.web.extra import viser_module
+    from coopenv.viz.web.page import viser_module
 
     viser_module()
     log, changes = options.console(stderr=True), options.parse_overrides(overrides)

@@ -21,8 +21,7 @@ from coopenv.runs.rollouts import play
 from coopenv.runs.video import film_at, frame_stride, open_film
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import SceneRecord
-from coopenv.viz.topview import TopView
-from coopenv.viz.window import Window
+from coopenv.viz.topview import TopView, Window
 
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
 HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."

@@ -207,7 +207,7 @@ def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[st
     """
     if not pages_can_be_written(path, log):
         return None
-    from coopenv.viz.web.replay import write_replay
+    from coopenv.viz.web.page import write_replay
 
     with Progress(log, f"writing {path.name}", total=1.0) as progress:
         return write_replay(record, path, progress.update, others)
@@ -215,7 +215,7 @@ def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[st
 
 def pages_can_be_written(path: Path, log: Console) -> bool:
     """Return whether the extra `view` is installed; where it is not, a line says so."""
-    from coopenv.viz.web.extra import has_viser
+    from coopenv.viz.web.page import has_viser
 
     if not has_viser():
         log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)

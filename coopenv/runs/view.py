@@ -14,13 +14,11 @@ from coopenv.runs.reels import FAULTS, Reel
 from coopenv.runs.video import MAX_FPS
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
-from coopenv.viz.web.extra import guarded_server
+from coopenv.viz.web.actors import Sent
 from coopenv.viz.web.ground import Look
-from coopenv.viz.web.panel import NO_FAULT, Panel
+from coopenv.viz.web.page import aim, guarded_server
+from coopenv.viz.web.panel import NO_FAULT, History, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
-from coopenv.viz.web.plots import History
-from coopenv.viz.web.replay import aim
-from coopenv.viz.web.sent import Sent
 
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go

@@ -21,7 +21,7 @@ from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
-from coopenv.viz.web.extra import has_viser
+from coopenv.viz.web.page import has_viser
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated

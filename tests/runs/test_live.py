@@ -19,7 +19,7 @@ from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs.live import Clock, Keyboard, Keys, drive_by_hand, watch
-from coopenv.viz.window import Window
+from coopenv.viz.topview import Window
 from tests.helpers.four_way import FOUR_WAY
 
 AT_ONCE = Clock(np.inf)

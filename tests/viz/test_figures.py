@@ -21,8 +21,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FIGURE_NAMES, error_figures, style
 from coopenv.viz.error_figures import error_figure, observability_figure, unwrapped
-from coopenv.viz.figures import save_figures
-from coopenv.viz.topology import topology_figure
+from coopenv.viz.figures import save_figures, topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.drawn import spans, texts, xdata, ydata
 from tests.helpers.synthetic import make_trajectory

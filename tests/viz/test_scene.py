@@ -19,7 +19,7 @@ from coopenv.viz.camera_image import Lens, camera_image
 from coopenv.viz.scene import Frame, SceneRecord, Source, Stage
 from coopenv.viz.scene.stage import entry
 from coopenv.viz.topview import TopView
-from coopenv.viz.web.lines import stopped
+from coopenv.viz.web.picture import stopped
 
 ALONG = np.array([40.0, 0.0, 0.0])
 

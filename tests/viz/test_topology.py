@@ -11,7 +11,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
 from coopenv.viz.error_figures import error_figure
-from coopenv.viz.topology import topology_figure
+from coopenv.viz.figures import topology_figure
 from tests.helpers.drawn import spans, texts
 
 

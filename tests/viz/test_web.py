@@ -19,11 +19,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source, Stage
 from coopenv.viz.web.actors import placed, quaternions
-from coopenv.viz.web.extra import has_viser, viser_module
 from coopenv.viz.web.ground import GAIN, linear, spacing_of
-from coopenv.viz.web.lines import levels
-from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, useful_magnification
-from coopenv.viz.web.replay import write_replay
+from coopenv.viz.web.page import has_viser, viser_module, write_replay
+from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, levels, useful_magnification
 
 msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
 zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
@@ -80,7 +78,7 @@ def test_titles_cannot_bring_code_along(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", coopenv.list_envs())
 def test_every_environment_can_be_drawn(name: str) -> None:
-    from coopenv.viz.web.replay import replay_html
+    from coopenv.viz.web.page import replay_html
 
     scenario = coopenv.load_scenario(name, {"horizon": 1.0})
     length, _ = messages(replay_html(scene_of(Engine(scenario), Source.of(name, scenario, seed=1))))
