@@ -99,7 +99,7 @@ LINES_AND_FILES = {
     "runs": (3600, 15),
     "scenario": (2950, 14),
     "training": (1300, 7),
-    "viz": (5050, 29),
+    "viz": (4925, 21),
     "world": (4300, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -14,7 +14,7 @@ from coopenv.runs.reels import FAULTS, Reel
 from coopenv.runs.video import MAX_FPS
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
-from coopenv.viz.web.actors import Sent
+from coopenv.viz.web.actors import SentProperties
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim, guarded_server
 from coopenv.viz.web.panel import NO_FAULT, History, Panel
@@ -46,7 +46,7 @@ class Viewer:
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
-        self._root = Sent(self._picture.ground.root)
+        self._root = SentProperties(self._picture.ground.root)
         vehicles = {i: i for i in range(self._stage.vehicles)}
         self._picture.actors.cars.handle.on_click(
             lambda event: self._panel.wish("vehicle", event.instance_index, vehicles)
@@ -90,7 +90,7 @@ class Viewer:
             self._live = False
             self._set_playing(False)
             again = "; Restart shows it again" if self._reel.abilities().seek else ""
-            self._panel.tell(f"The episode is over{again}.")
+            self._panel.set_status(f"The episode is over{again}.")
             return False
         self._due += self._period() / self._speed
         return True
@@ -123,7 +123,7 @@ class Viewer:
             place = np.zeros(3)
             if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
                 place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
-            self._root.tell(position=tuple(np.round(place, 4).tolist()))
+            self._root.set(position=tuple(np.round(place, 4).tolist()))
             self._panel.show(self._frame, self._history, now, exact=not self.playing)
         self._shown_at = now
         self.shown += 1
@@ -169,16 +169,16 @@ class Viewer:
                 else:
                     getattr(self, f"_wish_{name}")(value)
             except Exception as error:  # a wish never ends the view
-                self._panel.tell(f"That cannot be: {error if isinstance(error, CoopenvError) else told(error)}")
+                self._panel.set_status(f"That cannot be: {error if isinstance(error, CoopenvError) else told(error)}")
         return any_wish
 
     def _set_playing(self, playing: bool) -> None:
         self.playing, self._due = playing, monotonic()
-        self._panel.tell_playing(playing)
+        self._panel.set_playing(playing)
 
     def _wish_play(self, _: object) -> None:
         self._set_playing(not self.playing)
-        self._panel.tell("")
+        self._panel.set_status("")
 
     def _wish_refused(self, words: str) -> None:
         raise CoopenvError(words)
@@ -193,7 +193,7 @@ class Viewer:
     def _wish_restart(self, _: object) -> None:
         self._k = 0
         self._remember(self._frame)
-        self._panel.tell("")
+        self._panel.set_status("")
         self._set_playing(True)
 
     def _wish_speed(self, speed: float) -> None:
@@ -220,7 +220,7 @@ class Viewer:
 
     def _wish_magnification(self, magnification: float) -> None:
         self._look.magnification = magnification
-        self._panel.tell_legend()
+        self._panel.update_legend()
 
     def _wish_observer(self, name: str) -> None:
         self._change(f"Running this episode under {name} up to here", observer=name)
@@ -232,16 +232,16 @@ class Viewer:
 
     def _change(self, words: str, **changes: Any) -> None:
         """Run the episode again up to here under changes."""
-        self._panel.tell(f"{words} (kernels that are new here are compiled first) ...")
+        self._panel.set_status(f"{words} (kernels that are new here are compiled first) ...")
         self._server.flush()
         self._reel.change(**changes)
         self._k = min(self._k, len(self._reel.frames) - 1)
         self._history = History(self._reel.scenario.rates.camera)
         for frame in self._reel.frames[: self._k + 1]:
             self._remember(frame)
-        self._picture.actors.tell_source(self._reel.source)
-        self._panel.tell_source(self._reel.source)
-        self._panel.tell("")
+        self._picture.actors.set_source(self._reel.source)
+        self._panel.set_source(self._reel.source)
+        self._panel.set_status("")
         self._due = monotonic()
 
 

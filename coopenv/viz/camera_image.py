@@ -1,4 +1,4 @@
-"""What a vehicle's camera sees: its image with the targets where they are projected to, drawn from the true poses."""
+"""The image of a vehicle's camera with the projected targets, drawn from the true poses."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ _HIGH = 30.0  # deg that such an image reaches up and down
 _SCALE = 2  # of the drawing, which is made smaller at the end
 _NEAR = 0.05  # m before the camera, where boxes are cut
 _AHEAD = 1e-3  # of the distance: depth from which on a point is ahead of the camera
-_WIDEST = 2.0  # radius of the image plane at distance 1 from which on the polynomial of the lens means nothing
+_WIDEST = 2.0  # radius of the image plane at distance 1 from which on the polynomial of the lens is not valid
 _EDGES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
@@ -44,7 +44,7 @@ def camera_image(stage: Stage, frame: Frame, vehicle: int) -> np.ndarray:
 
 
 class Lens:
-    """Projects points of the map to the pixels of one camera, as it is believed to be mounted."""
+    """Projects points of the map to the pixels of one camera, at its nominal mounting."""
 
     def __init__(self, stage: Stage, frame: Frame, vehicle: int) -> None:
         """Take the camera of a vehicle at a frame."""
@@ -93,7 +93,7 @@ def _boxes(stage: Stage, frame: Frame, vehicle: int) -> list[tuple[Box, str, str
 
 
 def _draw_ground(draw: ImageDraw.ImageDraw, lens: Lens) -> None:
-    """Fill what is below the horizon."""
+    """Fill the image below the horizon."""
     width, height = lens.size
     if lens.around:
         draw.rectangle([0, _SCALE * height // 2, _SCALE * width, _SCALE * height], fill=GROUND)

@@ -48,7 +48,7 @@ def _corner(direction: tuple[int, int], extent: np.ndarray) -> np.ndarray:
 
 
 def _cost(low: np.ndarray, extent: np.ndarray, marks: np.ndarray, lines: np.ndarray, taken: list[np.ndarray]) -> float:
-    """Return what a name that covers a box would cost; `taken` are corners (2, 2) of the boxes of others."""
+    """Return the cost of a name that covers a box; `taken` are corners (2, 2) of the boxes of other names."""
     high = low + extent
     names = sum(bool(np.all((low < other[1]) & (high > other[0]))) for other in taken)
     on_marks = np.all((marks > low - _MARK) & (marks < high + _MARK), axis=-1).sum()
@@ -88,7 +88,7 @@ _NAME = style.NORMAL + 1  # pt
 
 
 class Drawing:
-    """Axes with what has been drawn on them, names to be placed at the end."""
+    """Axes with lines, marks, and names that are placed at the end."""
 
     def __init__(self, ax: Any, low: np.ndarray, high: np.ndarray, dimensions: int) -> None:
         self.ax, self.low, self.high, self.dimensions = ax, low, high, dimensions
@@ -98,7 +98,7 @@ class Drawing:
         self._names: list[tuple[str, np.ndarray, str]] = []
 
     def line(self, path: np.ndarray, **look: Any) -> None:
-        """Draw what lies in the box of a path (K, 3)."""
+        """Draw the part of a path (K, 3) that lies in the box."""
         used = slice(self.dimensions)
         shown = clipped(path[:, used], self.low[used], self.high[used])
         self.ax.plot(*shown.T, **look)

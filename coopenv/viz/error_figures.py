@@ -29,13 +29,13 @@ _DASHED, _DOTTED = (0, (4, 2)), (0, (1, 1.5))
 _LATE = 0.7  # share of the record after which errors are small, and drawn linearly
 _LEAST_LINEAR = 1e-3  # m or deg
 _MOST_DECADES = 2  # that are labelled on each side of zero
-_ALWAYS = 0.95  # share of the record: what holds for longer is no event to shade
+_ALWAYS = 0.95  # share of the record: a condition that holds for longer is not shaded
 _USUAL = 0.9  # share of the last errors that are drawn linearly
 _DOT = 4.0  # pt
 
 
 class _Quantity(NamedTuple):
-    """What one column shows."""
+    """Data of a column of panels."""
 
     components: list[np.ndarray]  # per vehicle (k, 3), m or deg
     title: str
@@ -101,7 +101,7 @@ def _quantities(trajectory: Trajectory, live: np.ndarray) -> tuple[_Quantity, _Q
 def unwrapped(angles: np.ndarray) -> np.ndarray:
     """Return angles (K, 3), deg, without jumps by whole turns; in the end they lie within half a turn of zero.
 
-    What is NaN stays so, and is passed over.
+    NaN stays NaN.
     """
     result = np.array(angles, float)
     for angle in result.T:
@@ -118,7 +118,7 @@ def _draw(ax: Axes, t: np.ndarray, quantity: _Quantity, vehicle: int, bins: int)
     for level in (-quantity.tolerance, quantity.tolerance):
         ax.axhline(level, color=style.GREY, linewidth=0.9, linestyle=_DOTTED)
     for component, colour in zip(quantity.components[vehicle].T, style.AXES_COLOURS, strict=True):
-        first = 1 if len(t) > 1 else 0  # what was before the first correction is a dot
+        first = 1 if len(t) > 1 else 0  # the error before the first correction is a dot
         style.draw_band(ax, t[first:], component[first:], bins, color=colour, linewidth=style.LINE)
         ax.plot(t[:1], component[:1], "o", color=colour, markersize=_DOT, clip_on=False, zorder=4)
 
@@ -142,7 +142,7 @@ def _share_scale(column: Sequence[Axes], quantity: _Quantity) -> None:
 
 
 def _marks(converged: np.ndarray, shaded: bool, ended: bool) -> list[Line2D | Patch]:
-    """Return what the legend explains of all that is in the figure."""
+    """Return the marks of the legend that occur in the figure."""
     ink = style.INK
     lines = [
         Line2D([], [], color=colour, linewidth=style.LINE, label=f"{first}, {second}")
@@ -172,15 +172,15 @@ _SPREAD_LOOKS: tuple[dict[str, Any], dict[str, Any]] = (
     {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4},
     {"color": style.INK, "linestyle": "-", "linewidth": 0.8},
 )
-"""Of what is claimed, and of what is."""
+"""Of the standard deviation that the observer states, and of the error."""
 _SHORT = 9.0  # inches: in narrower figures panels have no room for sentences
 _TITLES, _NARROW_TITLES = ("NEES (6 dof)", "position [m]", "orientation [deg]"), ("NEES", "[m]", "[deg]")
 _ROOM = 0.3  # of the height, for words above the curves
-HONEST = (
-    "An honest observer's NEES lies in the band 95 % of the time; "
-    "above it, the observer believes itself better than it is."
+CONSISTENT = (
+    "The NEES of a consistent observer lies in the band 95 % of the time; "
+    "above the band, the observer is overconfident."
 )
-GAIN = "The P of this observer is the gain matrix of its Riccati equation, not a covariance: its NEES says nothing."
+GAIN = "The P of this observer is the gain matrix of its Riccati equation, not a covariance: its NEES is meaningless."
 
 
 def consistency_figure(
@@ -198,7 +198,7 @@ def consistency_figure(
 
     Args:
         trajectory: the record of a run.
-        ends: s, when each vehicle was parked, after which nothing counts.
+        ends: s, when each vehicle was parked, after which no sample counts.
         steady_from: s; the mean NEES and the share inside are over the ticks after it (None: `STEADY_SHARE` of
             the record).
         width: inches (None: a page's).
@@ -229,7 +229,7 @@ def consistency_figure(
         _share_decades(column, room)
     for ax, title in zip(axes[0], _NARROW_TITLES if narrow else _TITLES, strict=True):
         ax.set_title(title, fontsize=style.NORMAL, color=style.INK)
-    style.explain(figure, GAIN if gain else HONEST)
+    style.explain(figure, GAIN if gain else CONSISTENT)
     ended = [Patch(facecolor=style.ENDED, label="ended, parked")] if live.min() < len(trajectory.t) else []
     style.legend_above(figure, [*_nees_marks(trajectory.t, steady_from), *ended])
     return figure
@@ -248,7 +248,7 @@ def _nees_marks(t: np.ndarray, steady_from: float) -> list[Patch | Line2D]:
 
 
 def _share_decades(column: Sequence[Axes], room: float) -> None:
-    """Give panels the same logarithmic ordinate, which holds what all of them show, and room above it."""
+    """Give panels the same logarithmic ordinate, wide enough for all of them, with room above the curves."""
     for ax in column:
         style.show_decades(ax)
     limits = [ax.get_ylim() for ax in column]
@@ -340,7 +340,7 @@ def observability_figure(
 
 
 def _draw_eigenvalues(ax: Axes, cut: list[Observability]) -> list[Line2D | Patch]:
-    """Draw one line per vehicle, of different dashes where they lie upon one another; return what explains them."""
+    """Draw one line per vehicle, with different dashes because lines may coincide; return the handles of the legend."""
     style.tidy(ax)
     ax.set_yscale("log")
     drawn: list[Line2D | Patch] = []
@@ -357,7 +357,7 @@ def _draw_eigenvalues(ax: Axes, cut: list[Observability]) -> list[Line2D | Patch
 
 
 def _draw_verdict(ax: Axes, cut: list[Observability]) -> list[Patch]:
-    """Draw the verdict of every vehicle, and return what explains it."""
+    """Draw the verdict of every vehicle, and return the handles of the legend."""
     style.tidy(ax)
     ax.grid(False, axis="y")
     occurring = set()

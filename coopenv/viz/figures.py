@@ -1,11 +1,11 @@
 """All figures of a run, written under stable names.
 
-`style` gives Matplotlib's settings for figures of one's own, `restyle` changes a figure of this package:
+`style` gives Matplotlib's settings for your own figures, `restyle` changes a figure of this package:
 
     import matplotlib.pyplot as plt
-    from coopenv.viz import paper
+    from coopenv.viz import figures
 
-    plt.style.use(paper.style("ieee1"))
+    plt.style.use(figures.style("ieee1"))
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -61,11 +61,11 @@ _MOST_NAMES = 8
 
 
 def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, width: float | None = None) -> Figure:
-    """Draw, per vehicle, one lane per target against time, the bar telling what became of the sight line.
+    """Draw, per vehicle, one lane per target against time, with a bar for the state of the line of sight.
 
     Targets that are the same from begin to end, such as those of a fixed topology, stand in words above the lanes.
     Blue shading: a moving target is detected, or a moving body hides a target. Grey: the vehicle has ended (at `ends`,
-    s) and is parked; others may see it. `width` is in inches (None: a page's).
+    s) and is parked; other vehicles may see it. `width` is in inches (None: a page's).
     """
     count = len(trajectory.vehicles)
     live = live_ticks(trajectory.t, count, ends)
@@ -132,7 +132,7 @@ def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndar
 def _write_title(
     ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int, inches: float
 ) -> None:
-    """Write the vehicle's name, how much it sees, and what never changes."""
+    """Write the vehicle's name, its mean number of visible targets, and the lines of sight that never change."""
     seen = mean_targets_in_view(trajectory.visible[:ticks, vehicle])
     parts = [f"{seen:.2f} targets in view on average"]
     names, first = house.target_labels(trajectory), trajectory.sight[0, vehicle]
@@ -205,7 +205,7 @@ def inches_of(width: str | float | None) -> float | None:
 
 
 def style(name: str, height: float = 0.68) -> dict[str, Any]:
-    """Return Matplotlib's settings for figures of one's own, to give to `plt.style.use` or `matplotlib.rc_context`.
+    """Return Matplotlib's settings for your own figures, to give to `plt.style.use` or `matplotlib.rc_context`.
 
     Args:
         name: one of `COLUMNS`.
@@ -300,8 +300,8 @@ def save_figures(
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
         file_format: one of `FORMATS`.
-        note: in small print below each figure: what it is of.
-        about: what metadata of the files say: environment, observer, seed.
+        note: in small print below each figure: its subject.
+        about: metadata of the files: environment, observer, seed.
         width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figures then have, or inches (None: a page's).
         gain: whether P is a gain matrix and no covariance.
 

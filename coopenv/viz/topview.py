@@ -1,4 +1,4 @@
-"""The top view of an environment: who sees whom, and how good each estimate is."""
+"""The top view of an environment: lines of sight, estimates and their errors."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body
 from coopenv.viz import topview_geometry as geometry
 from coopenv.viz import topview_ground as ground
-from coopenv.viz.scene.stage import Frame, Shown, Stage
+from coopenv.viz.scene.stage import Frame, FrameSource, Stage
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_ground import Goals, Layers
 
@@ -27,7 +27,7 @@ class Window:
 
     @property
     def canvas(self) -> Any:
-        """Matplotlib's canvas, which tells of keys; None before the first picture and without a display."""
+        """Matplotlib's canvas, which reports keys; None before the first picture and without a display."""
         return None if self._image is None else self._image.figure.canvas
 
     @property
@@ -69,7 +69,7 @@ def _opened(title: str, picture: np.ndarray) -> Any:
             return None
         dpi = 100
         figure = plt.figure(num=None, figsize=(picture.shape[1] / dpi, picture.shape[0] / dpi), dpi=dpi)
-    except Exception:  # each toolkit has its own way to say that it is not installed or finds no display
+    except Exception:  # each toolkit raises its own error where it is not installed or finds no display
         return None
     ax = figure.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
@@ -92,7 +92,7 @@ _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body
 class TopView:
     """Draws one world of an engine from above.
 
-    The picture depends on the engine's present state alone. What stands still is drawn once; the few artists that
+    The picture depends on the engine's present state alone. The static part is drawn once; the few artists that
     move are kept and updated.
     """
 
@@ -118,7 +118,7 @@ class TopView:
         self._prepare_table()
         self._window = Window(scenario.title)
 
-    def draw(self, engine: Shown) -> np.ndarray:
+    def draw(self, engine: FrameSource) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of world 0, as wide as the map if that is all."""
         return self.paint(Frame.of(engine))
 
@@ -229,9 +229,9 @@ class TopView:
         place, guess = position[L:, :2], self._drawable(frame.estimate_position[:, :2])
         self._truth.set_verts(geometry.outlines(R[L:], place, self._box))
         self._truth_nose.set_verts(geometry.outlines(R[L:], place, self._nose))
-        believed = geometry.outlines(R_hat, guess, self._box)
-        self._casing.set_verts(believed)
-        self._estimate.set_verts(believed)
+        estimated = geometry.outlines(R_hat, guess, self._box)
+        self._casing.set_verts(estimated)
+        self._estimate.set_verts(estimated)
         self._estimate_nose.set_verts(geometry.outlines(R_hat, guess, self._nose))
         self._other.set_verts(geometry.outlines(R[self._others], position[self._others, :2], self._other_box))
         self._links.set_segments(list(np.stack([place, guess], axis=1)))

@@ -66,10 +66,10 @@ def nose_shape(corners: np.ndarray) -> np.ndarray:
 
 
 def ways(scenario: Scenario) -> np.ndarray:
-    """Return (N,) rad, by which the way of each vehicle is turned from its body's x axis when it starts.
+    """Return the angle (N,), rad, from each vehicle's x axis to its direction of travel at the start.
 
     In the paper's intersection bodies are not turned: R = I also of those that go north. There, where bodies hide
-    nothing, a vehicle is drawn pointing where it goes; everywhere else the way is that of the body.
+    nothing, a vehicle is drawn in its direction of travel; everywhere else the angle is zero.
     """
     if scenario.topology.mode != "fixed":
         return np.zeros(len(scenario.vehicles))
@@ -101,7 +101,7 @@ def camera_fan(camera: Camera) -> np.ndarray:
 
 
 class Box(NamedTuple):
-    """A box that hides what is behind it."""
+    """A box that occludes targets."""
 
     name: str
     rotation: np.ndarray  # (3, 3) to map

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -14,27 +14,29 @@ from coopenv.base.npz import read_npz
 from coopenv.base.sections import Section, validated
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.estimation.poses import covariance_in_map
-from coopenv.observers import Recording, Run
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
-from coopenv.viz.scene.stage import FIELDS, WHOLE_FIELDS, Frame, Shown
+from coopenv.viz.scene.stage import FIELDS, WHOLE_FIELDS, Frame, FrameSource
+
+if TYPE_CHECKING:
+    from coopenv.observers import Recording, Run
 
 SCENE_FILE = "scene.npz"
 _HEADER = "header"
 
 
 class Source(Section):
-    """What a scene is of, for its heading."""
+    """Environment, observer, driver and seed of a scene, for its heading."""
 
     name: str
     """Of the environment, the recording or the deployment."""
     observer: str
     policy: str = ""
-    """Who drives; empty: nobody."""
+    """Name of the driver; empty: no driver."""
     seed: int | None = None
-    """None: nothing was drawn."""
+    """None: the episode was not drawn at random."""
     terms: tuple[str, ...] = ()
     """Names of the reward terms of a frame."""
     honest: bool = True
@@ -42,7 +44,7 @@ class Source(Section):
 
     @classmethod
     def of(cls, name: str, scenario: Scenario, **more: Any) -> Self:
-        """Return what a scene of a scenario is of; `more` are further fields."""
+        """Return the source of a scene of a scenario; `more` are further fields."""
         observer = scenario.observer.name
         terms = tuple(scenario.reward.by_name)
         return cls(name=name, observer=observer, terms=terms, honest=states_covariance(observer), **more)
@@ -99,7 +101,7 @@ class SceneRecord:
             same = len(small) > 1 and np.array_equal(
                 small, np.broadcast_to(small[:1], small.shape), equal_nan=not whole
             )
-            arrays[name] = small[:1] if same else small  # what stands still is kept once
+            arrays[name] = small[:1] if same else small  # an array that never changes is kept once
         scenario = without_own_terms(jsonable(self.scenario))
         header = {"frames": len(self), "source": self.source.model_dump(), "scenario": scenario}
         arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -149,11 +151,11 @@ _AXES = {
     "traffic_rotation": "K Z 3 3",
     **dict.fromkeys(("traffic_position", "traffic_half"), "K Z 3"),
 }
-"""By field of a frame its axes; F: all frames, K: all of them, or one where nothing changes."""
+"""By field of a frame its axes; F: all frames, K: all frames, or a single one for a constant field."""
 _TABLE = {name: f"{'i' if name in WHOLE_FIELDS else 'f'} {axes}" for name, axes in _AXES.items()}
 
 
-def frames_of(recording: Recording, run: Run, ticks: np.ndarray) -> list[Frame]:
+def frames_of(recording: "Recording", run: "Run", ticks: np.ndarray) -> list[Frame]:
     """Return frames of a recording and of a run of an observer on it.
 
     A vehicle whose truth is never known has the pose of its estimate. There are no goals, routes and reward terms.
@@ -201,12 +203,12 @@ class SceneWriter:
         self.scenario, self.source = scenario, source
         self._frames: list[Frame] = []
 
-    def add(self, shown: Shown) -> Frame:
-        """Keep what is there now, and return it."""
+    def add(self, shown: FrameSource) -> Frame:
+        """Add the present frame, and return it."""
         self._frames.append(Frame.of(shown))
         return self._frames[-1]
 
     def record(self) -> SceneRecord:
-        """Return what has been kept; `add` must have been called."""
+        """Return the record of all frames; `add` must have been called."""
         stacked = {name: np.stack([getattr(frame, name) for frame in self._frames]) for name in FIELDS}
         return SceneRecord(self.scenario, self.source, stacked)

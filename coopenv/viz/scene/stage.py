@@ -1,4 +1,4 @@
-"""What stands still in a scene, and what follows from it and a frame: fields of view, and who hides whom."""
+"""The static side of a scene, its frames, and what follows from both: fields of view and occlusion."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -14,8 +14,8 @@ from coopenv.viz import topview_geometry as geometry
 from coopenv.viz.topview_geometry import Box
 
 
-class Shown(Protocol):
-    """What can be drawn: an engine, or what stands for one."""
+class FrameSource(Protocol):
+    """Source of frames: an engine, or a stand-in for one."""
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of its results or its state, (W, ...)."""
@@ -27,7 +27,7 @@ class Frame:
     """A agents (landmarks first, then N vehicles), R reward terms, P points of a route, Z bodies of other traffic.
 
     Positions are in the map frame, m; rotations map body to map. Arrays are copies. Numbers are NaN of agents that are
-    not there, and of true poses that nobody knows.
+    not there, and of unknown true poses.
     """
 
     tick: np.ndarray  # () camera ticks since the start
@@ -38,7 +38,7 @@ class Frame:
     position_covariance: np.ndarray  # (N, 3, 3) m^2, of the estimate, from the observer's P to first order
     position_error: np.ndarray  # (N,) m
     orientation_error: np.ndarray  # (N,) deg
-    nees: np.ndarray  # (N,) normalised error squared of the pose; 6 on average where P is honest
+    nees: np.ndarray  # (N,) normalised error squared of the pose; 6 on average where P is consistent
     sight: np.ndarray  # (N, A) values of `Sight`
     pan: np.ndarray  # (N,) rad, by which the camera is turned to the left
     ended: np.ndarray  # (N,) values of `Outcome`, or conditions of the scenario's own
@@ -53,8 +53,8 @@ class Frame:
     traffic_half: np.ndarray  # (Z, 3) half of the edges; zero: not there
 
     @classmethod
-    def of(cls, shown: Shown, world: int = 0) -> Self:
-        """Return what an engine shows of a world now."""
+    def of(cls, shown: FrameSource, world: int = 0) -> Self:
+        """Return the present frame of a world of an engine."""
         kept: dict[str, Any] = {name: np.array(shown.view(name)[world], float) for name in _FLOATS}
         kept |= {name: np.array(shown.view(name)[world]).astype(np.int64) for name in _WHOLE}
         R_hat, p_hat = kept["estimate_rotation"], np.array(shown.view("estimate_position")[world], float)
@@ -124,7 +124,7 @@ class Stage:
     """The static side of a scene; lengths in m, everything in the map frame."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Work out what a scenario fixes."""
+        """Derive the static side from a scenario."""
         self.scenario = scenario
         self.landmarks, self.vehicles = len(scenario.landmarks), len(scenario.vehicles)
         self.origin = np.array(scenario.map.origin, float)
@@ -202,7 +202,7 @@ class Stage:
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
 
     def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:
-        """Return the short name of what hides a target from a vehicle's camera; None: nothing that is drawn does."""
+        """Return the short name of the box that hides a target from a vehicle's camera; None: no drawn box does."""
         kind = frame.sight[vehicle, target]
         start, end = self.eyes(frame)[vehicle], self.targets(frame)[target]
         if kind == Sight.OCCLUDED_BY_BUILDING:

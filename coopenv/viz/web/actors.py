@@ -11,16 +11,16 @@ from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import ROOT, Ground, Look, Mesh, arrow, box, car, linear, pole, rgb, sphere
 
 
-class Sent:
-    """A handle, and what it was told last."""
+class SentProperties:
+    """A handle of viser, and the properties that were sent to it last."""
 
     def __init__(self, handle: Any) -> None:
-        """Begin with a handle that has been told nothing."""
+        """Start with a new handle."""
         self.handle = handle
         """viser's."""
         self._last: dict[str, Any] = {}
 
-    def tell(self, **properties: Any) -> None:
+    def set(self, **properties: Any) -> None:
         """Set properties; an array that is given must not be changed afterwards."""
         for name, value in properties.items():
             last = self._last.get(name)
@@ -89,7 +89,7 @@ class Batch:
     def __init__(self, scene: Any, name: str, mesh: Mesh, colours: np.ndarray, **look: Any) -> None:
         """Add them, one per colour (N, 3), to be placed; of none there is no node."""
         count = len(colours)
-        self._node: Sent | None = None
+        self._node: SentProperties | None = None
         if count:
             handle = scene.add_batched_meshes_simple(
                 name,
@@ -101,7 +101,7 @@ class Batch:
                 lod="off",
                 **{"cast_shadow": False, "receive_shadow": False, **look},
             )
-            self._node = Sent(handle)
+            self._node = SentProperties(handle)
 
     @property
     def handle(self) -> Any:
@@ -112,10 +112,10 @@ class Batch:
         """Put the copies to their places."""
         if self._node is None:
             return
-        self._node.tell(visible=shown)
+        self._node.set(visible=shown)
         if shown:
             wxyzs, positions, scales = places
-            self._node.tell(batched_wxyzs=wxyzs, batched_positions=positions, batched_scales=scales)
+            self._node.set(batched_wxyzs=wxyzs, batched_positions=positions, batched_scales=scales)
 
 
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
@@ -142,7 +142,7 @@ class Actors:
         self._ghosts = Batch(scene, f"{ROOT}/estimates/body", car(), colours, **ghost)
         self._frames = Batch(scene, f"{ROOT}/estimates/edges", box(), colours, wireframe=True, opacity=0.5)
         self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", sphere(), colours, opacity=_HONEST)
-        self.tell_source(source)
+        self.set_source(source)
         dark = np.tile(np.array(rgb(DARK_BLUE), np.uint8), (stage.landmarks, 1))
         self._dots = Batch(scene, f"{ROOT}/landmarks/dots", sphere(6), dark)
         self._poles = Batch(scene, f"{ROOT}/landmarks/poles", pole(), dark)
@@ -152,16 +152,16 @@ class Actors:
         self._scene = scene
         self._traffic: Batch | None = None
 
-    def tell_source(self, source: Source) -> None:
-        """Say what is shown: ellipsoids of what is no covariance are paler."""
+    def set_source(self, source: Source) -> None:
+        """Set the source: ellipsoids of a gain matrix are paler than those of a covariance."""
         self._ellipsoids.handle.opacity = _HONEST if source.honest else _GAIN
 
     def place(self, frame: Frame, look: Look) -> None:
         """Move everything to where it is in a frame."""
         R, R_hat = frame.vehicle_rotation, frame.estimate_rotation
         at = self._rounded(frame.vehicle_position + (R @ self._center[..., None])[..., 0])
-        believed = self._near(frame.estimate_position + (R_hat @ self._center[..., None])[..., 0])
-        true, ghosts = placed(R, at, self._size), placed(R_hat, believed, _SHELL * self._size)
+        estimated = self._near(frame.estimate_position + (R_hat @ self._center[..., None])[..., 0])
+        true, ghosts = placed(R, at, self._size), placed(R_hat, estimated, _SHELL * self._size)
         self.cars.put(true)
         self._arrows.put(true)
         self._ghosts.put(ghosts, look.estimates)

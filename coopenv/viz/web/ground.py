@@ -1,4 +1,4 @@
-"""What stands still: floor, grid, roads and buildings."""
+"""The static part of the scene in the browser: floor, grid, roads and buildings; looks, legend and meshes."""
 
 from dataclasses import dataclass
 from html import escape
@@ -27,7 +27,7 @@ class Look:
     sight: bool = True
     """Lines of sight."""
     only: int | None = None
-    """The vehicle whose lines of sight alone are shown; None: those of all."""
+    """Index of the only vehicle with lines of sight; None: all vehicles have them."""
     views: bool = True
     """Fields of view."""
     messages: bool = True
@@ -60,11 +60,11 @@ def vehicle_colours(count: int) -> np.ndarray:
 
 
 _ROW = "display:flex;gap:8px;align-items:center;line-height:1.45"
-GAIN = "P is a gain matrix of this observer, not a covariance: its ellipsoids say nothing about the error."
+GAIN = "P is a gain matrix of this observer, not a covariance: its ellipsoids are not bounds of the error."
 
 
 def ellipsoid_words(source: Source, magnification: float) -> str:
-    """Return what an ellipsoid shows."""
+    """Return the legend of an ellipsoid."""
     times = f", {magnification:g} times as large" if magnification != 1.0 else ""
     return f"3σ of the estimate{times}" if source.honest else f"observer's P{times} (gain, no covariance)"
 
@@ -78,7 +78,7 @@ def marks(stage: Stage, source: Source, magnification: float) -> list[tuple[str,
         (True, _block(BLUE, 0.3), "its estimate; a dashed line joins both"),
         (True, _disc(BLUE, 0.25), ellipsoid_words(source, magnification)),
         (stage.sees_a_part, _block(BLUE, 0.15), "field of view"),
-        (True, _line(BLUE), "sees (colour of who looks)"),
+        (True, _line(BLUE), "sees (colour of the observing vehicle)"),
         (sensed and bool(s.obstacles), _line(GREY), "hidden by a building, where the line ends"),
         (sensed, _line(INK), "hidden by a body, where the line ends"),
         (any(camera.miss_probability > 0 for camera in s.cameras), _line(BLUE, "2 4"), "in view, but missed"),
@@ -206,7 +206,7 @@ def circle(radius: float, points: int = 32) -> np.ndarray:
 ROOT = "/world"
 """The node that everything hangs on; moving it moves the world."""
 SOLID, FADED = 0.8, 0.15
-"""Opacity of buildings, and of those that hide what is looked at."""
+"""Opacity of buildings, and of buildings in front of the picked vehicle."""
 _GRID = "#DEDBD1"
 
 
@@ -247,7 +247,7 @@ class Ground:
         self.buildings = [self._building(scene, i) for i in range(len(stage.scenario.obstacles))]
 
     def fade(self, hidden: set[int]) -> None:
-        """Let the buildings of these indices be seen through, the others not."""
+        """Make the buildings of these indices transparent, and all other ones solid."""
         for i, building in enumerate(self.buildings):
             building.opacity = FADED if i in hidden else SOLID
 

@@ -60,7 +60,7 @@ def guarded_server(host: str, port: int) -> Iterator[tuple[Any, str]]:
     own `process_request` while it starts.
 
     Raises:
-        CoopenvError: the extra is not installed, or this version of viser starts in another way.
+        CoopenvError: the extra is not installed, or this version of viser starts its server differently.
     """
     viser = viser_module()
     from websockets.asyncio import server as asyncio_server
@@ -217,7 +217,7 @@ def _choice(driver: str, others: Mapping[str, str]) -> str:
         f"<b>{escape(name)}</b>" if name == driver else f'<a href="{escape(quote(file))}">{escape(name)}</a>'
         for name, file in others.items()
     ]
-    return f"<p>Who drives: {', '.join(names)}</p>"
+    return f"<p>Driver: {', '.join(names)}</p>"
 
 
 _KEYS = "Drag to turn, right drag to move, wheel to come nearer. Space: pause."

@@ -32,15 +32,15 @@ _LOOK: dict[str, Any] = {
 
 
 class History:
-    """What the plots show, of all vehicles."""
+    """Recent frames of all vehicles, for the plots."""
 
     def __init__(self, rate: float) -> None:
-        """Begin with nothing; `rate` are camera ticks per second."""
+        """Start without frames; `rate` is in camera ticks per second."""
         self._rate = rate
         self._frames: deque[tuple[float, Frame]] = deque(maxlen=_LONGEST)
 
     def add(self, frame: Frame) -> None:
-        """Add a frame; one that is not later than the last one begins anew."""
+        """Add a frame; a frame that is not later than the last one clears the history."""
         time = float(frame.tick) / self._rate
         if self._frames and time <= self._frames[-1][0]:
             self._frames.clear()
@@ -69,7 +69,7 @@ class Plots:
         error, pair = ("error", BLUE), (start, one, one)
         title = f"Position error [m]; dashed: {sigma}"
         self._error = gui.add_uplot(pair, _series(error, ("3σ", GREY)), title=title, scales=log, **_LOOK)
-        title, bounds = "NEES; dashed: 95 % of honest ones", (("from", GREY), ("to", GREY))
+        title, bounds = "NEES; dashed: 95 % if consistent", (("from", GREY), ("to", GREY))
         self._nees = gui.add_uplot((*pair, one), _series(("NEES", BLUE), *bounds), title=title, scales=log, **_LOOK)
         self._reward: Any = None
         if self._terms:
@@ -102,7 +102,7 @@ def _series(*named: tuple[str, str]) -> tuple[dict[str, Any], ...]:
 
 
 def _positive(values: np.ndarray) -> np.ndarray:
-    """Return values that a logarithmic axis can show; what is no number is as the last one that was."""
+    """Return values for a logarithmic axis; a value that is not finite is replaced by the last finite one."""
     good = np.isfinite(values)
     last = np.maximum.accumulate(np.where(good, np.arange(len(values)), 0))
     filled = values[last]
@@ -112,10 +112,10 @@ def _positive(values: np.ndarray) -> np.ndarray:
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")
 MAGNIFICATIONS = ("1", "10", "100")
 _CELL = "padding:2px 5px;text-align:right"
-NOBODY = "nobody"
+NONE_PICKED = "none"
 NO_FAULT = "none"
 REFUSED = "refused"
-"""Name of a wish for what was not offered; its value says which."""
+"""Name of a wish for a value that was not offered; its value is the reason."""
 SWITCH = {False: False, True: True}
 TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
 """s of real time between two positions of the slider, two tables, and two images and plots."""
@@ -123,14 +123,14 @@ TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
 
 @dataclass
 class Abilities:
-    """What a source lets one do."""
+    """Controls that a source supports."""
 
     pace: bool = True
     """Pause, step and speed; not of real cars."""
     seek: bool = True
     """Go back to earlier frames."""
     observers: Sequence[str] = ()
-    """That can be put in place of the one that runs; the first one runs."""
+    """Observers to choose from; the first one runs."""
     faults: Sequence[str] = ()
     """That can be switched on."""
 
@@ -156,9 +156,9 @@ class Panel:
         self._add_playback(length)
         names = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
         self._vehicles = gui.add_dropdown(
-            "Vehicle", (NOBODY, *names), hint="Its camera, its plots; the view goes along."
+            "Vehicle", (NONE_PICKED, *names), hint="Its camera, its plots; the view goes along."
         )
-        self._on(self._vehicles, "vehicle", {NOBODY: None} | {name: i for i, name in enumerate(names)})
+        self._on(self._vehicles, "vehicle", {NONE_PICKED: None} | {name: i for i, name in enumerate(names)})
         tabs = gui.add_tab_group()
         with tabs.add_tab("Errors"):
             self._table = gui.add_html("")
@@ -169,10 +169,10 @@ class Panel:
             self._plots = Plots(gui, source)
         with tabs.add_tab("Show"):
             self._add_switches()
-        self.tell_source(source)
+        self.set_source(source)
 
     def _on(self, handle: Any, name: str, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
-        """Let the user's changes of a control become wishes; what the program sets itself does not."""
+        """Turn the user's changes of a control into wishes; changes by the program are no wishes."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
@@ -186,7 +186,7 @@ class Panel:
         Args:
             name: of the wish.
             given: value of the control.
-            offered: by value what it means, or the lowest and the highest number.
+            offered: meaning by value, or the lowest and the highest number.
         """
         if isinstance(offered, tuple):
             low, high = offered
@@ -243,25 +243,25 @@ class Panel:
         self._on(self._follow, "follow", SWITCH)
         self._legend = gui.add_html("")
 
-    def tell_source(self, source: Source) -> None:
-        """Say what is shown."""
+    def set_source(self, source: Source) -> None:
+        """Set the heading and the legend."""
         self._source = source
         title = self._stage.scenario.title
         self._head.content = f"**{_plain(title)}**  \n{_plain(source.words)}"
-        self.tell_legend()
+        self.update_legend()
 
-    def tell_legend(self) -> None:
-        """Say what the marks mean, now."""
+    def update_legend(self) -> None:
+        """Update the legend."""
         legend = legend_html(self._stage, self._source, self._look.magnification)
         self._legend.content = f'<div style="font-size:12px;padding:4px 14px">{legend}</div>'
 
-    def tell(self, words: str) -> None:
-        """Say what is going on; nothing: it goes on as usual."""
+    def set_status(self, words: str) -> None:
+        """Show a line on the present activity; empty: hide it."""
         self._status.visible = bool(words)
         self._status.content = f"*{_plain(words)}*" if words else ""
 
-    def tell_playing(self, playing: bool) -> None:
-        """Name the button after what it does."""
+    def set_playing(self, playing: bool) -> None:
+        """Set the label of the play button."""
         if self._playing is not None:
             self._playing.label = "Pause" if playing else "Play"
 
@@ -269,16 +269,18 @@ class Panel:
         """Look at a vehicle, or at none."""
         self.picked = vehicle
         none = vehicle is None
-        self._vehicles.value = NOBODY if vehicle is None else self._stage.short_name(self._stage.landmarks + vehicle)
+        self._vehicles.value = (
+            NONE_PICKED if vehicle is None else self._stage.short_name(self._stage.landmarks + vehicle)
+        )
         self._image.visible = not none
         if none:
             self._vehicle_words.content = "*Pick a vehicle above, or click on one in the scene.*"
         self._plots_at = -np.inf
 
     def show(self, frame: Frame, history: History, now: float, exact: bool = False) -> None:
-        """Tell a frame in numbers, not more often than can be read; `now` is real time, s.
+        """Show the numbers of a frame, not more often than can be read; `now` is real time, s.
 
-        With `exact` the time is told in any case.
+        With `exact` the time is shown in any case.
         """
         if self._time is not None and (exact or now - self._time_at >= TIME_EVERY):
             self._time_at = now
@@ -312,7 +314,7 @@ def table_html(stage: Stage, source: Source, frame: Frame) -> str:
 
 
 def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
-    """Return what a vehicle's camera sees and does not, in Markdown."""
+    """Return a vehicle's visible, hidden and missed targets, in Markdown."""
 
     def names(kind: Sight) -> list[str]:
         found = []
@@ -325,10 +327,10 @@ def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
     lines.append(("hidden", [*names(Sight.OCCLUDED_BY_BODY), *names(Sight.OCCLUDED_BY_BUILDING)]))
     lines.append(("missed", names(Sight.MISSED)))
     mark = stage.short_name(stage.landmarks + vehicle)
-    said = "; ".join(f"{word} {_plain(', '.join(found))}" for word, found in lines if found)
-    return f"**{mark}** {said or 'sees nothing'}"
+    listed = "; ".join(f"{word} {_plain(', '.join(found))}" for word, found in lines if found)
+    return f"**{mark}** {listed or 'sees nothing'}"
 
 
 def _plain(text: str) -> str:
-    """Return a text in which Markdown finds nothing to do."""
+    """Return a text with all Markdown characters escaped."""
     return "".join(f"\\{c}" if c in r"\`*_{}[]()#+-!|<>" else c for c in escape(text, quote=False))

@@ -11,7 +11,7 @@ from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import GREY, INK
 from coopenv.viz.topview_geometry import Box, crossings
 from coopenv.viz.web import ground
-from coopenv.viz.web.actors import Actors, Batch, Sent, fine, placed
+from coopenv.viz.web.actors import Actors, Batch, SentProperties, fine, placed
 from coopenv.viz.web.ground import ROOT, Ground, Look, in_turn, linear, rgb, vehicle_colours
 
 Coloured = tuple[np.ndarray, np.ndarray]
@@ -24,14 +24,14 @@ _GROWTH = 32  # segments by which the arrays grow
 class Segments:
     """A node of line segments whose number changes.
 
-    Arrays have room for more, so that they seldom change their shape; what is not used lies in one point.
+    Arrays have room for more, so that they seldom change their shape; unused segments lie in a single point.
     """
 
     def __init__(self, scene: Any, name: str, thickness: float) -> None:
         """Begin with none; the thickness is in pixels."""
         self._scene, self._name, self._thickness = scene, name, thickness
         self._room = 0
-        self._node: Sent | None = None
+        self._node: SentProperties | None = None
         self._colours, self._shade = np.zeros((0, 3), np.uint8), np.zeros((0, 2, 3), np.uint8)
 
     def show(self, points: np.ndarray, colours: np.ndarray) -> None:
@@ -40,7 +40,7 @@ class Segments:
         if not good.all():
             points, colours = points[good], colours[good]
         if self._node is not None:
-            self._node.tell(visible=len(points) > 0)
+            self._node.set(visible=len(points) > 0)
         if not len(points):
             return
         grown = len(points) > self._room
@@ -54,18 +54,18 @@ class Segments:
             self._shade[: len(points)], self._shade[len(points) :] = shade[:, None], shade[0]
         if self._node is None or grown:
             look: dict[str, Any] = {"thickness": self._thickness, "thickness_units": "screen"}
-            self._node = Sent(self._scene.add_line_segments(self._name, whole, self._shade, **look))
-        self._node.tell(points=whole, colors=self._shade)
+            self._node = SentProperties(self._scene.add_line_segments(self._name, whole, self._shade, **look))
+        self._node.set(points=whole, colors=self._shade)
 
 
 def joined(*parts: Coloured) -> Coloured:
-    """Return all of them as one."""
+    """Return all segments in one pair of arrays."""
     points = np.concatenate([np.asarray(points, float).reshape(-1, 2, 3) for points, _ in parts])
     return points, np.concatenate([np.asarray(colours, np.uint8).reshape(-1, 3) for _, colours in parts])
 
 
 def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> Coloured:
-    """Return lines of sight: to what is seen; dotted to what was missed; of what is hidden up to what hides it."""
+    """Return lines of sight: solid to visible targets, dotted to missed ones, and to hidden ones up to the occluder."""
     eye, target = stage.eyes(frame), stage.targets(frame)
     chosen = np.ones(stage.vehicles, bool)
     if look.only is not None:
@@ -88,7 +88,7 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
 
 
 def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Return where the ways from start to end (K, 3) enter a box first, not one that they begin in; or the end."""
+    """Return where paths from start to end (K, 3) first enter a box in which they do not start; else their ends."""
     if not len(start) or not boxes:
         return np.asarray(end)
     enter, leave = crossings(start, end - start, boxes)
@@ -120,7 +120,7 @@ class Trails:
     """Where vehicles have been in the last seconds."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
+        """Start without points."""
         self._points: deque[np.ndarray] = deque(maxlen=_TRAIL)
         self._times: deque[float] = deque(maxlen=_TRAIL)
         self._drawn: Coloured = np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
@@ -179,7 +179,7 @@ class Pulses:
         self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
     def place(self, frame: Frame, time: float, shown: bool) -> None:
-        """Let those fly whose message arrived since the last frame, and the others on."""
+        """Start the beads of messages that arrived since the last frame, and move the other beads on."""
         arrived = frame.inbox_tick.ravel()
         if time < self._time:
             self._began[:], self._last[:] = -np.inf, arrived
@@ -202,52 +202,54 @@ _MOST_NAMES = 24  # landmarks; more would hide one another
 
 
 class Labels:
-    """Texts that stand over what they name."""
+    """Names over vehicles, estimates and landmarks."""
 
     def __init__(self, scene: Any, stage: Stage) -> None:
         """Add them."""
         self._stage, self._said = stage, -np.inf
         look: dict[str, Any] = {"anchor": "bottom-center", "depth_test": False}
         marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
-        self._cars = [Sent(scene.add_label(f"{ROOT}/names/{mark}", mark, **look)) for mark in marks]
+        self._cars = [SentProperties(scene.add_label(f"{ROOT}/names/{mark}", mark, **look)) for mark in marks]
         self._marks = marks
         self._marked, self._marks_at = False, np.zeros((0, 3))
         above = stage.bodies[0][:, 2] + 0.012 * stage.side
         self._above = np.column_stack([np.zeros((len(above), 2)), above])
         small = {**look, "font_screen_scale": 0.85}
-        believed = f"{ROOT}/names/estimates"
-        self._believed = [Sent(scene.add_label(f"{believed}/{mark}", f"{mark} estimated", **small)) for mark in marks]
+        estimated = f"{ROOT}/names/estimates"
+        self._estimates = [
+            SentProperties(scene.add_label(f"{estimated}/{mark}", f"{mark} estimated", **small)) for mark in marks
+        ]
         self._landmarks = {
-            i: Sent(scene.add_label(f"{ROOT}/names/landmarks/{i}", stage.short_name(i), **small))
+            i: SentProperties(scene.add_label(f"{ROOT}/names/landmarks/{i}", stage.short_name(i), **small))
             for i, landmark in enumerate(stage.scenario.landmarks)
             if landmark.group is None and stage.landmarks <= _MOST_NAMES
         }
 
     def place(self, frame: Frame, time: float, shown: bool, turn: int | None = None) -> None:
-        """Put them over what they name; with a `turn` those of some vehicles, as in `Picture.show`."""
+        """Move the names; with a `turn` those of some vehicles, as in `Picture.show`."""
         again = not 0.0 <= time - self._said < _OFTEN - 1e-9
         self._said = time if again else self._said
         if again and shown:
             for i, label in enumerate(self._cars):
-                label.tell(text=self._text(frame, i))
+                label.set(text=self._text(frame, i))
         mine = in_turn(turn, self._stage.vehicles)
         places = frame.vehicle_position + self._above
         places[:, 2] += _RAISED * self._stage.side * levels(places[:, :2], _CLOSE * self._stage.side)
         for label, place in zip(self._cars[mine], places[mine], strict=True):
             _put(label, place, shown)
-        self._place_believed(frame, shown, mine)
+        self._place_estimates(frame, shown, mine)
         places = self._stage.targets(frame)[: self._stage.landmarks]
         if shown != self._marked or not np.array_equal(places, self._marks_at, equal_nan=True):
             self._marked, self._marks_at = shown, places
             for i, label in self._landmarks.items():
                 _put(label, places[i] + [0.0, 0.0, 0.015 * self._stage.side], shown)
 
-    def _place_believed(self, frame: Frame, shown: bool, mine: slice) -> None:
+    def _place_estimates(self, frame: Frame, shown: bool, mine: slice) -> None:
         """Name the estimates that are not where their vehicles are."""
         places = (frame.estimate_position + self._above)[mine]
         inside = np.all((places[:, :2] > self._stage.low) & (places[:, :2] < self._stage.high), axis=-1)
         named = inside & (frame.position_error[mine] > _APART * self._stage.side)
-        for label, place, there in zip(self._believed[mine], places, named.tolist(), strict=True):
+        for label, place, there in zip(self._estimates[mine], places, named.tolist(), strict=True):
             _put(label, place, shown and there)
 
     def _text(self, frame: Frame, vehicle: int) -> str:
@@ -261,7 +263,7 @@ class Labels:
 def levels(points: np.ndarray, close: float) -> np.ndarray:
     """Return (N,) on which level the name of each point (N, 2) stands: no two of one level are close to each other.
 
-    Of two that are close the one farther to the north has the higher level: the first camera looks from the south.
+    Of two close points the northern one has the higher level: the first camera looks from the south.
     """
     near = np.linalg.norm(points[:, None] - points, axis=-1) < close
     level, done = np.zeros(len(points), int), np.zeros(len(points), bool)
@@ -272,12 +274,12 @@ def levels(points: np.ndarray, close: float) -> np.ndarray:
     return level
 
 
-def _put(label: Sent, place: np.ndarray, shown: bool) -> None:
+def _put(label: SentProperties, place: np.ndarray, shown: bool) -> None:
     """Put a label to a place (3,), NaN: nowhere."""
     shown = shown and not np.isnan(place[0])
-    label.tell(visible=shown)
+    label.set(visible=shown)
     if shown:
-        label.tell(position=tuple(place.round(3).tolist()))
+        label.set(position=tuple(place.round(3).tolist()))
 
 
 FIELD_OF_VIEW = 0.72
@@ -289,7 +291,7 @@ class Picture:
     """Draws frames of one stage into viser's scene."""
 
     def __init__(self, scene: Any, stage: Stage, source: Source, look: Look) -> None:
-        """Draw what stands still, and add what moves."""
+        """Draw the static part, and add the moving parts."""
         self.stage, self.look = stage, look
         self._scene, self._colours = scene, vehicle_colours(stage.vehicles)
         self.ground = Ground(scene, stage)
@@ -301,7 +303,7 @@ class Picture:
         self._errors = Segments(scene, f"{ROOT}/errors", 1.5)
         self._ways = Segments(scene, f"{ROOT}/ways", 2.0)
         self._trail = Segments(scene, f"{ROOT}/trails", 3.0)
-        self._views: list[Sent] = []
+        self._views: list[SentProperties] = []
         self._drawn_trail: Coloured | None = None
         self._trails_shown = True
         self._drawn_ways: tuple[bytes, ...] = ()
@@ -311,9 +313,9 @@ class Picture:
         """Show a frame.
 
         Args:
-            frame: what is shown.
-            turn: its number where another one follows at once: then a part of the names and fields of view waits
-                for it, as `in_turn` says.
+            frame: to show.
+            turn: number of the frame where another frame follows at once: then some names and fields of view wait
+                for that frame, see `in_turn`.
         """
         time, look, nothing = float(frame.tick) / self.stage.scenario.rates.camera, self.look, np.zeros((0, 2, 3))
         none = nothing, np.zeros((0, 3), np.uint8)
@@ -341,7 +343,7 @@ class Picture:
         views = self.stage.fields_of_view(frame, _VIEW_RAYS, mine) if self.look.views else None
         if views is None:
             for view in self._views:
-                view.tell(visible=False)
+                view.set(visible=False)
             return
         views[..., 2] = (self.ground.z + 2e-4 * self.stage.side * np.arange(1, self.stage.vehicles + 1))[mine, None]
         corners = fine(views, self._step)
@@ -349,9 +351,9 @@ class Picture:
             self._add_views(corners)
         there = np.isfinite(corners).all(axis=(1, 2)).tolist()
         for i, view in enumerate(self._views[mine]):
-            view.tell(visible=there[i])
+            view.set(visible=there[i])
             if there[i]:
-                view.tell(vertices=corners[i])
+                view.set(vertices=corners[i])
 
     def _add_views(self, corners: np.ndarray) -> None:
         n = np.arange(1, corners.shape[1] - 1)
@@ -359,7 +361,7 @@ class Picture:
         flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False, "side": "double", "opacity": 0.16}
         for i, colour in enumerate(self._colours.tolist()):
             mesh = self._scene.add_mesh_simple(f"{ROOT}/views/{i}", corners[i], faces, color=tuple(colour), **flat)
-            self._views.append(Sent(mesh))
+            self._views.append(SentProperties(mesh))
 
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:
@@ -372,7 +374,7 @@ def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndar
 
 
 def useful_magnification(sigma: np.ndarray, side: float) -> float:
-    """Return by how much ellipsoids are to be magnified, 1, 10 or 100, that one of semi-axes (N,) can be seen."""
+    """Return the magnification, 1, 10 or 100, at which an ellipsoid of semi-axes (N,), m, can be seen."""
     good = sigma[np.isfinite(sigma)]
     middle = float(np.median(good)) if len(good) else side
     return next((factor for factor in (1.0, 10.0) if factor * middle > 0.01 * side), 100.0)
