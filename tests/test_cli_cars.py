@@ -13,7 +13,7 @@ from coopenv.cars.fake.car import fault_topic
 from coopenv.cars.fake.fleet import fakes, free_port
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
-from coopenv.cli.svea.run import STOPPED
+from coopenv.cli.svea import STOPPED
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start, wait_until
 
 OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"

@@ -21,8 +21,7 @@ HEAVY = {"warp", "scipy", "numba", "matplotlib", "PIL", "pandas", "mcap", "torch
 LIGHT = {f"base.{name}" for name in ("errors", "installation", "interrupts", "lazy", "seeds")}
 LIGHT |= {"base", "api", "api.registration"}
 COMMANDS = Path(coopenv.__file__).parent / "cli"
-LIGHT |= {"cli", "cli.svea", *(f"cli.{path.stem}" for path in COMMANDS.glob("[a-z]*.py"))}
-LIGHT |= {f"cli.svea.{path.stem}" for path in (COMMANDS / "svea").glob("[a-z]*.py")}
+LIGHT |= {"cli", *(f"cli.{path.stem}" for path in COMMANDS.glob("[a-z]*.py"))}
 
 
 def modules_after(statement: str) -> set[str]:

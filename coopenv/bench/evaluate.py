@@ -1,6 +1,5 @@
 """`coopenv evaluate`: from what the user asked for to tables and files."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,38 +25,40 @@ WIDTH = 100
 
 
 class Request(NamedTuple):
-    """What the command line asks for."""
+    """An evaluation, and where its results go."""
 
     environment: str
     agents: Sequence[str]
     worlds: int
     block: int
-    assignments: Sequence[str]
     overrides: Mapping[str, Any]
     ideal: bool
+    command: str
+    """The command line that gives the same figures again."""
+    out: Path | None = None
+    """Folder of the files; None: no files."""
+    figures: str | None = None
+    """Format of the figures; None: no figures and no replay."""
+    film: bool = False
+    force: bool = False
+    """Whether an earlier evaluation in the folder is replaced."""
+    width: str | None = None
+    """Column of `coopenv.viz.figures` that figures are drawn for; None: a page's."""
 
     @property
     def name(self) -> str:
-        """What the environment is called."""
+        """Name of the environment."""
         return Path(self.environment).stem
 
     def entrants(self) -> list[Entrant]:
         """Return the drivers, built."""
         return enter(self.environment, self.name, self.overrides, self.agents, self.ideal)
 
-    def command(self) -> str:
-        """Return the command that gives the same figures again."""
-        words = ["coopenv", "evaluate", self.environment]
-        words += ["--agents", ",".join(self.agents)] if self.agents else []
-        words += ["--worlds", str(self.worlds), "--seed-block", str(self.block)]
-        words += [word for assignment in self.assignments for word in ("--set", assignment)]
-        return shlex.join([*words, *(["--ideal"] if self.ideal else [])])
-
 
 def document(request: Request, evaluation: Evaluation) -> dict[str, Any]:
-    """Return what `evaluation.json` holds."""
+    """Return the content of `evaluation.json`."""
     return {
-        "command": request.command(),
+        "command": request.command,
         "coopenv": version(),
         "versions": versions("numpy", "warp-lang"),
         "environment": evaluation.environment,
@@ -83,36 +84,25 @@ def run(request: Request, entrants: Sequence[Entrant], log: Console) -> Evaluati
         )
 
 
-def write(
-    folder: Path,
-    request: Request,
-    entrants: Sequence[Entrant],
-    figures: str | None,
-    film: bool,
-    force: bool,
-    log: Console,
-    width: str | None = None,
-) -> Evaluation:
+def write(folder: Path, request: Request, entrants: Sequence[Entrant], log: Console) -> Evaluation:
     """Evaluate and write everything to a folder, which is replaced as a whole.
 
-    `width` is a column of `coopenv.viz.figures` that figures are drawn for; None: a page's.
-
     Raises:
-        OutputError: it holds an earlier evaluation and `force` is false, or it cannot be written.
+        OutputError: it holds an earlier evaluation that is not to be replaced, or it cannot be written.
     """
-    if (folder / JSON_FILE).exists() and not force:
+    if (folder / JSON_FILE).exists() and not request.force:
         raise OutputError(f"{folder / JSON_FILE}: exists already; --force replaces it")
     earlier = [path.name for path in folder.glob("replay_*.html")]
     with replacing_folder(folder, [*result_names(), *earlier]) as new:
         evaluation = run(request, entrants, log)
         replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
-        if figures is not None:
+        if request.figures is not None:
             from coopenv.bench.evaluate_figures import save_figures, write_replays
 
             with Progress(log, "drawing figures"):
-                save_figures(evaluation, new, figures, width)
+                save_figures(evaluation, new, request.figures, request.width)
             write_replays(evaluation, new, log)
-        if film:
+        if request.film:
             from coopenv.bench.evaluate_figures import write_film
 
             write_film(evaluation, new, log)

@@ -1,12 +1,16 @@
 """`coopenv bench ...`: measure."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
+
+if TYPE_CHECKING:
+    from coopenv.bench.observers.comparison import Plan
 
 bench = typer.Typer(help="Compare observers, study seeds.", no_args_is_help=True)
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
@@ -38,9 +42,11 @@ def bench_seeds(
     out.print(f"Steady: after {start:g} s. Settled: below {SETTLED.text} until the end.")
 
 
-@bench.command("observers")
-def bench_observers(
-    source: options.Source,
+@dataclass(frozen=True, kw_only=True)
+class ObserverOptions:
+    """Options of `coopenv bench observers`."""
+
+    source: options.Source
     observers: Annotated[
         str | None,
         typer.Option(
@@ -48,13 +54,13 @@ def bench_observers(
             "(default: all that suit).",
             **options.OBSERVERS,
         ),
-    ] = None,
+    ] = None
     variants: Annotated[
         str | None,
         typer.Option(
             help="Names of variants with commas between, or `all`: faults of an environment, what recorded robots see."
         ),
-    ] = None,
+    ] = None
     faults: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,21 +69,21 @@ def bench_observers(
             help="One more variant, with a fault that has parameters (see `coopenv list variants`): gyro_bias=0.01 "
             "or lie=drift:0.05@vehicle_2,from=10; several vehicles with : between, several faults with +. Repeatable.",
         ),
-    ] = None,
+    ] = None
     policy: Annotated[
         str | None,
         typer.Option("--policy", help="Agent or policy that drives in the records.", **options.POLICY),
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
-    first: First = 0,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
-    engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local",
-    address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None,
-    data: options.DataFolder = None,
-    topics: options.TopicMap = None,
-    basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
-    overrides: options.Overrides = None,
-    steady_from: options.SteadyFrom = None,
+    ] = None
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5
+    first: First = 0
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None
+    engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local"
+    address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None
+    data: options.DataFolder = None
+    topics: options.TopicMap = None
+    basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
+    overrides: options.Overrides = None
+    steady_from: options.SteadyFrom = None
     windows: Annotated[
         str | None,
         typer.Option(
@@ -85,48 +91,78 @@ def bench_observers(
             "(default: 5,10,20,35; of recorded robots none).",
             show_default=False,
         ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
+    ] = None
+    out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None
     figures: Annotated[
         str | None, typer.Option("--figures", help="Also write figures as files to the folder: png, pdf or svg.")
-    ] = None,
-    width: options.FigureWidth = None,
-    open_report: Annotated[bool, typer.Option("--open", help="Show the report when it is done; needs --out.")] = False,
-    as_json: options.AsJson = False,
-) -> None:
+    ] = None
+    width: options.FigureWidth = None
+    open_report: Annotated[bool, typer.Option("--open", help="Show the report when it is done; needs --out.")] = False
+    as_json: options.AsJson = False
+
+    @property
+    def names(self) -> list[str] | None:
+        """The observers that were given; None: all that suit."""
+        return [word.strip() for word in self.observers.split(",")] if self.observers else None
+
+    def plan(self) -> "Plan":
+        """Return the comparison, everything in it checked."""
+        from coopenv.bench.observers.comparison import Plan
+
+        return Plan.of(
+            self.names,
+            self.source,
+            range(self.first, self.first + self.seeds),
+            variants=self.variants,
+            overrides=options.parse_overrides(self.overrides),
+            steady_from=self.steady_from,
+            windows=self.windows,
+            data=self.data,
+            topics=self.topics,
+            faults=self.faults or (),
+            policy=self.policy,
+        )
+
+    def command_of(self, plan: "Plan") -> str:
+        """Return the command line that gives the same tables again, with all names that a plan has chosen."""
+        added = {variant.name for variant in plan.source.added}
+        named = [name for name in plan.variants if name not in added]
+        faults = [name for name in plan.variants if name in added]
+        observers = ",".join(dict.fromkeys(self.names or plan.observers))
+        chosen = replace(self, observers=observers, variants=",".join(named), faults=faults)
+        return options.command_text("bench observers", chosen, OF_THE_OUTPUT)
+
+
+OF_THE_OUTPUT = ("jobs", "engine", "address", "out", "figures", "width", "open_report", "as_json")
+"""Options of `bench observers` that do not change what is measured."""
+
+
+@bench.command("observers")
+@options.command
+def bench_observers(given: ObserverOptions) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import find_executor
-    from coopenv.bench.observers.command import REPORT_FILE, perform, request_of
+    from coopenv.bench.observers.basin import check_source
+    from coopenv.bench.observers.command import REPORT_FILE, Request, perform
     from coopenv.bench.observers.tables import WIDE
 
-    if open_report and out is None:
+    if given.open_report and given.out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
-    if width is not None and figures is None:
-        raise CoopenvError(f"--width {width.value}: is for files of figures, --figures pdf")
+    if given.width is not None and given.figures is None:
+        raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
     printed, log = options.console(), options.console(stderr=True)
     if not printed.is_terminal:
         printed.width = max(printed.width, WIDE)
     with options.warned():
-        changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
-        request = request_of(
-            source,
-            observers,
-            variants,
-            numbers,
-            steady_from,
-            basin,
-            data,
-            changes,
-            overrides or (),
-            topics,
-            faults or (),
-            policy,
-            windows,
-        )
-        request.plan.source.check()
-    perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json, width and width.value)
-    if open_report and out is not None:
-        options.show(out / REPORT_FILE)
+        plan = given.plan()
+        if given.basin:
+            check_source(plan.source)
+        plan.source.check()
+    width = given.width and given.width.value
+    request = Request(plan, given.command_of(plan), given.basin, given.out, given.figures, width, given.as_json)
+    perform(request, find_executor(given.engine, given.jobs, given.address), printed, log)
+    if given.open_report and given.out is not None:
+        options.show(given.out / REPORT_FILE)
 
 
 @bench.command("learning")

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import os
+import shlex
 import sys
 import tomllib
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
+from dataclasses import dataclass, fields
+from enum import Enum, StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import typer
 
@@ -239,6 +242,81 @@ SteadyFrom = Annotated[
 ]
 
 
+Options = TypeVar("Options")
+
+
+def command(function: Callable[[Options], None]) -> Callable[..., None]:
+    """Return a command whose parameters are the fields of a record of options, the only argument of the function.
+
+    In the help a record's own options come before those that it inherits.
+    """
+    [record] = [kind for name, kind in get_type_hints(function).items() if name != "return"]
+    kinds = get_type_hints(record, include_extras=True)
+    own_first = sorted(
+        inspect.signature(record).parameters.values(), key=lambda p: p.name not in vars(record)["__annotations__"]
+    )
+
+    def run(**given: Any) -> None:
+        function(record(**given))
+
+    run.__name__, run.__doc__ = function.__name__, function.__doc__
+    run.__signature__ = inspect.Signature([p.replace(annotation=kinds[p.name]) for p in own_first])  # type: ignore[attr-defined]
+    return run
+
+
+def command_text(words: str, given: Any, leave_out: Collection[str] = ()) -> str:
+    """Return the command line that gives a record of options again, for a shell.
+
+    Options that are 0, off or absent by default are left out; other defaults are written, because they may change.
+
+    Args:
+        words: the command, such as "bench observers".
+        given: the record, a dataclass.
+        leave_out: names of fields that do not change the result.
+    """
+    arguments, named = [], []
+    kinds = get_type_hints(type(given), include_extras=True)
+    for field in fields(given):
+        value = getattr(given, field.name)
+        if field.name in leave_out or (not value and value == field.default):
+            continue
+        option = next(part for part in kinds[field.name].__metadata__ if hasattr(part, "param_decls"))
+        texts = [
+            str(one.value if isinstance(one, Enum) else one) for one in (value if isinstance(value, list) else [value])
+        ]
+        if isinstance(option, typer.models.ArgumentInfo):
+            arguments += texts
+            continue
+        name = next((w for w in (option.default, *(option.param_decls or ())) if str(w).startswith("--")), "")
+        name = name.partition("/")[0] or f"--{field.name.replace('_', '-')}"
+        for text in texts:
+            named += [name] if value is True else [name.replace("--", "--no-", 1)] if value is False else [name, text]
+    return shlex.join(["coopenv", *words.split(), *arguments, *named])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """What is simulated, replayed or read."""
+
+    environment: Source
+    overrides: Overrides = None
+    data: DataFolder = None
+    variant: Variant = None
+    topics: TopicMap = None
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The overrides of the scenario, dotted key to value."""
+        return parse_overrides(self.overrides)
+
+    def open(self) -> Backend:
+        """Return where the ticks come from, warnings printed as one line each."""
+        from coopenv.backends.sources import open_backend
+
+        with warned():
+            return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
+
+
 def console(stderr: bool = False) -> Console:
     """Return a console that prints scenario texts as they are."""
     from rich.console import Console
@@ -286,16 +364,6 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
 
     with warned():
         return open_simulation(environment, overrides)
-
-
-def open_source(
-    environment: str, overrides: dict[str, Any], data: Path | None, variant: str | None, topics: Path | None = None
-) -> Backend:
-    """Return where the ticks of an environment or a recording come from, warnings printed as one line each."""
-    from coopenv.backends.sources import open_backend
-
-    with warned():
-        return open_backend(environment, None, overrides, data, variant, topics=topics)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """`coopenv list | describe | scene | schema`: what there is."""
 
 import sys
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -45,34 +46,35 @@ def list_command(
         options.console().print(summary.list_table(rows, summary.COLUMNS[kind]))
 
 
-def describe(
-    environment: options.Source,
-    overrides: options.Overrides = None,
-    everything: Annotated[bool, typer.Option("--all", help="Also every vehicle, setting and field.")] = False,
-    as_json: options.AsJson = False,
-    data: options.DataFolder = None,
-    variant: options.Variant = None,
-    topics: options.TopicMap = None,
-) -> None:
-    """Say what an environment is: vehicles, sensors, observer."""
+@dataclass(frozen=True, kw_only=True)
+class DescribeOptions(options.SourceOptions):
+    """Options of `coopenv describe`."""
+
+    everything: Annotated[bool, typer.Option("--all", help="Also every vehicle, setting and field.")] = False
+    as_json: options.AsJson = False
+
+
+@options.command
+def describe(given: DescribeOptions) -> None:
+    """Print a summary of an environment: vehicles, sensors, observer."""
     from coopenv.backends.sources import is_recorded, simulation_of
     from coopenv.runs.summary import describe_scenario, document, summary
 
-    name, changes = Path(environment).stem, options.parse_overrides(overrides)
-    if is_recorded(environment) or any(option is not None for option in (data, variant, topics)):
-        backend = options.open_source(environment, changes, data, variant, topics)
+    name = Path(given.environment).stem
+    if is_recorded(given.environment) or any((given.data, given.variant, given.topics)):
+        backend = given.open()
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:
-        scenario, recorded = options.load(environment, changes), False
+        scenario, recorded = options.load(given.environment, given.changes), False
         if scenario.backend != "simulated":  # the roads of highway-env are drawn by highway-env itself
             scenario = simulation_of(scenario).scenario
-    if as_json:
+    if given.as_json:
         options.print_json(document(name, scenario))
         return
     out = options.console()
-    for part in describe_scenario(scenario) if everything else summary(name, scenario, recorded):
+    for part in describe_scenario(scenario) if given.everything else summary(name, scenario, recorded):
         out.print(part)
-    if not everything:
+    if not given.everything:
         out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
 
 

@@ -1,5 +1,6 @@
 """`coopenv dataset`, `train` and `evaluate`."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,27 +17,73 @@ Agent = Annotated[
 Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
 
 
-def train(
-    environment: options.Environment,
-    agent: Agent = None,
-    settings: Settings = None,
-    arm: Annotated[str | None, typer.Option(help="Table under `arms` of the settings that changes them.")] = None,
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Options of `coopenv train`."""
+
+    environment: options.Environment
+    agent: Agent = None
+    settings: Settings = None
+    arm: Annotated[str | None, typer.Option(help="Table under `arms` of the settings that changes them.")] = None
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of worlds, weights and exploration (default: 0).")
-    ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Decisions of vehicles to learn from.")] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.0, help="Minutes to learn, instead of --steps.")] = None,
-    overrides: options.Overrides = None,
-    out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None,
+    ] = None
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions of vehicles to learn from.")] = None
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Minutes to learn, instead of --steps.")] = None
+    overrides: options.Overrides = None
+    out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from the checkpoint in the folder; options are those it began with.")
-    ] = False,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the simulation (default: by cores).")] = None,
-    logs: Annotated[Path | None, typer.Option(help="Folder for TensorBoard (default: tensorboard/ in --out).")] = None,
-    onnx: Onnx = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an agent that is in the folder.")] = False,
-    as_json: options.AsJson = False,
-) -> None:
+    ] = False
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the simulation (default: by cores).")] = None
+    logs: Annotated[Path | None, typer.Option(help="Folder for TensorBoard (default: tensorboard/ in --out).")] = None
+    onnx: Onnx = False
+    force: Annotated[bool, typer.Option("--force", help="Replace an agent that is in the folder.")] = False
+    as_json: options.AsJson = False
+
+    def plan(self, folder: Path) -> Any:
+        """Return what is learnt from what.
+
+        Raises:
+            CoopenvError: a setting is not valid, or an option stands beside --resume that the folder decides.
+        """
+        from coopenv.training.command import resumed_plan
+        from coopenv.training.settings import Plan
+
+        if not self.resume:
+            return Plan(self.environment, self._settings(), self.seed or 0, self.arm, self._changes)
+        decided = {"--set": self.overrides}
+        decided |= {
+            f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
+        }
+        if named := [name for name, value in decided.items() if value is not None]:
+            raise CoopenvError(f"--resume goes on with what the training began with: leave out {', '.join(named)}")
+        plan = resumed_plan(folder)
+        if plan.environment != self.environment:
+            raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {self.environment}")
+        return plan
+
+    @property
+    def _changes(self) -> dict[str, Any]:
+        return options.parse_overrides(self.overrides)
+
+    def _settings(self) -> Any:
+        from coopenv.policies import find_agent
+        from coopenv.training.settings import SETTINGS_FILE, read_settings
+
+        path = self.settings
+        if self.agent is not None:
+            if path is not None:
+                raise CoopenvError("--agent and --settings: give one of them")
+            folder = find_agent(self.agent).folder
+            if folder is None or not (folder / SETTINGS_FILE).is_file():
+                raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
+            path = folder / SETTINGS_FILE
+        return read_settings(path, self.arm, Path(self.environment).stem, steps=self.steps, minutes=self.minutes)
+
+
+@options.command
+def train(given: TrainOptions) -> None:
     """Train one policy for all vehicles with PPO, and write it as an agent.
 
     The agent drives with `coopenv run ENV --policy DIR`. After an interruption go on with --resume.
@@ -44,75 +91,43 @@ def train(
     from dataclasses import asdict
 
     from coopenv.runs.console import Progress
-    from coopenv.training.settings import Plan
 
     try:
-        from coopenv.training.command import Reports, resumed_plan
+        from coopenv.training.command import Reports
         from coopenv.training.command import train as perform
     except ImportError as error:
         needs = "torch, stable-baselines3, tensorboard and tomlkit: pip install '.[train]'"
         raise CoopenvError(f"coopenv train needs {needs} ({error})") from None
-    folder = out or Path("out", "train", Path(environment).stem)
-    if resume:
-        given: dict[str, Any] = {
-            "--agent": agent,
-            "--settings": settings,
-            "--arm": arm,
-            "--seed": seed,
-            "--steps": steps,
-        }
-        given |= {"--minutes": minutes, "--set": overrides}
-        if named := [name for name, value in given.items() if value is not None]:
-            raise CoopenvError(f"--resume goes on with what the training began with: leave out {', '.join(named)}")
-        plan = resumed_plan(folder)
-        if plan.environment != environment:
-            raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {environment}")
-    else:
-        chosen = _settings(environment, agent, settings, arm, steps, minutes)
-        plan = Plan(environment, chosen, seed or 0, arm, options.parse_overrides(overrides))
-    log = options.console(stderr=True)
+    folder = given.out or Path("out", "train", Path(given.environment).stem)
+    plan, log = given.plan(folder), options.console(stderr=True)
     with options.warned():
-        options.load(environment, plan.all_overrides)
+        options.load(given.environment, plan.all_overrides)
 
     def judged(at: int, results: list[Any]) -> None:
-        log.print(f"{at:>10,} steps, held-out maps: {_told(results)}", soft_wrap=True)
+        log.print(f"{at:>10,} steps, held-out maps: {_figures(results)}", soft_wrap=True)
 
     with Progress(log, "starting", total=1.0) as progress:
         reports = Reports(
             lambda status: progress.update(status.share, status.line), judged, lambda line: progress.update(0.0, line)
         )
         results = perform(
-            plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, force=force, reports=reports
+            plan,
+            folder,
+            resume=given.resume,
+            threads=given.threads,
+            onnx=given.onnx,
+            logs=given.logs,
+            force=given.force,
+            reports=reports,
         )
-    if as_json:
+    if given.as_json:
         options.print_json({"agent": str(folder), "results": [asdict(result) for result in results]})
         return
-    options.console().print(f"Agent in {folder}: coopenv run {environment} --policy {folder}", soft_wrap=True)
+    options.console().print(f"Agent in {folder}: coopenv run {given.environment} --policy {folder}", soft_wrap=True)
 
 
-def _settings(
-    environment: str,
-    agent: str | None,
-    path: Path | None,
-    arm: str | None,
-    steps: int | None,
-    minutes: float | None,
-) -> Any:
-    from coopenv.policies import find_agent
-    from coopenv.training.settings import SETTINGS_FILE, read_settings
-
-    if agent is not None:
-        if path is not None:
-            raise CoopenvError("--agent and --settings: give one of them")
-        folder = find_agent(agent).folder
-        if folder is None or not (folder / SETTINGS_FILE).is_file():
-            raise CoopenvError(f"--agent {agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
-        path = folder / SETTINGS_FILE
-    return read_settings(path, arm, Path(environment).stem, steps=steps, minutes=minutes)
-
-
-def _told(results: list[Any]) -> str:
-    """Return the most telling figures on one line, each with its interval."""
+def _figures(results: list[Any]) -> str:
+    """Return the main figures on one line, each with its interval."""
     figures = {result.metric: result for result in results}
     percent = {"arrival_rate": "arrived", "collision_rate": "hit"}
     parts = [f"{word} {_interval(figures[name], 100, 0)} %" for name, word in percent.items()]
@@ -126,8 +141,11 @@ def _interval(figure: Any, factor: float, digits: int) -> str:
     return f"{mean} [{low}, {high}]"
 
 
-def evaluate(
-    environment: options.Environment,
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """Options of `coopenv evaluate`."""
+
+    environment: options.Environment
     agents: Annotated[
         str | None,
         typer.Option(
@@ -135,49 +153,65 @@ def evaluate(
             "agent of agents/ that was made for ENV).",
             **options.AGENTS,
         ),
-    ] = None,
+    ] = None
     worlds: Annotated[
         int, typer.Option(min=2, max=options.MOST_WORLDS, help="Number of held-out worlds, the same for every agent.")
-    ] = 256,
-    seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0,
-    overrides: options.Overrides = None,
+    ] = 256
+    seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0
+    overrides: options.Overrides = None
     ideal: Annotated[
         bool, typer.Option("--ideal", help="Also let route_follower drive where everybody sees everything.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None,
-    figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png,
-    width: options.FigureWidth = None,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
+    ] = False
+    out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None
+    figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
+    width: options.FigureWidth = None
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False
     film: Annotated[
         bool, typer.Option("--film", help="Also write a film of the agents in one of the worlds, side by side.")
-    ] = False,
+    ] = False
     write_card: Annotated[
         bool, typer.Option("--write-card", help="Write the results to card.json and card.md in the agents' folders.")
-    ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an evaluation that is there.")] = False,
-    as_json: options.AsJson = False,
-) -> None:
+    ] = False
+    force: Annotated[bool, typer.Option("--force", help="Replace an evaluation that is there.")] = False
+    as_json: options.AsJson = False
+
+
+OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", "force", "as_json")
+"""Options of `evaluate` that do not change what is measured."""
+
+
+@options.command
+def evaluate(given: EvaluateOptions) -> None:
     """Compare agents on held-out worlds: arrivals, collisions, time, errors."""
     from coopenv.bench import cards, evaluate
 
-    if film and out is None:
+    environment, agents, out, log = given.environment, given.agents, given.out, options.console(stderr=True)
+    if given.film and out is None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
     names = [word.strip() for word in agents.split(",") if word.strip()] if agents else []
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
-    changes, log = options.parse_overrides(overrides), options.console(stderr=True)
-    request = evaluate.Request(environment, names, worlds, seed_block, tuple(overrides or ()), changes, ideal)
+    request = evaluate.Request(
+        environment,
+        names,
+        given.worlds,
+        given.seed_block,
+        options.parse_overrides(given.overrides),
+        given.ideal,
+        options.command_text("evaluate", given, OF_THE_OUTPUT),
+        out,
+        None if given.no_figures else given.figures.value,
+        given.film,
+        given.force,
+        given.width and given.width.value,
+    )
     with options.warned():
         entrants = request.entrants()
-    if write_card:
+    if given.write_card:
         cards.check(entrants)
-    if out is None:
-        result = evaluate.run(request, entrants, log)
-    else:
-        form = None if no_figures else figures.value
-        result = evaluate.write(out, request, entrants, form, film, force, log, width and width.value)
-    written = cards.write(result, request.command()) if write_card else []
-    if as_json:
+    result = evaluate.run(request, entrants, log) if out is None else evaluate.write(out, request, entrants, log)
+    written = cards.write(result, request.command) if given.write_card else []
+    if given.as_json:
         options.print_json(evaluate.document(request, result))
         return
     printed = options.console()
@@ -191,8 +225,11 @@ def evaluate(
         printed.print(f"Card: {path}", soft_wrap=True)
 
 
-def dataset(
-    environment: options.Environment,
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions:
+    """Options of `coopenv dataset`."""
+
+    environment: options.Environment
     policy: Annotated[
         str,
         typer.Option(
@@ -200,41 +237,41 @@ def dataset(
             help="Who drives: random, the name of an agent, its folder, or mine.py:Mine.",
             **options.POLICY,
         ),
-    ] = "route_follower",
+    ] = "route_follower"
     worlds: Annotated[
         int, typer.Option(min=1, max=options.MOST_WORLDS, help="Worlds; an episode of each of their vehicles is kept.")
-    ] = 64,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the worlds.")] = 0,
-    overrides: options.Overrides = None,
+    ] = 64
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the worlds.")] = 0
+    overrides: options.Overrides = None
     identity: Annotated[
         str | None, typer.Option("--id", help="NAMESPACE/NAME-v0 of the dataset (default: coopenv/ENV/POLICY-v0).")
-    ] = None,
+    ] = None
     out: Annotated[
         Path | None, typer.Option(help="Folder of datasets (default: MINARI_DATASETS_PATH or ~/.minari/datasets).")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a dataset that is there.")] = False,
-) -> None:
-    """Write episodes of a policy as a Minari dataset, one per vehicle."""
-    import shlex
+    ] = None
+    force: Annotated[bool, typer.Option("--force", help="Replace a dataset that is there.")] = False
 
-    name, log = Path(environment).stem, options.console(stderr=True)
-    scenario = options.load(environment, options.parse_overrides(overrides))
+
+@options.command
+def dataset(given: DatasetOptions) -> None:
+    """Write episodes of a policy as a Minari dataset, one per vehicle."""
+    environment, policy, log = given.environment, given.policy, options.console(stderr=True)
+    name, scenario = Path(environment).stem, options.load(environment, options.parse_overrides(given.overrides))
     from coopenv.base.installation import list_envs
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
     from coopenv.runs.dataset import dataset_place, drive_vehicles, write_dataset
 
-    driver = load_policy(policy, scenario, seed)
+    driver = load_policy(policy, scenario, given.seed)
     own = Path(policy.rpartition(":")[2] or policy).name
-    identity = identity or f"coopenv/{name}/{own}-v0"
-    place = dataset_place(identity, out, force)
+    identity = given.identity or f"coopenv/{name}/{own}-v0"
+    place = dataset_place(identity, given.out, given.force)
     with Progress(log, "driving", total=1.0) as progress, compile_notice(log):
-        episodes = drive_vehicles(scenario, driver, seed, worlds, progress.update)
-    words = ["coopenv", "dataset", environment, "--policy", policy, "--worlds", str(worlds), "--seed", str(seed)]
-    words += [word for assignment in overrides or () for word in ("--set", assignment)]
-    facts = {"algorithm_name": own, "description": f"{scenario.title}: {shlex.join(words)}"}
-    registered = name if environment in list_envs() and not overrides else ""
+        episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
+    again = options.command_text("dataset", given, ("identity", "out", "force"))
+    facts = {"algorithm_name": own, "description": f"{scenario.title}: {again}"}
+    registered = name if environment in list_envs() and not given.overrides else ""
     write_dataset(episodes, scenario, registered, place, identity, facts)
     steps = sum(len(episode.actions) for episode in episodes)
-    told = f"{len(episodes)} episodes, {steps:,} steps"
-    options.console().print(f"{place.parent}: {told}, minari.load_dataset('{identity}')", soft_wrap=True)
+    size = f"{len(episodes)} episodes, {steps:,} steps"
+    options.console().print(f"{place.parent}: {size}, minari.load_dataset('{identity}')", soft_wrap=True)

@@ -1,6 +1,7 @@
 """`coopenv view`, `film`, `watch` and `play`."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +14,7 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coopenv.backends.base import Backend
     from coopenv.runs.reels import Reel
     from coopenv.viz.scene import SceneRecord
 
@@ -44,48 +46,84 @@ SceneSource = Annotated[
 ]
 
 
-def film(
-    source: SceneSource,
-    out: Annotated[Path, typer.Option(help="File to write: .mp4, .gif or .webp.")],
-    agent: Agent = None,
-    observer: ObserverName = None,
-    seed: options.Seed = 0,
-    overrides: options.Overrides = None,
-    speed: Annotated[float, typer.Option(min=0.05, max=100.0, help="Times real time.")] = 1.0,
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """What is shown: an environment, a record, or a saved scene."""
+
+    source: SceneSource
+    agent: Agent = None
+    observer: ObserverName = None
+    seed: options.Seed = 0
+    overrides: options.Overrides = None
+    data: options.DataFolder = None
+    variant: options.Variant = None
+    topics: options.TopicMap = None
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The overrides of the scenario, dotted key to value."""
+        return options.parse_overrides(self.overrides)
+
+    def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
+        """Return where the ticks come from; `more` overrides of the scenario win over those that were given.
+
+        Raises:
+            CoopenvError: there is no such source, or an option is not for it.
+        """
+        from coopenv.runs.scenes import open_source
+
+        changes = {**self.changes, **(more or {})}
+        watching = None if more and "observer.name" in more else self.observer
+        return open_source(self.source, changes, watching, self.data, self.variant, self.topics)
+
+    def saved(self) -> "SceneRecord | None":
+        """Return the scene of an earlier run; None: the source is no such run.
+
+        Raises:
+            CoopenvError: an option is only for an episode that runs now.
+        """
+        from coopenv.runs.scenes import saved_scene
+
+        found = saved_scene(self.source)
+        given = {"agent": self.agent, "observer": self.observer, "set": self.overrides, "seed": self.seed}
+        if found is not None and (unfit := next((name for name, value in given.items() if value), None)):
+            raise CoopenvError(f"--{unfit}: {self.source} has been run; name the environment to run it anew")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(SceneOptions):
+    """Options of `coopenv film`."""
+
+    out: Annotated[Path, typer.Option(help="File to write: .mp4, .gif or .webp.")]
+    speed: Annotated[float, typer.Option(min=0.05, max=100.0, help="Times real time.")] = 1.0
     fps: Annotated[
         float | None, typer.Option(min=1.0, max=50.0, help="Pictures a second (default: 20 for MP4, else 10).")
-    ] = None,
-    width: Annotated[int, typer.Option(min=64, max=896, help="Width of the pictures, pixels.")] = 896,
-    map_only: Annotated[bool, typer.Option("--map-only", help="Leave out the table and the legend.")] = False,
-    data: options.DataFolder = None,
-    variant: options.Variant = None,
-    topics: options.TopicMap = None,
-) -> None:
+    ] = None
+    width: Annotated[int, typer.Option(min=64, max=896, help="Width of the pictures, pixels.")] = 896
+    map_only: Annotated[bool, typer.Option("--map-only", help="Leave out the table and the legend.")] = False
+
+
+@options.command
+def film(given: FilmOptions) -> None:
     """Film an episode from above: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
     from coopenv.runs.live import write_film
     from coopenv.runs.video import film_at
 
-    rate, log = fps or (20.0 if out.suffix == ".mp4" else 10.0), options.console(stderr=True)
+    out, log = given.out, options.console(stderr=True)
+    rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
     film_at(out, rate)
     check_file(out)
-    record = scene(source, agent, observer, seed, options.parse_overrides(overrides), (data, variant, topics), log)
+    record = scene(given, log)
     with Progress(log, f"filming {out.name}", 1.0) as progress:
-        pictures = write_film(record, out, rate, speed, width, not map_only, progress.update)
+        pictures = write_film(record, out, rate, given.speed, given.width, not given.map_only, progress.update)
     size = out.stat().st_size / 1e6
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
 
 
-def scene(
-    source: str,
-    agent: str | None,
-    observer: str | None,
-    seed: int,
-    overrides: dict[str, object],
-    recorded: tuple[Path | None, str | None, Path | None],
-    log: "Console",
-) -> "SceneRecord":
+def scene(given: SceneOptions, log: "Console") -> "SceneRecord":
     """Return the scene of a source: a saved one, or that of an episode that runs now.
 
     Raises:
@@ -93,22 +131,20 @@ def scene(
     """
     from coopenv.api.engine import Engine
     from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.scenes import driver_of, open_source, saved_scene, scene_of, title_of
+    from coopenv.runs.scenes import driver_of, scene_of, title_of
     from coopenv.viz.scene import Source
 
-    saved = saved_scene(source)
+    saved = given.saved()
     if saved is not None:
-        refuse_for_saved(source, agent=agent, observer=observer, set=overrides or None, seed=seed or None)
         return saved
-    data, variant, topics = recorded
     with options.warned():
-        backend = open_source(source, overrides, observer, data, variant, topics)
-    if backend.capabilities.recorded and agent is not None:
-        raise CoopenvError(f"--agent: is for a simulation, {source} is recorded")
-    scenario = backend.scenario
-    policy, name = (None, "") if backend.capabilities.recorded else driver_of(agent, scenario, source, seed)
+        backend = given.open()
+    scenario, recorded = backend.scenario, backend.capabilities.recorded
+    if recorded and given.agent is not None:
+        raise CoopenvError(f"--agent: is for a simulation, {given.source} is recorded")
+    policy, name = (None, "") if recorded else driver_of(given.agent, scenario, given.source, given.seed)
     engine = Engine(scenario, backend=backend)
-    of = Source.of(title_of(source), scenario, policy=name, seed=None if backend.capabilities.recorded else seed)
+    of = Source.of(title_of(given.source), scenario, policy=name, seed=None if recorded else given.seed)
     try:
         with compile_notice(log):
             engine.load()
@@ -118,18 +154,14 @@ def scene(
         engine.close()
 
 
-def refuse_for_saved(source: str, **given: object) -> None:
-    """Refuse options that only an episode that runs has where they are given for one that has been run."""
-    for option, value in given.items():
-        if value is not None:
-            raise CoopenvError(f"--{option}: {source} has been run; name the environment to run it anew")
-
-
 CARS = "svea"
 """The source that stands for the cars of a deployment."""
 
 
-def view(
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(SceneOptions):
+    """Options of `coopenv view`."""
+
     source: Annotated[
         str,
         typer.Argument(
@@ -139,28 +171,63 @@ def view(
             autocompletion=options.environments,
             callback=lambda name: name if name == CARS else options.known_source(name),
         ),
-    ],
-    agent: Agent = None,
-    observer: ObserverName = None,
-    vehicle: Annotated[str | None, typer.Option(help="Vehicle to look at first, vehicle_1 or f1.")] = None,
-    seed: options.Seed = 0,
-    overrides: options.Overrides = None,
+    ]
+    vehicle: Annotated[str | None, typer.Option(help="Vehicle to look at first, vehicle_1 or f1.")] = None
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Port to listen on (default: 8080, or the next free one).")
-    ] = None,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; 0.0.0.0 lets other computers watch and switch.")
-    ] = "127.0.0.1",
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
-    deployment: Annotated[Path | None, typer.Option(help="Of svea: the file that says which cars.")] = None,
-    connect: options.Connect = None,
-    data: options.DataFolder = None,
-    variant: options.Variant = None,
-    topics: options.TopicMap = None,
-) -> None:
+    ] = None
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 lets other computers watch and switch.")] = (
+        "127.0.0.1"
+    )
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False
+    deployment: Annotated[Path | None, typer.Option(help="Of svea: the deployment file of the cars.")] = None
+    connect: options.Connect = None
+
+    def reel(self) -> "Reel":
+        """Return the source of frames.
+
+        Raises:
+            CoopenvError: there is no such source, or an option is not for it.
+        """
+        from coopenv.backends.sources import is_bag, is_recorded
+        from coopenv.runs.reels import EngineReel, SavedReel
+        from coopenv.runs.scenes import driver_of, title_of
+
+        if self.source == CARS:
+            return self._cars()
+        for option, value in (("--deployment", self.deployment), ("--connect", self.connect)):
+            if value is not None:
+                raise CoopenvError(f"{option} {value}: is for coopenv view svea")
+        if (saved := self.saved()) is not None:
+            return SavedReel(saved)
+        if self.agent is not None and (is_recorded(self.source) or is_bag(self.source, self.topics)):
+            raise CoopenvError(f"--agent: is for a simulation, {self.source} is recorded")
+        driver = partial(driver_of, self.agent, environment=self.source, seed=self.seed)
+        return EngineReel(self.open, title_of(self.source), self.seed, driver)
+
+    def _cars(self) -> "Reel":
+        """Return the cars of a deployment, which are observed and not driven."""
+        from coopenv.cars.backend.opening import open_svea
+        from coopenv.runs.reels import EngineReel
+
+        deployment = self.deployment
+        if deployment is None:
+            raise CoopenvError("--deployment: needed by coopenv view svea, the deployment file of the cars")
+        if self.agent is not None:
+            raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
+        changes = self.changes | ({} if self.observer is None else {"observer.name": self.observer})
+
+        def opened(more: Mapping[str, Any]) -> Any:
+            return open_svea(deployment, None, {**changes, **more}, connect=self.connect)
+
+        return EngineReel(opened, deployment.stem, self.seed, lambda scenario: (None, ""))
+
+
+@options.command
+def view(given: ViewOptions) -> None:
     """Watch an environment, a record or cars live in the browser; Ctrl-C ends it.
 
-    Nothing is asked of any other computer. Cars are observed only: they are never armed from here.
+    The page loads nothing from other computers. Cars are observed only: they are never armed from here.
     """
     from coopenv.runs.console import compile_notice
     from coopenv.runs.reels import vehicle_index
@@ -168,97 +235,30 @@ def view(
     from coopenv.viz.web.page import viser_module
 
     viser_module()
-    log, changes = options.console(stderr=True), options.parse_overrides(overrides)
+    log = options.console(stderr=True)
     with options.warned(), compile_notice(log):
-        reel = _reel(source, agent, observer, seed, changes, (deployment, connect), (data, variant, topics))
+        reel = given.reel()
     try:
-        picked = vehicle_index(reel.scenario, vehicle)
-        with serving(host, port) as (server, url):
+        picked = vehicle_index(reel.scenario, given.vehicle)
+        with serving(given.host, given.port) as (server, url):
             viewer = Viewer(server, reel)
             viewer.pick(picked)
-            _announce(url, host, log, no_browser)
+            _announce(url, given, log)
             viewer.run()
     finally:
         reel.close()
 
 
-def _announce(url: str, host: str, log: "Console", no_browser: bool) -> None:
-    """Say where the view is."""
+def _announce(url: str, given: ViewOptions, log: "Console") -> None:
+    """Print the address of the view, and open it in a browser."""
     options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
-    if host not in ("127.0.0.1", "localhost", "::1"):
+    if given.host not in ("127.0.0.1", "localhost", "::1"):
         log.print(
             "warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted",
             soft_wrap=True,
         )
-    if not no_browser:
+    if not given.no_browser:
         options.show_page(url)
-
-
-def _reel(
-    source: str,
-    agent: str | None,
-    observer: str | None,
-    seed: int,
-    changes: dict[str, Any],
-    cars: tuple[Path | None, str | None],
-    recorded: tuple[Path | None, str | None, Path | None],
-) -> "Reel":
-    """Return where the frames of a source come from.
-
-    Raises:
-        CoopenvError: there is no such source, or an option is not for it.
-    """
-    from coopenv.runs.reels import EngineReel, SavedReel
-    from coopenv.runs.scenes import driver_of, open_source, saved_scene, title_of
-
-    if source == CARS:
-        return _cars(*cars, agent, observer, seed, changes)
-    for option, value in zip(("--deployment", "--connect"), cars, strict=True):
-        if value is not None:
-            raise CoopenvError(f"{option} {value}: is for coopenv view svea")
-    saved = saved_scene(source)
-    if saved is not None:
-        refuse_for_saved(source, agent=agent, observer=observer, set=changes or None, seed=seed or None)
-        return SavedReel(saved)
-    data, variant, topics = recorded
-
-    def opened(more: Mapping[str, Any]) -> Any:
-        watching = None if "observer.name" in more else observer
-        return open_source(source, {**changes, **more}, watching, data, variant, topics)
-
-    from coopenv.backends.sources import is_bag, is_recorded
-
-    if agent is not None and (is_recorded(source) or is_bag(source, topics)):
-        raise CoopenvError(f"--agent: is for a simulation, {source} is recorded")
-    return EngineReel(opened, title_of(source), seed, partial(_driver, driver_of, agent, source, seed))
-
-
-def _driver(driver_of: Any, agent: str | None, source: str, seed: int, scenario: Any) -> Any:
-    return driver_of(agent, scenario, source, seed)
-
-
-def _cars(
-    deployment: Path | None,
-    connect: str | None,
-    agent: str | None,
-    observer: str | None,
-    seed: int,
-    changes: dict[str, Any],
-) -> "Reel":
-    """Return the cars of a deployment, which are observed and not driven."""
-    from coopenv.cars.backend.opening import open_svea
-    from coopenv.runs.reels import EngineReel
-
-    if deployment is None:
-        raise CoopenvError("--deployment: needed by coopenv view svea: the file that says which cars drive")
-    if agent is not None:
-        raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
-    watching = {} if observer is None else {"observer.name": observer}
-
-    def opened(more: Mapping[str, Any]) -> Any:
-        return open_svea(deployment, None, {**changes, **watching, **more}, connect=connect)
-
-    return EngineReel(opened, deployment.stem, seed, lambda scenario: (None, ""))
 
 
 def watch(

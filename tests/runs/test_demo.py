@@ -17,7 +17,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import Pacer
 from coopenv.cars.fake.fleet import free_port
 from coopenv.cli import app
-from coopenv.cli.svea.run import STOPPED
+from coopenv.cli.svea import STOPPED
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.demo import FLEETS, Demo
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until

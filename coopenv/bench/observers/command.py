@@ -3,7 +3,6 @@
 import io
 import math
 import re
-import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -28,17 +27,14 @@ from coopenv.bench.observers.basin import (
     basin_failures,
     basin_table,
     basins_of,
-    check_source,
     study_basin,
 )
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import basin_figure, chart_data, page_file, plotly
 from coopenv.bench.observers.rows import Row, spread
-from coopenv.bench.observers.sources import ALL, find_source
 from coopenv.bench.observers.tables import BOUNDS, Leaderboard, csv_text, failures, headline, honest_line, quality
 from coopenv.estimation.metrics import CONVERGED
-from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
 
@@ -47,58 +43,21 @@ WINDOWS_FILE, LATEX_FILE = "windows.csv", "leaderboard.tex"
 
 
 class Request(NamedTuple):
-    """What the command line asks for."""
+    """A comparison, and where its results go."""
 
     plan: Plan
     command: str
-    """The one that gives the same table again."""
-    basin: int
+    """The command line that gives the same table again."""
+    basin: int = 0
     """Draws of initial estimates; 0: no study of basins."""
-    left_out: Mapping[str, str]
-    """Observers and variants that would have been compared, but for a reason that is told."""
-
-
-def request_of(
-    text: str,
-    observers: str | None,
-    variants: str | None,
-    seeds: range,
-    steady_from: float | None,
-    basin: int,
-    data: Path | None,
-    overrides: Mapping[str, Any],
-    assignments: Sequence[str],
-    topics: Path | None = None,
-    faults: Sequence[str] = (),
-    policy: str | None = None,
-    windows: str | None = None,
-) -> Request:
-    """Return the request behind the options of the command line, `overrides` being `assignments` as they are read.
-
-    Raises:
-        CoopenvError: something of it does not exist.
-    """
-    source = find_source(text, overrides, data, topics, faults, policy)
-    given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
-    plan = Plan.of(source, given, variants, seeds, steady_from, windows)
-    if basin:
-        check_source(source)
-    left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
-    if variants is not None and variants.strip() == ALL:
-        left_out |= {name: source.obstacle(name) for name in source.variants}
-    words = ["coopenv", "bench", "observers", text, "--observers", ",".join(given or plan.observers)]
-    added = {variant.name for variant in source.added}
-    words += ["--variants", ",".join(name for name in plan.variants if name not in added), "--seeds", str(len(seeds))]
-    words += [word for name in plan.variants if name in added for word in ("--fault", name)]
-    words += [] if policy is None else ["--policy", policy]
-    words += ["--first", str(seeds[0])] if seeds[0] else []
-    words += [] if steady_from is None else ["--steady-from", f"{steady_from:g}"]
-    words += [] if windows is None else ["--windows", windows]
-    words += ["--basin", str(basin)] if basin else []
-    words += [word for assignment in assignments for word in ("--set", assignment)]
-    words += [] if data is None else ["--data", str(data)]
-    words += [] if topics is None else ["--map", str(topics)]
-    return Request(plan, shlex.join(words), basin, {name: reason for name, reason in left_out.items() if reason})
+    out: Path | None = None
+    """Folder of the files; None: no files."""
+    figures: str | None = None
+    """Format of figures as files of their own; None: figures are in the report alone."""
+    width: str | None = None
+    """Column of `coopenv.viz.figures` that these figures are drawn for; None: a page's."""
+    as_json: bool = False
+    """Whether the content of `leaderboard.json` is printed in place of the tables."""
 
 
 class Found(NamedTuple):
@@ -109,55 +68,44 @@ class Found(NamedTuple):
     basins: list[Basin]
 
     def document(self, command: str) -> dict[str, Any]:
-        """Return what `leaderboard.json` holds."""
+        """Return the content of `leaderboard.json`."""
         packages, board = versions("coopenv", "numpy", "scipy", "warp-lang"), self.comparison
         content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
         content["windows"] = board.window_rows
         return dict(jsonable(content | ({"basin": self.basins} if self.basins else {})))
 
 
-def perform(
-    request: Request,
-    executor: Executor,
-    out: Path | None,
-    figures: str | None,
-    printed: Console,
-    log: Console,
-    as_json: bool = False,
-    width: str | None = None,
-) -> None:
-    """Compare, print the tables (or what `leaderboard.json` holds) and write the files to the folder `out`, if any.
-
-    `figures` is the format of figures as files of their own; None: the report alone has them. `width` is a column of
-    `coopenv.viz.figures` that they are drawn for; None: a page's.
+def perform(request: Request, executor: Executor, printed: Console, log: Console) -> None:
+    """Compare, print the tables (or JSON) and write the files.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    wanted = figure_files(request.plan.variants, figures)
+    plan, out = request.plan, request.out
+    wanted = figure_files(plan.variants, request.figures)
     if wanted and out is None:
-        raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
+        raise CoopenvError(f"--figures {request.figures}: figures need a folder, --out DIR")
     found, names = None, [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
-    names += [name for form in FORMATS for name in figure_files(tuple(request.plan.source.variants), form)]
+    names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
             found = _compare(request, executor, log)
             if folder is not None:
-                write_files(found, request.command, folder, wanted, width)
+                write_files(found, request.command, folder, wanted, request.width)
                 names = sorted(path.name for path in folder.iterdir())
-    finally:  # hours of work are told even if they cannot be written
-        if found is not None and as_json:
+    finally:  # hours of work are printed even if they cannot be written
+        if found is not None and request.as_json:
             sys.stdout.write(json_text(found.document(request.command)))
         elif found is not None:
             print_tables(found, printed)
-    if out is not None and not as_json:
+    if out is not None and not request.as_json:
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
 
 def _compare(request: Request, executor: Executor, log: Console) -> Found:
-    for name, reason in request.left_out.items():
-        log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     plan, draws = request.plan, []
+    for name, reason in plan.left_out.items():
+        log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     with Progress(log, plan.work, total=1.0) as progress:
         comparison = plan.run(executor, progress.update)
     if request.basin:

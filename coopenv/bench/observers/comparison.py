@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from io import StringIO
 from itertools import chain, product
 from pathlib import Path
@@ -18,10 +18,10 @@ from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.rows import EDGES, Row, WindowRow, checked_edges
-from coopenv.bench.observers.sources import Source, find_source, variants_of
+from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
 from coopenv.bench.observers.tables import Leaderboard
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import available_names, find, named, portable
+from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
 from coopenv.runs.console import Progress
 
 if TYPE_CHECKING:
@@ -180,13 +180,20 @@ def compare(
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
-    if not isinstance(environment, str | Path):
-        kind = type(environment).__name__
-        raise CoopenvError(f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}")
-    folder, bag_map = (None if path is None else Path(path) for path in (data, topics))
-    source = find_source(str(environment), overrides, folder, bag_map, faults, policy)
-    source.check()
-    plan = Plan.of(source, observers, variants, seeds, steady_from, windows)
+    plan = Plan.of(
+        observers,
+        environment,
+        seeds,
+        variants=variants,
+        overrides=overrides,
+        steady_from=steady_from,
+        windows=windows,
+        data=data,
+        topics=topics,
+        faults=faults,
+        policy=policy,
+    )
+    plan.source.check()
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
         return plan.run(Local(jobs), progress.update)
 
@@ -203,18 +210,33 @@ class Plan:
     """s; None: the source's own."""
     edges: tuple[float, ...] = ()
     """s, of the windows that are judged one by one."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Observers and variants that would be compared if they could be, each with the obstacle."""
 
     @classmethod
     def of(
         cls,
-        source: Source,
         observers: Iterable[str | Factory] | None,
-        variants: str | Sequence[str] | None,
+        environment: str | Path,
         seeds: int | Iterable[int],
-        steady_from: float | None,
+        *,
+        variants: str | Sequence[str] | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        steady_from: float | None = None,
         windows: Sequence[float] | str | None = None,
+        data: str | Path | None = None,
+        topics: str | Path | None = None,
+        faults: Sequence[str] = (),
+        policy: str | None = None,
     ) -> Plan:
-        """Return what somebody asks for; arguments and errors as for `compare`."""
+        """Return a checked plan; arguments and errors as for `compare`."""
+        if not isinstance(environment, str | Path):
+            kind = type(environment).__name__
+            raise CoopenvError(
+                f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}"
+            )
+        folder, bag_map = (None if path is None else Path(path) for path in (data, topics))
+        source = find_source(str(environment), overrides, folder, bag_map, faults, policy)
         wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
         names, chosen = _observers(observers, source), variants_of(source, wanted)
         given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
@@ -222,7 +244,11 @@ class Plan:
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
         edges = checked_edges(windows) if windows is not None else () if source.planar else EDGES
-        return cls(source, names, chosen, numbers, steady_from, edges)
+        obstacles = {} if observers is not None else {name: obstacle(name) for name in observer_names()}
+        if wanted is not None and wanted.strip() == ALL:
+            obstacles |= {name: source.obstacle(name) for name in source.variants}
+        left_out = {name: reason for name, reason in obstacles.items() if reason}
+        return cls(source, names, chosen, numbers, steady_from, edges, left_out)
 
     @property
     def work(self) -> str:

@@ -14,11 +14,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from coopenv.backends.mcap.writer import write_recording
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare
-from coopenv.bench.observers.command import figure_files, request_of
+from coopenv.bench.observers.command import figure_files
 from coopenv.bench.observers.fault_variants import KNOBS, parts_of
 from coopenv.bench.observers.faults import with_loss
 from coopenv.bench.observers.sources import Simulated, find_source
 from coopenv.cli import main
+from coopenv.cli.bench import ObserverOptions
 from coopenv.observers.interference import Interference
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -158,14 +159,15 @@ def test_who_drives() -> None:
 
 
 def test_variants_and_the_command_that_gives_them_again() -> None:
-    faults, overrides = ["lie=drift:0.5,from=0.1", "v2x_loss=0.5"], {"horizon": 0.5}
-    request = request_of(
-        ENV, "mekf", None, range(7, 9), None, 0, None, overrides, ["horizon=0.5"], faults=faults, policy=None
+    faults = ["lie=drift:0.5,from=0.1", "v2x_loss=0.5"]
+    given = ObserverOptions(source=ENV, observers="mekf", seeds=2, first=7, overrides=["horizon=0.5"], faults=faults)
+    plan = given.plan()
+    assert plan.variants == ("nominal", *faults)
+    assert given.command_of(plan) == (
+        f"coopenv bench observers {ENV} --observers mekf --variants nominal "
+        "--fault lie=drift:0.5,from=0.1 --fault v2x_loss=0.5 --seeds 2 --first 7 --set horizon=0.5"
     )
-    assert request.plan.variants == ("nominal", *faults)
-    assert "--variants nominal --seeds 2" in request.command and "--first 7" in request.command
-    assert "--fault lie=drift:0.5,from=0.1 --fault v2x_loss=0.5" in request.command
-    names = figure_files(request.plan.variants, "svg")
+    names = figure_files(plan.variants, "svg")
     assert all("/" not in name and ":" not in name and "," not in name for name in names)
 
 

@@ -11,9 +11,9 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, find_source
-from coopenv.bench.observers.command import request_of
 from coopenv.bench.observers.faults import FAULTS
 from coopenv.bench.observers.sources import variants_of
+from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from tests.helpers import mrclam_files
@@ -49,7 +49,7 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
     """Unless they are asked for by name."""
 
     def names(source: str, observers: str | None = None) -> tuple[str, ...]:
-        return request_of(source, observers, None, range(1), None, 0, None, {}, ()).plan.observers
+        return ObserverOptions(source=source, observers=observers).plan().observers
 
     space, plane = names("overtaking"), names("mrclam_6")
     assert not {"planar_ekf", "planar_robust"} & {*space} and {"p3p", "robust", "robust_joint"} <= {*space}

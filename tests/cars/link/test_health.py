@@ -12,7 +12,7 @@ import pytest
 from coopenv.cars.codec import MOST_BYTES, empty, encode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
-from coopenv.cli.svea.health import next_status
+from coopenv.cli.svea import next_status
 
 TOPIC = SVEA.topic_of("svea7", Role.GATE)
 

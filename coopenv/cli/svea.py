@@ -1,0 +1,354 @@
+"""`coopenv svea`: cars, real ones and fakes. Commands import what they need when they run."""
+
+import gc
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from queue import Empty, Full, Queue
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cli import options
+
+if TYPE_CHECKING:
+    from coopenv.cars.transport.base import Transport
+
+svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None)
+STOPPED = 3
+"""Exit status of a run that was stopped: by the watchdog, a person or another station."""
+
+
+@svea.command()
+def demo(
+    environment: Annotated[
+        str, typer.Option(help="The experiment: svea_overtaking or svea_crossing.")
+    ] = "svea_overtaking",
+    fleet: Annotated[
+        Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Port of the router on this computer (default: a free one).")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results (default: out/NAME of environment or file); the drive is beside it."),
+    ] = None,
+    policy: options.PolicyName = "route_follower",
+    seed: options.Seed = 0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Go on with further seeds until the cars have driven so long, s.")
+    ] = 0.0,
+    beside: Annotated[
+        bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
+    ] = False,
+    overrides: options.Overrides = None,
+) -> None:
+    """Let fake cars drive an experiment in real time: table, figures, and a drive that can be run again.
+
+    A router and a process per car run on this computer's loopback for as long as it takes, half a minute. The first
+    time kernels are compiled, which takes a minute or two more. The exit status is 3 where the watchdog stopped the
+    cars.
+    """
+    from coopenv.runs.demo import Demo, run_demo
+
+    name = environment if fleet is None else fleet.stem
+    changes, folder = options.parse_overrides(overrides), out or Path("out") / name
+    chosen = Demo(name, folder, policy, seed, changes, seconds, beside, fleet)
+    with options.warned():
+        if not run_demo(chosen, port, options.console(stderr=True), options.console()):
+            raise typer.Exit(STOPPED)
+
+
+@svea.command()
+def fake(
+    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that it belongs to.")],
+    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    seed: options.Seed = 0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND[=VALUE][@START[+DURATION]]",
+            help="What goes wrong, from when on and for how long in s, e.g. loss=0.2@5+10. Kinds: freeze, kill, loss, "
+            "delay, clock_offset, clock_drift, false_blocks, duplicate_blocks, swapped_signatures. Repeatable.",
+        ),
+    ] = None,
+    connect: options.Connect = None,
+    gate: Annotated[
+        bool, typer.Option(help="Whether commands come through a gate of its own; else it obeys ManualControl.")
+    ] = True,
+    station: options.Station = None,
+) -> None:
+    """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
+    from coopenv.base import interrupts
+    from coopenv.cars.deployment import load_deployment
+    from coopenv.cars.fake.faults import parse_fault
+    from coopenv.cars.fake.fleet import prepare_fake, run
+    from coopenv.cars.transport.open import open_transport
+
+    faults = [parse_fault(text) for text in fault or ()]
+    make = prepare_fake(deployment, car, gate, station)
+    transport = open_transport(load_deployment(deployment, connect))
+
+    def complain(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    try:
+        made = make(transport, seed=seed, faults=faults, complain=complain)
+        gc.freeze()  # what is there stays, and need not be looked through again and again
+        interrupts.note(f"{car} is gone")
+        print(f"{car}: fake ready", flush=True)
+        run(made, threading.Event())
+    finally:
+        transport.close()
+
+
+Speed = typer.Option(help="Most m/s [default: 0.5].", show_default=False)
+Angle = typer.Option(help="Most rad of steering [default: 0.5236].", show_default=False)
+Acceleration = typer.Option(help="Most m/s^2, either way [default: 1].", show_default=False)
+Rate = typer.Option(help="Most rad/s of steering [default: 2].", show_default=False)
+
+
+@svea.command()
+def gate(
+    car: Annotated[str, typer.Option(help="Name of this car, as in its topics: svea7.")],
+    deployment: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment with [gate], keys and limits; options win."),
+    ] = None,
+    connect: options.GateConnect = None,
+    off_board: options.OffBoard = False,
+    keys: Annotated[
+        Path | None, typer.Option(help="Folder with CAR.pem and public.toml of `coopenv svea keys`.")
+    ] = None,
+    station: options.Station = None,
+    max_speed: Annotated[float | None, Speed] = None,
+    max_steering: Annotated[float | None, Angle] = None,
+    max_acceleration: Annotated[float | None, Acceleration] = None,
+    max_steering_rate: Annotated[float | None, Rate] = None,
+    reverse: Annotated[bool | None, typer.Option("--reverse", help="Let the car drive backwards.")] = None,
+) -> None:
+    """Pass on commands that are fresh, signed, in order and inside the limits; else keep the car neutral.
+
+    Runs on the car until it is interrupted; the car then gets neutral. It starts disarmed, and the station arms it for
+    a session. It connects to the car's own router, so that neutral gets to the wheels when the radio is gone. Without a
+    valid command for 0.2 s the car gets neutral until there is a newer one. A stop, from anybody, holds until the next
+    arming. Clocks of car and station must agree to 50 ms (chrony). What the gate rejects is counted in its status,
+    fleet/CAR/coopenv/gate.
+
+    Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
+    """
+    from coopenv.base import interrupts
+    from coopenv.cars.gate.core import Gate
+    from coopenv.cars.gate.process import CLOCK, GateSettings, Link, run
+
+    bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
+    given = GateSettings.of(car, deployment).changed(
+        connect=connect and (connect,),
+        keys=keys,
+        station=station,
+        limits={**bounds, "steering_rate": max_steering_rate, "reverse": reverse},
+    )
+    given.check_place(off_board)
+    signer, verifier = given.identities()
+    if verifier is None:
+        print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
+    transport = given.open()
+    try:
+        decides = Gate(car, given.limits, CLOCK, verifier, given.station, given.profile)
+        link = Link(decides, car, transport, signer, given.profile)
+        interrupts.note(f"{car} is in neutral")
+        if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
+            signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+        print(f"{car}: gate ready at {', '.join(given.connect)}", flush=True)
+        run(link)
+    finally:
+        transport.close()
+
+
+MOST_WAITING = 16
+"""Messages that are kept until they are read; a gate sends five a second."""
+
+
+@svea.command()
+def health(
+    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that the car belongs to.")],
+    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    connect: options.GateConnect = None,
+    off_board: options.OffBoard = False,
+    patience: Annotated[float, typer.Option(min=0.1, help="s to wait for it.")] = 2.0,
+) -> None:
+    """Wait for the next word of a car's gate and print it; the exit status is 2 where none comes.
+
+    On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
+    """
+    from coopenv.cars.gate.process import GateSettings
+    from coopenv.cars.profile import Role
+
+    given = GateSettings.of(car, deployment).changed({}, connect=connect and (connect,))
+    given.check_place(off_board)
+    topic, transport = given.profile.topic_of(given.car, Role.GATE), given.open()
+    try:
+        status = next_status(transport, topic, patience)
+    finally:
+        transport.close()
+    if status is None:
+        raise CoopenvError(f"{car}: its gate has said nothing for {patience:g} s on {topic}")
+    refused = sum(int(count) for count in status.counts)
+    print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
+
+
+def next_status(transport: "Transport", topic: str, patience: float) -> Any | None:
+    """Return the next message of a gate's topic that is one (None: none within s); whatever else comes is dropped."""
+    from coopenv.cars.codec import MOST_BYTES, decode
+    from coopenv.cars.profile import GATE_TYPES, Role
+    from coopenv.cars.transport.base import Arrival
+
+    heard, until = Queue[bytes](MOST_WAITING), monotonic() + patience
+
+    def keep(arrival: Arrival) -> None:
+        if len(arrival.payload) <= MOST_BYTES:
+            with suppress(Full):
+                heard.put_nowait(arrival.payload)
+
+    transport.subscribe(topic, keep)
+    with suppress(Empty):
+        while True:
+            payload = heard.get(timeout=max(until - monotonic(), 0.0))
+            with suppress(CoopenvError):
+                return decode(payload, GATE_TYPES[Role.GATE])
+    return None
+
+
+@svea.command()
+def keys(
+    deployment: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment: keys for its cars and its station."),
+    ] = None,
+    names: Annotated[str | None, typer.Option(help="Names instead, with commas between: svea7,svea8,station.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the keys (default: the deployment's security.keys, or keys).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Make new keys even of those who have some.")] = False,
+) -> None:
+    """Make keys: NAME.pem of each car and of the station, which nobody else may have, and public.toml for all.
+
+    Give each car its own NAME.pem and public.toml, by a channel that you trust, and delete it here. Who has keys
+    already keeps them.
+    """
+    from coopenv.cars.keys import PUBLIC, make_keys
+
+    if (deployment is None) == (names is None):
+        raise CoopenvError("keys: name a deployment file, or identities with --names, and not both")
+    folder, wanted = out or Path("keys"), [name.strip() for name in (names or "").split(",")]
+    if deployment is not None:
+        from coopenv.cars.deployment import load_deployment
+
+        read = load_deployment(deployment)
+        wanted = [*(car.name for car in read.cars), read.security.identity]
+        folder = out or read.folder / (read.security.keys or "keys")
+    new, kept = make_keys(folder, wanted, force)
+    for name in new:
+        print(f"{folder / f'{name}.pem'}: new, for {name} alone")
+    for name in kept:
+        print(f"{name}: has a key already, which is kept")
+    print(f"{folder / PUBLIC}: for everybody")
+
+
+@svea.command()
+def router(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
+    ] = None,
+) -> None:
+    """Run a Zenoh router until it is interrupted; it says so when it can be reached."""
+    from coopenv.base import interrupts
+    from coopenv.cars.transport.zenoh import open_zenoh
+
+    endpoints = listen or ["tcp/127.0.0.1:7447"]
+    transport = open_zenoh("router", listen=endpoints)
+    try:
+        interrupts.note("the router is gone")
+        print(f"router ready at {', '.join(endpoints)}", flush=True)
+        threading.Event().wait()
+    finally:
+        transport.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Options of `coopenv svea run`."""
+
+    config: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="Which cars, and how they are reached.")]
+    car: Annotated[
+        str | None,
+        typer.Option(help="Estimate and drive this car alone and hear the others (default: all, as an edge server)."),
+    ] = None
+    arm: Annotated[bool, typer.Option("--arm", help="Let the cars drive. Without it everything happens but that.")] = (
+        False
+    )
+    release: Annotated[
+        bool, typer.Option("--release", help="With --arm: also cars that somebody has stopped. Know why, first.")
+    ] = False
+    policy: options.PolicyName = "zero"
+    seed: options.Seed = 0
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None
+    connect: options.Connect = None
+    record: Annotated[
+        Path | None, typer.Option(help="MCAP file for every message that comes or goes; coopenv run replays it.")
+    ] = None
+    out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None
+    overrides: options.Overrides = None
+    steady_from: Annotated[
+        float, typer.Option(min=0.0, help="RMSE and NEES count from this time on, s: cars know their places by then.")
+    ] = 2.0
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False
+    as_json: options.AsJson = False
+
+
+@svea.command()
+@options.command
+def run(given: RunOptions) -> None:
+    """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
+
+    Without --arm no command is sent: run it beside the car that somebody else drives.
+    """
+    from coopenv.base.interrupts import also_kept
+    from coopenv.cars.backend.opening import open_svea
+    from coopenv.runs.command import NoTruthError, execute, report
+    from coopenv.runs.demo import kept_drive, links_line, links_report, truth_report
+    from coopenv.runs.rollouts import Rollout
+
+    changes, log = options.parse_overrides(given.overrides), options.console(stderr=True)
+    with options.warned():
+        backend = open_svea(given.config, None, changes, given.car, given.record, connect=given.connect)
+    also_kept(partial(kept_drive, given.record, backend))
+    try:
+        wishes = {"arm": given.arm, "release": given.release}
+        rollout = Rollout(
+            backend.scenario, given.seed, given.steps, policy=given.policy, backend=backend, options=wishes
+        )
+        folder = given.out or Path("out") / given.config.stem
+        figures = None if given.no_figures else "png"
+        watched = partial(links_line, backend)
+        result = execute(given.config.stem, rollout, folder, log, changes, given.steady_from, figures, False, watched)
+    except NoTruthError:
+        raise CoopenvError(truth_report(backend)) from None
+    finally:
+        backend.close()
+    if given.as_json:
+        options.print_json(result)
+    else:
+        report(rollout, result, folder, options.console())
+        links_report(backend, options.console())
+    if backend.watchdog.trip is not None:
+        raise typer.Exit(STOPPED)
