@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.cosimulation import CosimulatedWorld, Poses
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.simulated import CosimulatedWorld, Poses, Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario

@@ -155,7 +155,7 @@ def open_backend(
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
-        cars: arguments of `coopenv.cars.backend.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
+        cars: arguments of `coopenv.cars.backend.backend.open_svea`, which `backend="svea"` needs: `deployment`, and
             `car`, `record` and `connect`.
         topics: map of the topics of a ROS bag.
 
@@ -220,7 +220,7 @@ def _open_recorded(
 
 def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:
     """Return the cars of a deployment file: that which is given, or `name` itself."""
-    from coopenv.cars.backend.opening import open_svea
+    from coopenv.cars.backend.backend import open_svea
 
     for key in ("data", "variant", "topics"):
         if given[key] is not None:

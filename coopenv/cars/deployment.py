@@ -9,9 +9,19 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.sections import Section, read_toml, validated
-from coopenv.cars.limits import USUAL, Limits, Point, is_simple
-from coopenv.cars.profile import SVEA, CarProfile, Number, Positive, Pulses, load_profile
-from coopenv.cars.transport.endpoints import SECURE, address_of
+from coopenv.cars.profile import (
+    SVEA,
+    USUAL,
+    CarProfile,
+    Limits,
+    Number,
+    Point,
+    Positive,
+    Pulses,
+    is_simple,
+    load_profile,
+)
+from coopenv.cars.transport.base import SECURE, address_of
 
 
 class Tls(Section):

@@ -91,7 +91,7 @@ def fake(
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.fake.faults import parse_fault
     from coopenv.cars.fake.fleet import prepare_fake, run
-    from coopenv.cars.transport.open import open_transport
+    from coopenv.cars.transport.zenoh import open_transport
 
     faults = [parse_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
@@ -323,7 +323,7 @@ def run(given: RunOptions) -> None:
     Without --arm no command is sent: run it beside the car that somebody else drives.
     """
     from coopenv.base.interrupts import also_kept
-    from coopenv.cars.backend.opening import open_svea
+    from coopenv.cars.backend.backend import open_svea
     from coopenv.runs.command import NoTruthError, execute, report
     from coopenv.runs.demo import kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout

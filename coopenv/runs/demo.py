@@ -17,8 +17,7 @@ from coopenv.base.files import replacing_file, writing
 from coopenv.base.format import seconds
 from coopenv.base.installation import data_directory
 from coopenv.base.interrupts import also_kept
-from coopenv.cars.backend.backend import Svea
-from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.profile import Role
 from coopenv.cars.transport.zenoh import library

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from coopenv import DataError
-from coopenv.backends import unpacking
-from coopenv.backends.mcap import read_recording, write_recording
+from coopenv.backends.mcap import container, read_recording, write_recording
 from coopenv.backends.replay import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
@@ -293,7 +292,7 @@ def test_a_chunk_that_unpacks_to_more_than_fits_is_not_unpacked(
 def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, more = tmp_path / "hostile.mcap", tmp_path / "more.mcap"
     bomb(written, path, 9 * 2**20)  # a million records of 9 bytes
-    monkeypatch.setattr(unpacking, "AT_ONCE", 16 * 2**20)
+    monkeypatch.setattr(container, "AT_ONCE", 16 * 2**20)
     bomb(path, more, 9 * 2**20)
     refused(more, r"would unpack to 9437184, more than [89]\d{6}\b")  # the limit is for both
 

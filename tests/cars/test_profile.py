@@ -11,15 +11,14 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.backend.gates import Gates
+from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock
 from coopenv.cars.gate.process import Link
-from coopenv.cars.limits import USUAL
-from coopenv.cars.profile import FOLDER, CarProfile, Drive, Role, load_profile
+from coopenv.cars.profile import FOLDER, USUAL, CarProfile, Drive, Role, load_profile
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
 

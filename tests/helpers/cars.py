@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from coopenv.cars.backend.backend import Svea
-from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic

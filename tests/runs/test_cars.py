@@ -14,11 +14,10 @@ import pytest
 from rich.console import Console
 
 from coopenv.base.errors import CoopenvError, DataWarning
-from coopenv.cars.backend.gates import Gates
-from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.backend.backend import open_svea
+from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.limits import USUAL
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.transport.base import Hub
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_line, links_report

@@ -1,14 +1,19 @@
-"""The end of the network that an environment is: what has come waits here until a tick takes it."""
+"""The station's end of the network: inbox, clock of the ticks, and sessions with the gates."""
 
+import secrets
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from coopenv.cars.codec import MOST_BYTES
-from coopenv.cars.keys import Verifier
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
+from coopenv.cars.keys import Signer, Verifier
+from coopenv.cars.profile import GATE_TYPES, SVEA, CarProfile, Limits, Role
 from coopenv.cars.transport.base import Arrival, Transport
 
 MOST_WAITING = 256
@@ -148,3 +153,207 @@ class Pacer:
     def late(self, share: float) -> float:
         """Return the lateness that a share of the ticks did not exceed, s; 0 where there were none."""
         return float(np.quantile(self.lateness, share)) if self.lateness else 0.0
+
+
+PATIENCE = 1.0  # s in which a gate has to answer
+WORD = 0.5  # s in which every gate has spoken once more
+LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
+OLD = 1.0  # s after which a gate that says nothing counts as gone
+POLL = 0.01  # s
+
+
+@dataclass
+class GateState:
+    """What a gate has said last."""
+
+    state: str = "unknown"
+    session: str = ""
+    nonce: str = ""
+    accepted: int = 0
+    rejections: dict[str, int] = field(default_factory=dict)
+    heard: float = float("-inf")  # by the monotonic clock, s
+
+    @property
+    def age(self) -> float:
+        """How long ago it spoke, s."""
+        return time.monotonic() - self.heard
+
+
+class Gates:
+    """The gates of some cars."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        cars: tuple[str, ...],
+        limits: Limits,
+        signer: Signer | None,
+        verifier: Verifier | None = None,
+        profile: CarProfile = SVEA,
+    ) -> None:
+        """Listen to the gates; with a verifier only to what they have signed."""
+        self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
+        self._profile, self._lock = profile, threading.Lock()
+        self._states = {car: GateState() for car in cars}
+        self._before: dict[str, dict[str, int]] = {}
+        self._cars = {self._profile.topic_of(car, Role.GATE): car for car in cars}
+        self._stamps = dict.fromkeys(cars, 0)
+        self._stopping = False
+        self.stopped_by_others: set[str] = set()
+        """Cars that somebody else has stopped, since their last arming."""
+        self.dropped = {car: Counter[str]() for car in cars}
+        """What gates seem to have said and was not believed, by car and reason."""
+        self.session = ""
+        self._sequence = 0
+        for topic in self._cars:
+            transport.subscribe(topic, self._hear)
+
+    @property
+    def states(self) -> dict[str, GateState]:
+        """What each gate has said last."""
+        with self._lock:
+            return dict(self._states)
+
+    def refused(self, car: str) -> dict[str, int]:
+        """Return what a gate has refused since it was armed for this session, or since it was first heard, by reason.
+
+        It counts since it was started itself.
+        """
+        with self._lock:
+            counts, before = self._states[car].rejections, self._before.get(car, {})
+        since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
+        return dict(counts) if any(count < 0 for count in since.values()) else since  # the gate was started anew
+
+    def _hear(self, arrival: Arrival) -> None:
+        car, v = self._cars[arrival.topic], self._verifier
+        if len(arrival.payload) > MOST_BYTES:
+            self.dropped[car]["too long"] += 1
+            return
+        if v is not None and v.signer(arrival.topic, arrival.payload, arrival.attachment) != car:
+            self.dropped[car]["signature"] += 1
+            return
+        try:
+            m = decode(arrival.payload, GATE_TYPES[Role.GATE])
+        except CoopenvError:
+            self.dropped[car]["malformed"] += 1
+            return
+        stamp = stamp_of(m)
+        if not -AHEAD <= arrival.received - stamp <= LATE:
+            self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
+            return
+        counts = dict(zip(m.rejections, (int(n) for n in m.counts), strict=False))
+        state = GateState(m.state, m.session, m.nonce, int(m.accepted), counts, time.monotonic())
+        with self._lock:
+            if stamp < self._stamps[car]:
+                self.dropped[car]["out of order"] += 1
+                return
+            self._stamps[car], self._states[car] = stamp, state
+            if m.state == "stopped" and not self._stopping:
+                self.stopped_by_others.add(car)
+            self._before.setdefault(car, counts)
+
+    def begin(self, release: bool = False) -> None:
+        """Arm all gates for a new session; those that somebody else has stopped only with `release`.
+
+        Raises:
+            CoopenvError: a gate is not there, does not open, or is stopped meanwhile; all are closed again then.
+        """
+        self.session, self._sequence = secrets.token_hex(8), 0
+        before = self._fresh_states()
+        with self._lock:
+            stopped = sorted(car for car in self.stopped_by_others if before[car].state == "stopped")
+        if stopped and not release:
+            raise CoopenvError(
+                f"not armed: {stopped[0]}: somebody has stopped it; once you know why, release it "
+                '(`coopenv svea run --release`, options={"arm": True, "release": True})'
+            )
+        until = time.monotonic() + PATIENCE
+        while closed := [c for c, s in self.states.items() if (s.state, s.session) != ("armed", self.session)]:
+            states = self.states
+            for car in closed:
+                if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
+                    self.end()
+                    self.stopped_by_others.add(car)
+                    raise CoopenvError(f"{car}: was stopped while it was being armed")
+            if time.monotonic() > until:
+                self.end()
+                raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
+            for car in closed:
+                self._arm(car, True, states[car].nonce)  # as looked at: a stop that comes now makes it worthless
+            time.sleep(5 * POLL)
+        with self._lock:
+            self._stopping = False
+            self.stopped_by_others.clear()
+            self._before = {car: state.rejections for car, state in self._states.items()}
+
+    def _fresh_states(self) -> dict[str, GateState]:
+        """Return what each gate says now, not what it said before the last stop. Raises CoopenvError: one is silent."""
+        asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
+        while any(state.heard < asked for state in self.states.values()) and time.monotonic() < asked + WORD:
+            time.sleep(POLL)
+        for car, state in self.states.items():
+            if state.age <= OLD:
+                continue
+            if dropped := self.dropped[car] - known[car]:
+                why = ", ".join(f"{reason} {count}" for reason, count in dropped.items())
+                raise CoopenvError(f"{car}: what its gate says is not believed ({why}): are keys and clocks the same?")
+            topic = self._profile.topic_of(car, Role.GATE)
+            raise CoopenvError(f"{car}: no gate has spoken on {topic}: is `coopenv svea gate` running there?")
+        return self.states
+
+    def end(self) -> None:
+        """Close all gates; cars come to a stand."""
+        for car in self._states:
+            self._arm(car, False, "")
+        self.session = ""
+
+    def _arm(self, car: str, armed: bool, nonce: str) -> None:
+        message = make(
+            GATE_TYPES[Role.ARM], header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
+        )
+        self._send(car, Role.ARM, message)
+
+    def stop(self) -> None:
+        """Tell every gate to stop at once and to stay so."""
+        with self._lock:
+            self._stopping = True
+        for car in self._states:
+            self._send(car, Role.STOP, make(GATE_TYPES[Role.STOP], data=True))
+
+    def command(self, car: str, speed: float, steering: float, acceleration: float) -> None:
+        """Send a command: m/s, rad, m/s^2, clipped to the limits."""
+        limits = self._limits
+        speed = min(max(speed, -limits.speed if limits.reverse else 0.0), limits.speed)
+        steering = min(max(steering, -limits.steering), limits.steering)
+        drive = make(
+            "ackermann_msgs/msg/AckermannDrive",
+            steering_angle=steering,
+            steering_angle_velocity=limits.steering_rate,
+            speed=speed,
+            acceleration=min(acceleration, limits.acceleration),
+            jerk=0.0,
+        )
+        about = header(time.time_ns(), f"{self.session}:{self._sequence}")
+        self._send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
+
+    def next(self) -> None:
+        """Begin the commands of the next decision."""
+        self._sequence += 1
+
+    def _send(self, car: str, role: Role, message: Any) -> None:
+        topic, payload = self._profile.topic_of(car, role), encode(message)
+        signature = b"" if self._signer is None else self._signer.sign(topic, payload)
+        kind = self._profile.topics[role]
+        self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
+
+
+def _why_closed(before: GateState, now: GateState) -> str:
+    """Return why a gate has not opened, by what it has refused since."""
+    news = {r: n - before.rejections.get(r, 0) for r, n in now.rejections.items() if n > before.rejections.get(r, 0)}
+    if "signature" in news:
+        return (
+            "its gate refuses this end's signature: is it told to trust this one (--station), "
+            "and is its public.toml that of this end's key?"
+        )
+    why = ", ".join(f"{reason} {count}" for reason, count in news.items()) or "no reason told"
+    return f"the gate did not open, it is {now.state} ({why})"

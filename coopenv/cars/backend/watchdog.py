@@ -9,11 +9,9 @@ from typing import Literal
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.gates import OLD, Gates
-from coopenv.cars.backend.station import Station
+from coopenv.cars.backend.station import OLD, Gates, Station
 from coopenv.cars.deployment import Safety
-from coopenv.cars.limits import inside
-from coopenv.cars.profile import SVEA, CarProfile, Role
+from coopenv.cars.profile import SVEA, CarProfile, Role, inside
 from coopenv.cars.samples import Pose, RobustReport, Sample
 from coopenv.estimation.poses import Array
 

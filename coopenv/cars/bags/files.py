@@ -54,7 +54,7 @@ class BagFile:
                 raise DataError(f"{part}: {CUT_OFF}; {MENDED}")
         from rosbags.highlevel import AnyReader
 
-        from coopenv.backends.unpacking import Allowance
+        from coopenv.backends.mcap.container import Allowance
         from coopenv.cars.bags.limits import limited
 
         try:
@@ -92,7 +92,7 @@ class BagFile:
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
         DataWarning says so.
         """
-        from coopenv.backends.unpacking import Allowance
+        from coopenv.backends.mcap.container import Allowance
         from coopenv.cars.bags.limits import each_limited, is_too_large
 
         connections = [c for c in self._reader.connections if c.topic in topics]

@@ -7,7 +7,7 @@ from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, Self
 
-from coopenv.backends.unpacking import AT_ONCE, Allowance, TooLargeError
+from coopenv.backends.mcap.container import AT_ONCE, Allowance, TooLargeError
 from coopenv.base.errors import CoopenvError
 
 _allowance: ContextVar[Allowance | None] = ContextVar("_allowance", default=None)

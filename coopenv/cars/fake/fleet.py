@@ -15,8 +15,8 @@ from pathlib import Path
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.interrupts import before_a_hard_end, held
+from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.backend.opening import scenario_of
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import REAL, Fake
 from coopenv.cars.fake.faults import FakeFault

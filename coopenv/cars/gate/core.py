@@ -30,8 +30,7 @@ from coopenv.cars.gate.codec import (
     write_status,
 )
 from coopenv.cars.keys import Verifier, is_identity
-from coopenv.cars.limits import Limits
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Drive, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Drive, Limits, Role
 
 
 class GateMode(StrEnum):

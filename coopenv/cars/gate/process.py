@@ -15,10 +15,8 @@ from coopenv.base.errors import CoopenvError, shown
 from coopenv.cars.gate.codec import write_bool
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode
 from coopenv.cars.keys import LONGEST_IDENTITY, Signer, is_identity
-from coopenv.cars.limits import USUAL, Limits
-from coopenv.cars.profile import SVEA, CarProfile, Role, presence_of
-from coopenv.cars.transport.base import Arrival, Transport
-from coopenv.cars.transport.endpoints import SECURE, address_of
+from coopenv.cars.profile import SVEA, USUAL, CarProfile, Limits, Role, presence_of
+from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
 
 if TYPE_CHECKING:
     from coopenv.cars.deployment import Deployment
@@ -180,12 +178,12 @@ class GateSettings:
                 )
 
     def open(self) -> Transport:
-        """Connect to the network; errors as for `coopenv.cars.transport.open.open_transport`."""
+        """Connect to the network; errors as for `coopenv.cars.transport.zenoh.open_transport`."""
         if self.fleet is None:
             from coopenv.cars.transport.zenoh import open_zenoh
 
             return open_zenoh("client", self.connect)
-        from coopenv.cars.transport.open import open_transport
+        from coopenv.cars.transport.zenoh import open_transport
 
         secure = any(address_of(endpoint).protocol in SECURE for endpoint in self.connect)
         tls = self.fleet.network.tls if secure else None  # on the car itself nothing need be

@@ -1,13 +1,18 @@
-"""What every transport does: carry bytes by topic between processes, without looking at them."""
+"""Transports carry bytes by topic between processes. Endpoints (as Zenoh writes them) and certificates."""
 
+import ipaddress
 import re
+import socket
+import ssl
+import stat
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, listed, shown
 
 
 class LinkError(CoopenvError):
@@ -139,3 +144,135 @@ class Local:
             called = [callback for matches, callback, _ in self._hub._watchers if matches(name)]
         for callback in called:
             callback(name, there)
+
+
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")
+SECURE = ("tls", "quic")
+NO_ANSWER = "no answer"
+
+WRITTEN = re.compile(r"([a-z]+)/(\[[0-9A-Fa-f:.]+\]|[^\s/:?#\[\]]+):(\d{1,5})(?:[?#]\S*)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """An endpoint."""
+
+    protocol: str
+    host: str  # without the brackets of IPv6
+    port: int
+
+    @property
+    def authority(self) -> str:
+        """Host and port as URLs have them."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether it is on this computer, whatever its networks: 127.0.0.0/8, ::1 or localhost."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host.lower() == "localhost"
+
+
+def address_of(endpoint: str) -> Address:
+    """Return the parts of an endpoint such as tcp/127.0.0.1:7447. Raises CoopenvError: it is none."""
+    found = WRITTEN.fullmatch(endpoint)
+    if found is None or found[1] not in PROTOCOLS or int(found[3]) > 65_535:
+        known = listed(PROTOCOLS)
+        raise CoopenvError(f"{shown(endpoint)} is no endpoint, expected for example tcp/127.0.0.1:7447 (or {known})")
+    return Address(found[1], found[2].strip("[]"), int(found[3]))
+
+
+def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float) -> str | None:
+    """Try a connection by hand, because libraries often only say that it did not work.
+
+    Args:
+        address: where to.
+        context: certificates, for TLS.
+        timeout: s.
+
+    Returns:
+        Why it fails; None: it does not, or it cannot be tried.
+    """
+    if address.protocol in ("udp", "quic"):
+        return None
+    try:
+        with socket.create_connection((address.host, address.port), timeout) as plain:
+            return _tls_trouble(plain, address.host, context) if address.protocol == "tls" and context else None
+    except TimeoutError:
+        return NO_ANSWER
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _tls_trouble(plain: socket.socket, host: str, context: ssl.SSLContext) -> str | None:
+    try:
+        with context.wrap_socket(plain, server_hostname=host) as secured:
+            secured.settimeout(0.2)
+            secured.recv(1)  # who wants a certificate of ours, or refuses it, says so only now
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate is refused: {error.verify_message}"
+    except ssl.SSLError as error:
+        return f"TLS: {(error.reason or str(error)).replace('_', ' ').lower()}"
+    except TimeoutError:
+        pass
+    return None
+
+
+FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO
+
+
+@dataclass(frozen=True, slots=True)
+class Certificates:
+    """Files in PEM. Whoever listens with a certificate asks for one of those who connect (mutual TLS)."""
+
+    root_ca: Path  # who signs the others' certificates
+    certificate: Path | None = None  # own one
+    key: Path | None = None  # private key of it
+
+    def __post_init__(self) -> None:
+        """Refuse files that cannot be used. Raises CoopenvError: one line names the field and the file."""
+        if (self.certificate is None) != (self.key is None):
+            raise CoopenvError("tls.certificate, tls.key: give both or none")
+        _check("root_ca", self.root_ca)
+        if self.certificate is not None and self.key is not None:
+            _check("certificate", self.certificate)
+            _check("key", self.key)
+            if self.key.stat().st_mode & FORBIDDEN:
+                raise CoopenvError(f"tls.key: {self.key} can be read by others; run: chmod 600 {self.key}")
+        self.context()
+
+    def context(self) -> ssl.SSLContext:
+        """Return what Python connects with. Raises CoopenvError: the files do not hold what they should."""
+        try:
+            made = ssl.create_default_context(cafile=self.root_ca)
+        except (ssl.SSLError, OSError):
+            raise CoopenvError(f"tls.root_ca: {self.root_ca} holds no certificate in PEM") from None
+        if self.certificate is None or self.key is None:
+            return made
+        try:
+            made.load_cert_chain(self.certificate, self.key, password="")  # never ask at the terminal
+        except (ssl.SSLError, OSError):
+            files = f"{self.certificate} and {self.key}"
+            raise CoopenvError(
+                f"tls.certificate, tls.key: {files} are no certificate and its key, in PEM without a password"
+            ) from None
+        return made
+
+    def for_zenoh(self) -> dict[str, object]:
+        """Return the entries of Zenoh's `transport/link/tls`."""
+        entries: dict[str, object] = {"root_ca_certificate": str(self.root_ca)}
+        if self.certificate is not None:
+            for side in ("listen", "connect"):
+                entries |= {f"{side}_certificate": str(self.certificate), f"{side}_private_key": str(self.key)}
+            entries["enable_mtls"] = True
+        return entries
+
+
+def _check(field: str, path: Path) -> None:
+    try:
+        with path.open("rb"):
+            return
+    except OSError as error:
+        raise CoopenvError(f"tls.{field}: {path}: cannot be read ({error.strerror or error})") from None

@@ -13,9 +13,16 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.transport.base import Arrival, Callback, LinkError, matcher
-from coopenv.cars.transport.endpoints import Address, address_of, trouble_at
-from coopenv.cars.transport.zenoh import Certificates
+from coopenv.cars.transport.base import (
+    Address,
+    Arrival,
+    Callback,
+    Certificates,
+    LinkError,
+    address_of,
+    matcher,
+    trouble_at,
+)
 
 ATTACHMENT = "Coopenv-Attachment"
 """Header, base64; the authors' connector looks at no headers."""

@@ -15,8 +15,7 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import ros1
-from coopenv.cars.transport.base import Arrival, Callback, LinkError, matcher
-from coopenv.cars.transport.endpoints import Address, address_of, trouble_at
+from coopenv.cars.transport.base import Address, Arrival, Callback, LinkError, address_of, matcher, trouble_at
 from coopenv.cars.transport.nats import PERIOD, Presence
 
 ENVELOPE = "std_msgs/msg/UInt8MultiArray"

@@ -1,75 +1,23 @@
-"""Zenoh, under the keys of zenoh-bridge-ros2dds: a ROS name without its leading slash, the payload plain CDR."""
+"""Zenoh under the keys of zenoh-bridge-ros2dds (no leading slash, plain CDR), and the transport of a deployment."""
 
 import json
-import ssl
-import stat
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.transport.base import Arrival, Callback, LinkError
-from coopenv.cars.transport.endpoints import NO_ANSWER, SECURE, address_of, trouble_at
-
-FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO
-
-
-@dataclass(frozen=True, slots=True)
-class Certificates:
-    """Files in PEM. Whoever listens with a certificate asks for one of those who connect (mutual TLS)."""
-
-    root_ca: Path  # who signs the others' certificates
-    certificate: Path | None = None  # own one
-    key: Path | None = None  # private key of it
-
-    def __post_init__(self) -> None:
-        """Refuse files that cannot be used. Raises CoopenvError: one line names the field and the file."""
-        if (self.certificate is None) != (self.key is None):
-            raise CoopenvError("tls.certificate, tls.key: give both or none")
-        _check("root_ca", self.root_ca)
-        if self.certificate is not None and self.key is not None:
-            _check("certificate", self.certificate)
-            _check("key", self.key)
-            if self.key.stat().st_mode & FORBIDDEN:
-                raise CoopenvError(f"tls.key: {self.key} can be read by others; run: chmod 600 {self.key}")
-        self.context()
-
-    def context(self) -> ssl.SSLContext:
-        """Return what Python connects with. Raises CoopenvError: the files do not hold what they should."""
-        try:
-            made = ssl.create_default_context(cafile=self.root_ca)
-        except (ssl.SSLError, OSError):
-            raise CoopenvError(f"tls.root_ca: {self.root_ca} holds no certificate in PEM") from None
-        if self.certificate is None or self.key is None:
-            return made
-        try:
-            made.load_cert_chain(self.certificate, self.key, password="")  # never ask at the terminal
-        except (ssl.SSLError, OSError):
-            files = f"{self.certificate} and {self.key}"
-            raise CoopenvError(
-                f"tls.certificate, tls.key: {files} are no certificate and its key, in PEM without a password"
-            ) from None
-        return made
-
-    def for_zenoh(self) -> dict[str, object]:
-        """Return the entries of Zenoh's `transport/link/tls`."""
-        entries: dict[str, object] = {"root_ca_certificate": str(self.root_ca)}
-        if self.certificate is not None:
-            for side in ("listen", "connect"):
-                entries |= {f"{side}_certificate": str(self.certificate), f"{side}_private_key": str(self.key)}
-            entries["enable_mtls"] = True
-        return entries
-
-
-def _check(field: str, path: Path) -> None:
-    try:
-        with path.open("rb"):
-            return
-    except OSError as error:
-        raise CoopenvError(f"tls.{field}: {path}: cannot be read ({error.strerror or error})") from None
-
+from coopenv.cars.deployment import Deployment, DeploymentError, Tls
+from coopenv.cars.transport.base import (
+    NO_ANSWER,
+    SECURE,
+    Arrival,
+    Callback,
+    Certificates,
+    LinkError,
+    Transport,
+    address_of,
+    trouble_at,
+)
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
@@ -199,3 +147,55 @@ def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) 
             return None if trouble == NO_ANSWER else trouble
     said = str(error).split(" at /")[0].split("\n")[0][:120]
     return None if connect and "Timeout" in said else said
+
+
+def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
+    """Connect to the network of a fleet; topics are those of the profile on every kind of network.
+
+    Args:
+        deployment: says where, how and with which certificates.
+        timeout: s to wait for the router, broker or master.
+
+    Raises:
+        DeploymentError: certificates that cannot be used, or what the kind of network cannot do.
+        LinkError: nobody answers there.
+        CoopenvError: an extra is not installed.
+    """
+    network, certificates = deployment.network, certificates_of(deployment)
+    if network.kind == "ros1":
+        from coopenv.cars.transport.ros1 import open_ros1
+
+        return _translated(lambda types: open_ros1(network.connect[0], types, timeout), deployment)
+    if network.kind == "nats":
+        from coopenv.cars.transport.nats import open_nats
+
+        return _translated(lambda _: open_nats(network.connect, certificates, timeout), deployment)
+
+    return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
+
+
+def _translated(connect: Callable[[dict[str, str]], Transport], deployment: Deployment) -> Transport:
+    """Return a connection to the authors' cars under our names."""
+    from coopenv.cars.transport.authors import Authors, routes_of
+
+    routes = [
+        route for car in deployment.cars for route in routes_of(car, deployment.profile)
+    ]  # before anything is opened
+    return Authors(connect({route.name: route.theirs.type for route in routes}), routes)
+
+
+def certificates_of(deployment: Deployment) -> Certificates | None:
+    """Return the files of `network.tls`, checked (None: there is no such section); errors as for `open_transport`."""
+    tls = deployment.network.tls
+    if tls is None:
+        return None
+    try:
+        return _found(tls, deployment)
+    except CoopenvError as error:
+        raise DeploymentError(f"network.{error}") from None
+
+
+def _found(tls: Tls, deployment: Deployment) -> Certificates:
+    own = None if tls.certificate is None else deployment.folder / tls.certificate
+    key = None if tls.key is None else deployment.folder / tls.key
+    return Certificates(deployment.folder / tls.root_ca, own, key)

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.gates import LATE, Gates
-from coopenv.cars.backend.station import Station
+from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Gate, GateClock
 from coopenv.cars.gate.process import Link
-from coopenv.cars.limits import USUAL
-from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.samples import Pose, Sample, Twist
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.processes import wait_until
@@ -129,7 +127,7 @@ class Yard:
 @pytest.fixture
 def yard(monkeypatch: pytest.MonkeyPatch) -> Yard:
     made = Yard()
-    monkeypatch.setattr("coopenv.cars.backend.gates.time", Ticking(made.tell))
+    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(made.tell))
     return made
 
 
@@ -166,7 +164,7 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
             yard.stop("a")
 
     arm = yard.gates._arm
-    monkeypatch.setattr("coopenv.cars.backend.gates.time", Ticking(during))
+    monkeypatch.setattr("coopenv.cars.backend.station.time", Ticking(during))
     monkeypatch.setattr(
         yard.gates, "_arm", lambda car, on, nonce: arm(car, on, nonce) if car == "a" or not on else None
     )

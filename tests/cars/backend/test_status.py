@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.backend import status
-from coopenv.cars.backend.status import StatusBoard
+from coopenv.cars.backend import start
+from coopenv.cars.backend.start import StatusBoard
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote
 from coopenv.cars.fake import messages
@@ -74,9 +74,9 @@ def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPat
     talk, now = Talk(), time.monotonic()
     talk.all_is_well()
     talk.board.begin()
-    monkeypatch.setattr(status.time, "monotonic", lambda: now + 1.5)
+    monkeypatch.setattr(start.time, "monotonic", lambda: now + 1.5)
     assert talk.board.obstacle(CAR) == talk.board.happened(CAR) == ""
-    monkeypatch.setattr(status.time, "monotonic", lambda: now + 2.5)
+    monkeypatch.setattr(start.time, "monotonic", lambda: now + 2.5)
     assert talk.board.obstacle(CAR).endswith(SVEA.topic_of(CAR, Role.STATE))
     assert talk.board.happened(CAR)
 

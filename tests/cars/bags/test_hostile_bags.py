@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from coopenv import CoopenvError, DataError
-from coopenv.backends import unpacking
+from coopenv.backends.mcap import container
 from coopenv.cars import codec
 from coopenv.cars.bags import files, limits
 from coopenv.cli import main
@@ -62,7 +62,7 @@ def test_a_bag_that_unpacks_to_far_more_than_it_is(form: str, tmp_path: Path) ->
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert "\n" not in str(caught.value)
-    assert peak < 2.5 * unpacking.AT_ONCE
+    assert peak < 2.5 * container.AT_ONCE
 
 
 def test_a_value_of_a_database_that_is_too_large(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_value_of_a_database_that_is_too_large(tmp_path: Path) -> None:
 def test_chunks_that_unpack_to_much_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = bomb(tmp_path / "drive", "mcap STORAGE", 2**20, 4)
     assert read(path) == 4
-    monkeypatch.setattr(unpacking, "AT_ONCE", 2 * 2**20)
+    monkeypatch.setattr(container, "AT_ONCE", 2 * 2**20)
     with pytest.raises(DataError, match="would unpack to"):
         read(path)
 

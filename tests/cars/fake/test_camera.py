@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.cars.lens import bearings, detections
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import read
+from coopenv.cars.readings import bearings, detections, read
 from coopenv.cars.samples import Calibration
 from tests.helpers.fakes import CROSSING, EXACT, MARKERS, OVERTAKING, Stage
 

@@ -15,7 +15,7 @@ import pytest
 
 import coopenv
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.backend.opening import scenario_of
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.fake.fleet import FakesError, fakes, free_port
 from coopenv.cars.profile import presence_of

@@ -14,12 +14,11 @@ import pytest
 from typer.testing import CliRunner
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.gates import Gates
+from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.fake.fleet import open_fake, run
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
-from coopenv.cars.limits import Limits
-from coopenv.cars.profile import RESET_TOPIC, SVEA, Role, presence_of
+from coopenv.cars.profile import RESET_TOPIC, SVEA, Limits, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Hub, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app

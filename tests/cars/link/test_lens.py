@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import root
 
-from coopenv.cars.lens import rays
+from coopenv.cars.readings import rays
 from coopenv.cars.samples import Calibration
 from coopenv.estimation.lens import distort, largest_radius, undistort
 from coopenv.world.camera import undistort as simulated

@@ -218,7 +218,7 @@ def test_covariances_turn_to_the_map_as_errors_do(coordinates: Coordinates) -> N
 
 def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> None:
     """Undistorted pixels of the annotations, by the calibration in the file, are the bearings again."""
-    from coopenv.cars.lens import directions
+    from coopenv.cars.readings import directions
     from coopenv.estimation.lens import undistort
 
     made, _, log, _ = crossing

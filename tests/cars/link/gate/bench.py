@@ -10,8 +10,7 @@ from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, Reason
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.limits import Limits
-from coopenv.cars.profile import SVEA, Drive, Role
+from coopenv.cars.profile import SVEA, Drive, Limits, Role
 from tests.cars.link.gate import messages
 
 CAR = "svea7"

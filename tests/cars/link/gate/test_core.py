@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.cars.gate.core import MOST_AHEAD, TIMEOUT, GateMode, Reason
-from coopenv.cars.limits import Limits
-from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Limits, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 

@@ -7,7 +7,7 @@ import socket
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.transport.endpoints import Address, address_of, trouble_at
+from coopenv.cars.transport.base import Address, address_of, trouble_at
 from tests.helpers.wire import free_port
 
 

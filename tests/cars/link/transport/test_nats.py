@@ -16,10 +16,9 @@ import pytest
 from coopenv.cars.codec import empty, encode
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Arrival, LinkError
+from coopenv.cars.transport.base import Arrival, Certificates, LinkError
 from coopenv.cars.transport.nats import MOST_WAITING, open_nats
-from coopenv.cars.transport.open import open_transport
-from coopenv.cars.transport.zenoh import Certificates
+from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.authority import Authority
 from tests.helpers.brokers import nats_server
 from tests.helpers.processes import wait_until

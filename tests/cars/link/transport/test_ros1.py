@@ -21,10 +21,9 @@ from coopenv.cars.codec import decode, decode_ros1, encode, header, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import ros1
-from coopenv.cars.transport.base import Arrival, LinkError
-from coopenv.cars.transport.endpoints import Address
-from coopenv.cars.transport.open import open_transport
+from coopenv.cars.transport.base import Address, Arrival, LinkError
 from coopenv.cars.transport.ros1 import ENVELOPE, open_ros1, opened, sealed
+from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.brokers import ros_master
 from tests.helpers.processes import start, wait_until
 from tests.helpers.wire import free_port, listening

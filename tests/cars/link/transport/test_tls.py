@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport.base import Arrival, LinkError
-from coopenv.cars.transport.open import open_transport
-from coopenv.cars.transport.zenoh import Certificates, open_zenoh
+from coopenv.cars.transport.base import Arrival, Certificates, LinkError
+from coopenv.cars.transport.zenoh import open_transport, open_zenoh
 from tests.helpers.authority import Authority
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port
