@@ -87,10 +87,10 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 LINES_AND_FILES = {
     ".": (150, 2),
     "api": (4300, 23),
-    "backends": (3400, 19),
+    "backends": (3320, 17),
     "base": (1250, 11),
     "bench": (4820, 21),
-    "cars": (8700, 47),
+    "cars": (8650, 40),
     "cli": (2200, 8),
     "estimation": (1815, 11),
     "evaluation": (450, 3),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (2950, 14),
     "training": (1300, 7),
     "viz": (4925, 21),
-    "world": (4300, 17),
+    "world": (4250, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

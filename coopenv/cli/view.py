@@ -207,7 +207,7 @@ class ViewOptions(SceneOptions):
 
     def _cars(self) -> "Reel":
         """Return the cars of a deployment, which are observed and not driven."""
-        from coopenv.cars.backend.backend import open_svea
+        from coopenv.cars.backend.opening import open_svea
         from coopenv.runs.reels import EngineReel
 
         deployment = self.deployment
@@ -231,8 +231,7 @@ def view(given: ViewOptions) -> None:
     """
     from coopenv.runs.console import compile_notice
     from coopenv.runs.reels import vehicle_index
-    from coopenv.runs.view import Viewer
-    from coopenv.runs import view
+    from coopenv.runs.view import Viewer, serving
     from coopenv.viz.web.page import viser_module
 
     viser_module()

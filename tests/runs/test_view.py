@@ -20,8 +20,7 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.reels import FAULTS, EngineReel, Reel, SavedReel, vehicle_index
 from coopenv.runs.scenes import driver_of, open_source, scene_of
-from coopenv.runs.view import Viewer, free_port
-from coopenv.runs import view
+from coopenv.runs.view import Viewer, free_port, serving
 from coopenv.viz.scene import Source
 from tests.helpers.fleet import Fleet
 
