@@ -15,7 +15,7 @@ from coopenv.estimation.poses import Array, exp_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import Scenario
 
-FIELDS = ("told_shift", "told_turn")
+FIELDS = ("broadcast_shift", "broadcast_turn")
 """Of the state, at every tick."""
 
 

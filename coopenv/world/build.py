@@ -123,7 +123,7 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
 
 
 def fault_switches(scenario: Scenario) -> dict[str, int]:
-    """Return which faults any vehicle has, so that the others cost nothing."""
+    """Return the faults that any vehicle has; faults of no vehicle cost nothing."""
     everybody = scenario.all_faults
     return {
         "clocks": int(any(f.clock_offset > 0.0 for f in everybody)),
@@ -192,7 +192,7 @@ def _at_rate(std: float, stated: float | str, actual: float) -> float:
 
 
 GRAMIAN_RATE = 20.0
-"""Hz at which the sliding Gramian is sampled: it says how the scene is seen over a second, not within a frame."""
+"""Hz at which the sliding Gramian is sampled: it measures the view of the scene over a second."""
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
@@ -281,7 +281,7 @@ def _start(scenario: Scenario) -> dict[str, Any]:
     poses = [*(None for _ in scenario.landmarks), *(vehicle.initial_pose for vehicle in scenario.vehicles)]
     motions = [vehicle.motion for vehicle in scenario.vehicles]
     estimates = [vehicle.initial_estimate for vehicle in scenario.vehicles]
-    believed = [NOWHERE if e.position is None else np.array(e.position) - origin for e in estimates]
+    initial = [NOWHERE if e.position is None else np.array(e.position) - origin for e in estimates]
     fixed = [e.yaw is not None or e.quaternion_wxyz is not None for e in estimates]
     turned = [rotation_of(e.yaw, e.quaternion_wxyz) for e in estimates]
     offsets = [rotation_of(None, e.orientation_offset_wxyz) for e in estimates]
@@ -299,7 +299,7 @@ def _start(scenario: Scenario) -> dict[str, Any]:
         "yaw_spread": [pose.yaw_spread if pose else 0.0 for pose in poses],
         "speed": [motion.initial_speed if motion.kind == "driven" else 0.0 for motion in motions],
         "estimate_fixed": [e.position is not None for e in estimates],
-        "estimate_position": [np.add(p, e.position_offset) for p, e in zip(believed, estimates, strict=True)],
+        "estimate_position": [np.add(p, e.position_offset) for p, e in zip(initial, estimates, strict=True)],
         "estimate_radius": [e.position_radius for e in estimates],
         "orientation_fixed": fixed,
         "estimate_rotation": [(R if f else np.eye(3)) @ o for R, f, o in zip(turned, fixed, offsets, strict=True)],
@@ -379,7 +379,7 @@ def _observer(scenario: Scenario) -> dict[str, Any]:
         "rate": min(scenario.rates.observer or camera, camera),
         "gramian_stride": stride,
         "block_ticks": stride * max(1, block),
-        "block_way": (o.gramian_distance or 0.0) / GRAMIAN_BLOCKS,
+        "block_distance": (o.gramian_distance or 0.0) / GRAMIAN_BLOCKS,
         "blocks": GRAMIAN_BLOCKS,
     }
 

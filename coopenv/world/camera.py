@@ -1,7 +1,7 @@
 """Camera: which targets are in view and not occluded, and their noisy unit bearings.
 
 A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame; of a
-camera that pans in that frame without pan, as the vehicle knows the angle, so that all who read it need not.
+camera that pans in that frame without pan, as the vehicle knows the angle; readers of a bearing need no pan.
 """
 
 from typing import Any
@@ -57,7 +57,7 @@ def body_bearing(model: Any, state: Any, world: int, vehicle: int, target: int):
 def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, center: Any, half: Any) -> bool:
     """Return whether the segment origin + s direction, 0 < s < 1, passes through an oriented box (slab test).
 
-    `inverse_square` is 1 / |direction|^2; most boxes are told apart by their bounding spheres.
+    `inverse_square` is 1 / |direction|^2; bounding spheres rule most boxes out.
     """
     reach = origin.dtype(1.0e-12)
     to_center = center - origin
@@ -84,7 +84,7 @@ def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, c
 
 @wp.func
 def behind_building(model: Any, origin: Any, direction: Any, inverse_square: Any) -> bool:
-    """Return whether a building is in the way of a line of sight; `inverse_square` is 1 / |direction|^2."""
+    """Return whether a building occludes a line of sight; `inverse_square` is 1 / |direction|^2."""
     for k in range(model.obstacles):
         if segment_hits_box(
             origin,
@@ -233,7 +233,7 @@ def noisy_bearing(noise: Any, level: Any, bearing: Any, words: Any):
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
     """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame.
 
-    Nobody sees who is absent, and who is absent sees nobody.
+    An absent vehicle sees no target and is seen by no vehicle.
     """
     if state.present[world, target] == 0 or state.present[world, model.landmarks + vehicle] == 0:
         return OUT_OF_VIEW

@@ -57,7 +57,7 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
 
 @device_function
 def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building or the body of another one of the first `count` agents."""
+    """Return 1 when a vehicle's box overlaps a building or the body of another of the first `count` agents."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
@@ -193,7 +193,7 @@ def gradually(d: Any, command: Any, before: Any, duration: Any):
 
 @wp.func
 def decide(model: Any, state: Any, actions: Any, world: int):
-    """Turn the actions of a decision that begins into commands; who has ended is to stand."""
+    """Turn the actions of a decision into commands; a vehicle whose episode has ended stops."""
     for vehicle in range(model.vehicles):
         for k in range(model.action_size):
             state.action[world, vehicle, k] = sanitised(actions[world, vehicle, k])
@@ -289,16 +289,16 @@ def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, comma
         new_speed = type(speed)(0.0)
     half = type(speed)(0.5)
     mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
-    way = mid_speed * dt
+    distance = mid_speed * dt
     o = type(position)()
-    turn = type(position)(o[0], o[1], way * wp.tan((steering + new_steering) * half) / d.wheelbase)
-    new_R, new_position = increment(R, position, type(position)(way, o[1], o[2]), turn, type(speed)(1.0))
+    turn = type(position)(o[0], o[1], distance * wp.tan((steering + new_steering) * half) / d.wheelbase)
+    new_R, new_position = increment(R, position, type(position)(distance, o[1], o[2]), turn, type(speed)(1.0))
     return new_R, new_position, new_speed, new_steering
 
 
 @wp.func
 def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
-    """Advance a driven vehicle in short steps; one that has ended stands still."""
+    """Advance a driven vehicle in short steps; a vehicle whose episode has ended stands still."""
     agent = model.landmarks + vehicle
     limits = model.dynamics[vehicle]
     R = state.rotation[world, agent]
@@ -327,7 +327,7 @@ def yaw_rate(d: Any, speed: Any, steering: Any):
 
 @wp.func
 def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any, tick: int):
-    """Drive a vehicle through one camera tick, keeping its true twist at every odometry sample on the way.
+    """Drive a vehicle through one camera tick, keeping its true twist at every odometry sample.
 
     Sample m is taken at m / odometry_rate; those in (t_{tick-1}, t_tick] belong to this tick.
     """

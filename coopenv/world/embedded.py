@@ -29,7 +29,7 @@ class Nothing:
 
 @wp.struct
 class Now:
-    """The tick that is under way."""
+    """The current tick."""
 
     tick: wp.int32  # time since the start in units of `model.camera_period`: its number, where ticks come regularly
     period: wp.float64  # s since the last tick
@@ -59,9 +59,9 @@ class Messages:
     """How what an embedded observer sends looks to observers on the host (`coopenv.observers.kernel_observer`)."""
 
     write: Callable[[Any], Any]
-    """(KernelObserver): return the `Message` that `send` has put on the air."""
+    """(KernelObserver): return the `Message` that `send` has broadcast."""
     read: Callable[[Any, int, Any, int], None]
-    """(KernelObserver, sender, Message, sent): put a message where the observer finds what it has received; `sent` is
+    """(KernelObserver, sender, Message, sent): put a message into the observer's inbox; `sent` is
     when, in the kernels' time. Raises ValueError or a CoopenvError where the message is malformed."""
     tampered: Callable[[Any], Any] | None = None
     """(Message): return a message whose further contents agree with what its position and covariance claim, for studies
@@ -72,7 +72,7 @@ class Messages:
 class Embedded:
     """An observer that runs in the world's kernels.
 
-    Its functions read what a vehicle senses and hears from `state`, write its estimate there (`estimate_rotation`,
+    Its functions read what a vehicle senses and receives from `state`, write its estimate there (`estimate_rotation`,
     `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`. `model` and
     `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else.
     """
@@ -84,9 +84,9 @@ class Embedded:
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
     covariance is `coopenv.world.v2x.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
-    for a vehicle that starts anew, see `[faults.restart]`."""
+    for a vehicle that restarts, see `[faults.restart]`."""
     send: Any
-    """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry; called
+    """(model, state, memory, world, vehicle, tick): broadcast what the V2X pose estimate does not carry; called
     at every tick, after `start` as well."""
     memory: Any = Nothing
     """A Warp struct whose arrays are declared with `coopenv.world.state.array`, the axes W (worlds) and N (vehicles)
@@ -135,7 +135,7 @@ def start_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int)
 
 @device_function
 def estimate_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
-    """Leave the estimate as it is: somebody else writes it."""
+    """Leave the estimate unchanged: the host writes it."""
 
 
 @device_function

@@ -29,9 +29,9 @@ from coopenv.base.installation import available_cores
 from coopenv.world.warp_internals import field_types, replay_of
 
 ATTEMPTS = 3
-"""Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
+"""Attempts to load a module: the second rebuilds it, the third is for two processes that rebuild the same one."""
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
-LONGEST_COMPILATION = 120.0  # s; who holds a module for longer has been stopped, by Ctrl-Z for example
+LONGEST_COMPILATION = 120.0  # s; a process that holds a lock for longer is taken for suspended (Ctrl-Z)
 _MODULE, _LOCKS = "wp_", "locks"
 """How names of folders of modules begin; the folder of the locks."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
@@ -65,9 +65,9 @@ def launch(kernel: wp.Kernel, **options: Any) -> Any:
     if name in _loaded:
         try:
             return wp.launch(kernel, **options)
-        except Exception:  # a function of it has been defined anew, and what the cache has of that is damaged
+        except Exception:  # one of its functions was redefined, and its cached build is damaged
             _loaded.discard(name)
-    with _alone(name):
+    with _locked(name):
         done = _launch(kernel, options)
     _loaded.add(name)
     return done
@@ -91,12 +91,12 @@ def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
 
 
 @contextmanager
-def _alone(name: str) -> Iterator[None]:
-    """Let one process at a time load a module, so that the others find what it has compiled."""
-    place, descriptor = cache_folder() / _LOCKS / name, None
+def _locked(name: str) -> Iterator[None]:
+    """Let one process at a time load a module, so that other processes find the compiled module."""
+    path, descriptor = cache_folder() / _LOCKS / name, None
     with suppress(OSError):  # a cache that is only read, or on a disk without locks
-        place.mkdir(parents=True, exist_ok=True)
-        descriptor = lock(place, LONGEST_COMPILATION)
+        path.mkdir(parents=True, exist_ok=True)
+        descriptor = lock(path, LONGEST_COMPILATION)
     try:
         yield
     finally:
@@ -185,11 +185,11 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
 def inlining(threshold: int) -> dict[str, Any]:
     """Return options of kernels in which functions up to a cost are inlined: Warp's 9000 takes long to compile.
 
-    It serves functions that are handed large records, of which others than `device_function`s get copies.
+    It serves functions with large records as arguments, which are copied except for a `device_function`.
     """
     flags = (wp.config.cpu_compiler_flags or "").split()
     if not any("-inline-threshold" in flag for flag in flags):
-        return {}  # somebody has chosen others
+        return {}  # flags set by the user
     kept = [flag for flag in flags if "-inline-" not in flag]
     return {"cpu_compiler_flags": " ".join([*kept, f"-mllvm=-inline-threshold={threshold}"])}
 

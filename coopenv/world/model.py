@@ -285,7 +285,7 @@ def model_struct(p: Precision) -> Any:
         rate: wp.float64  # Hz
         gramian_stride: wp.int32  # ticks between the samples of the sliding Gramian
         block_ticks: wp.int32  # ticks per block of it, a multiple of the stride
-        block_way: scalar  # m per block of it; 0: blocks last so many ticks
+        block_distance: scalar  # m per block of it; 0: blocks last so many ticks
         blocks: wp.int32
 
     @wp.struct
@@ -305,7 +305,7 @@ def model_struct(p: Precision) -> Any:
         vehicles: wp.int32
         agents: wp.int32
         obstacles: wp.int32
-        traffic: wp.int32  # bodies that move and are nobody's target, at most
+        traffic: wp.int32  # moving bodies without identity, at most
         sensed: wp.int32  # 1: `topology.mode` asks for what is in view, 0: for every neighbour
         sensing: wp.int32  # SENSED, IDEAL or BLIND
         camera_rate: wp.float64  # Hz
@@ -317,9 +317,9 @@ def model_struct(p: Precision) -> Any:
         action_size: wp.int32  # numbers of an action
         horizon_ticks: wp.int32
         last_outcome: wp.int32  # largest value of `ended`
-        map_size: wp.int32  # landmarks of the map that an observation tells of
-        route_step: scalar  # m ahead on the way that an observation tells of, and twice, four and eight times
-        targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1
+        map_size: wp.int32  # landmarks of the map in an observation
+        route_step: scalar  # m ahead on the route of the points in an observation: 1, 2, 4 and 8 times
+        targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and received, ascending, then -1
         target_count: wp.array(dtype=wp.int32)  # (N,)
         order: wp.array(dtype=wp.int32)  # (N,) leaders first
         rank: wp.array(dtype=wp.int32)  # (N,) place in the order
@@ -333,8 +333,8 @@ def model_struct(p: Precision) -> Any:
         noise: wp.array(dtype=Noise)  # (N,)
         fault: wp.array(dtype=Fault)  # (N,)
         clocks: wp.int32  # 1: some clock is off
-        restarts: wp.int32  # 1: some vehicle may start anew
-        alters: wp.int32  # 1: some message may say something else than its sender believes
+        restarts: wp.int32  # 1: some vehicle may restart
+        alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         radio: Radio
         observer: Observer
         judgement: Judgement

@@ -141,7 +141,7 @@ def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: 
 
 @wp.func
 def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Take the odometry samples of one camera tick, whose motion is over, and sum them up to its increment."""
+    """Take the odometry samples of one camera tick after its motion and sum them to its increment."""
     drift(model, state, world, vehicle, tick)
     tick_end = wp.float64(tick) * model.camera_period
     now = wp.float64(tick - 1) * model.camera_period

@@ -62,7 +62,7 @@ def position_variance(P: Any, p_hat: Any):
 
 @device_function
 def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: int) -> bool:
-    """Return whether the observer can use this target now: seen, and its position known or heard."""
+    """Return whether the observer can use this target now: seen, and its position known or received."""
     if state.sight[world, vehicle, target] != VISIBLE:
         return False
     if target < model.landmarks:
@@ -82,7 +82,7 @@ def known_position(model: Any, state: Any, world: int, vehicle: int, target: int
 
 @device_function
 def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, block: int, dt: Any):
-    """Add C^T C dt, dt being the time (or the way) since the last sample, to a block of the sliding Gramian.
+    """Add C^T C dt, dt being the time (or the distance) since the last sample, to a block of the sliding Gramian.
 
     In map axes the transition matrix of A_i is the identity, so that blocks simply add up; the spectrum is the same
     as in the body frame of the window's start. C is taken at the estimate, as the observer itself knows it.
@@ -110,7 +110,7 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
 
 @device_function
 def empty_block(state: Any, world: int, vehicle: int, block: int):
-    """Begin a block of the sliding Gramian anew."""
+    """Reset a block of the sliding Gramian."""
     zero = type(state.gramian_11[world, vehicle, block])()
     state.gramian_11[world, vehicle, block] = zero
     state.gramian_12[world, vehicle, block] = zero
@@ -129,29 +129,29 @@ def sample_by_time(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 
 @device_function
-def sample_by_way(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Add the way since the last sample to the sliding Gramian over a way: nothing while the vehicle stands."""
-    since = state.gramian_way[world, vehicle]
-    way = state.way_driven[world, vehicle] - since
-    if way > type(way)(0.0):
-        first = int(since / model.observer.block_way)
-        last = int((since + way) / model.observer.block_way)
+def sample_by_distance(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Add the distance since the last sample to the sliding Gramian over a distance."""
+    since = state.gramian_distance_at[world, vehicle]
+    distance = state.distance_driven[world, vehicle] - since
+    if distance > type(distance)(0.0):
+        first = int(since / model.observer.block_distance)
+        last = int((since + distance) / model.observer.block_distance)
         for k in range(wp.max(first, last - model.observer.blocks) + 1, last + 1):
             empty_block(state, world, vehicle, k % model.observer.blocks)
-        accumulate_gramian(model, state, world, vehicle, tick, last % model.observer.blocks, way)
-        state.gramian_way[world, vehicle] = since + way
+        accumulate_gramian(model, state, world, vehicle, tick, last % model.observer.blocks, distance)
+        state.gramian_distance_at[world, vehicle] = since + distance
 
 
 @device_function
 def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Add this tick to the sliding Gramian when a sample is due."""
-    by_way = model.observer.block_way > type(model.observer.max_turn)(0.0)
-    if by_way:
+    by_distance = model.observer.block_distance > type(model.observer.max_turn)(0.0)
+    if by_distance:
         forward = state.increment_translation[world, vehicle][0]
-        state.way_driven[world, vehicle] = state.way_driven[world, vehicle] + forward
+        state.distance_driven[world, vehicle] = state.distance_driven[world, vehicle] + forward
     if tick % model.observer.gramian_stride == 0:
-        if by_way:
-            sample_by_way(model, state, world, vehicle, tick)
+        if by_distance:
+            sample_by_distance(model, state, world, vehicle, tick)
         else:
             sample_by_time(model, state, world, vehicle, tick)
 

@@ -72,7 +72,7 @@ def random_words(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, 
 
 @wp.func
 def pair(vehicle: int, other: int) -> int:
-    """Return the subject of what concerns a vehicle and another agent."""
+    """Return the subject of random numbers of a pair of a vehicle and another agent."""
     return vehicle * 65536 + other
 
 
@@ -82,11 +82,11 @@ CELL_SHIFT = wp.constant(wp.uint32(28))
 
 @wp.func
 def on_cells(words: vec4u, seed: wp.uint64, first: bool, second: bool, third: bool) -> vec4u:
-    """Return the words of a place such that the numbers of its cells along the axes that count have the right parity.
+    """Return random words for a position whose grid-cell indices have the parity of a set (training or held-out).
 
-    The sum is even in worlds for training and odd in those for evaluation (bit 31 of the key), so that none of the
-    latter's places is in a cell of the former's. Where several axes count, each coordinate by itself stays uniform: the
-    last one is moved to the cell beside, which is right for one half of what the others may be.
+    The sum of the indices is even in training worlds and odd in evaluation worlds (bit 31 of the key), so that the two
+    sets share no cell. Each coordinate alone stays uniform: a wrong parity is corrected by the neighbouring cell along
+    the last axis, for half of the values of the other axes.
     """
     one = wp.uint32(1)
     odd = wp.uint32(seed >> wp.uint64(31)) & one

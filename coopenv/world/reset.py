@@ -41,7 +41,7 @@ EVERY_VEHICLE = wp.constant(-1)
 
 @wp.func
 def draw_presence(model: Any, state: Any, world: int):
-    """Draw who is there in an episode, and the pace of each prescribed motion."""
+    """Draw the agents that are present in an episode, and the pace of each prescribed motion."""
     one = type(model.routes.height)(1.0)
     for agent in range(model.agents):
         words = random_words(state.seed[world], state.episode[world], 0, agent, PRESENCE)
@@ -61,7 +61,7 @@ def draw_presence(model: Any, state: Any, world: int):
 
 @wp.func
 def keep_one_vehicle(model: Any, state: Any, world: int):
-    """Let one of the vehicles stay where all are absent: a driven one if there is any."""
+    """Keep one vehicle, driven if there is one, in an episode whose draw has none."""
     candidates = int(0)
     for agent in range(model.landmarks, model.agents):
         if model.motion.kind[agent] == DRIVEN or model.drawn.any_driven == 0:
@@ -210,8 +210,8 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.gramian_12[world, vehicle, block] = type(R)()
         state.gramian_22[world, vehicle, block] = type(R)()
         state.gramian_time[world, vehicle, block] = o[0]
-    state.gramian_way[world, vehicle] = o[0]
-    state.way_driven[world, vehicle] = o[0]
+    state.gramian_distance_at[world, vehicle] = o[0]
+    state.distance_driven[world, vehicle] = o[0]
 
 
 @wp.func
@@ -237,7 +237,7 @@ def random_turn(largest: Any, words: Any, zero: Any):
 
 
 @wp.func
-def believe(model: Any, state: Any, world: int, vehicle: int):
+def set_initial_estimate(model: Any, state: Any, world: int, vehicle: int):
     """Draw the initial estimate and set P(0)."""
     agent = model.landmarks + vehicle
     seed = state.seed[world]
@@ -268,7 +268,7 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
 
 @wp.func
 def place_everybody(model: Any, state: Any, world: int):
-    """Begin at tick 0, draw what the world draws, and put everybody in place."""
+    """Begin at tick 0: draw the world's random quantities and place all bodies."""
     state.tick[world] = 0
     state.exhausted[world] = 0
     draw_parameters(model, state, world)
@@ -283,7 +283,7 @@ def place_everybody(model: Any, state: Any, world: int):
 def begin_sensing(model: Any, state: Any, world: int):
     """Draw initial estimates and lasting errors, look for contact, take the first frame."""
     for vehicle in range(model.vehicles):
-        believe(model, state, world, vehicle)
+        set_initial_estimate(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)
         draw_faults(model, state, world, vehicle)
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)

@@ -30,7 +30,7 @@ def route_length(state: Any, world: int, vehicle: int):
 
 @device_function
 def route_tangent(state: Any, world: int, vehicle: int, segment: int, share: Any):
-    """Return the horizontal direction of a route, of length 1, at a share in [0, 1] of the way along a segment.
+    """Return the horizontal direction of a route, of length 1, at a fraction in [0, 1] of a segment.
 
     At a point it is parallel to the chord of its neighbours, along a segment it turns evenly.
     """
@@ -47,7 +47,7 @@ def route_tangent(state: Any, world: int, vehicle: int, segment: int, share: Any
 
 @device_function
 def place_on_route(state: Any, world: int, vehicle: int, x: Any, y: Any):
-    """Return (s, lateral offset, heading) of the place of a vehicle's route that is nearest to a point of the map.
+    """Return (arc length, lateral offset, heading) at the point of a vehicle's route nearest to a point of the map.
 
     Arguments and results in m and rad; the offset of the point is positive to the left of the route. All are 0
     without a route.
@@ -120,7 +120,7 @@ def goal_distance(model: Any, state: Any, world: int, vehicle: int):
 
 @device_function
 def remaining_way(model: Any, state: Any, world: int, vehicle: int):
-    """Return the way left to the goal, m: along the route that was drawn, or as the crow flies where none was."""
+    """Return the distance to the goal, m: along the drawn route, or straight without a route."""
     if has_routes(model, vehicle):
         p = state.position[world, model.landmarks + vehicle]
         s, _, _ = place_on_route(state, world, vehicle, p[0], p[1])
@@ -173,7 +173,7 @@ def wave(share: Any, first: Any, second: Any):
 
 @wp.func
 def one_of(word: wp.uint32, first: int, count: int) -> int:
-    """Return one of the numbers first .. first + count - 1, by a random word."""
+    """Return a random number of first .. first + count - 1."""
     return first + wp.min(int(uniform(word, wp.float64(1.0)) * wp.float64(count)), count - 1)
 
 
@@ -240,7 +240,7 @@ def start_on_route(model: Any, state: Any, world: int, vehicle: int, s: Any):
 def go_straight(model: Any, state: Any, world: int, vehicle: int):
     """Make the route of a vehicle without routes: the straight line from its nominal start to its goal, if it has one.
 
-    The nominal start is known beforehand; a line from the true one would tell a vehicle where it is.
+    The line starts at the nominal start, which is known; the true start would reveal the vehicle's position.
     """
     if has_routes(model, vehicle):
         return

@@ -63,7 +63,7 @@ def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "
     """Return a record of zeros of a struct whose fields are declared with `array`; `sizes` are lengths by letter.
 
     Along the axis `shared`, where it comes second, all indices stand for one and the same row: whoever needs the rows
-    of one vehicle alone can then index them by the vehicle without room for the others'.
+    of one vehicle can then index them by the vehicle without memory for the other vehicles.
     """
     result = record()
     for name, field in fields(record).items():
@@ -107,7 +107,7 @@ def parts(record: Any, struct: Any) -> dict[str, Any]:
 
 
 def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
-    """Yield the way to every field of a structured type that has no fields itself."""
+    """Yield the path of every field of a structured type that has no fields itself."""
     if dtype.names is None:
         yield ()
     for name in dtype.names or ():
@@ -257,13 +257,13 @@ def state_struct(p: Precision) -> Any:
         speed: array("WN", scalar)  # of the bicycle, m/s
         steering: array("WN", scalar)  # rad
         pan: array("WN", scalar)  # angle by which the camera is turned to the left, rad
-        action: array("WNU", scalar)  # of the decision under way, in [-1, 1]
+        action: array("WNU", scalar)  # of the current decision, in [-1, 1]
         command: array("WN", vec4)  # what it asks for: speed m/s, steering rad, acceleration m/s^2, pan rad
         last_command: array("WN", vec4)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
         collided: array("WN", wp.int32)  # touching something now
 
-        traffic_position: array("WZ", vec3)  # centres of boxes that are nobody's target, map
+        traffic_position: array("WZ", vec3)  # centres of boxes without identity, map
         traffic_rotation: array("WZ", mat33)  # body to map
         traffic_half: array("WZ", vec3)  # half of their edges, m; zero: not there
 
@@ -274,15 +274,15 @@ def state_struct(p: Precision) -> Any:
         gyro_bias: array("WN", vec3)  # truth, rad/s
         slip: array("WN", vec2)  # truth: share that the wheels read too much, side slip angle in rad; zero: none
         camera_turn: array("WN", vec3)  # truth: rotation vector of the camera in its frame, beside the nominal one
-        camera_shift: array("WN", vec3)  # truth: of the camera in the body frame, beside the nominal place, m
+        camera_shift: array("WN", vec3)  # truth: of the camera in the body frame, from the nominal position, m
         camera_focal: array("WN", scalar)  # truth: its focal length is (1 + this) times the nominal one
 
         clock: array("WN", wp.int32)  # truth: ticks by which a vehicle's clock is ahead
-        restart_tick: array("WN", wp.int32)  # before which its observer starts anew; -1: never
+        restart_tick: array("WN", wp.int32)  # before which its observer restarts; -1: never
         lie_tick: array("WN", wp.int32)  # from which on its messages are lies; -1: never
         lie_vector: array("WN", vec3)  # of its lie, m or m/s, map
-        told_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
-        told_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
+        broadcast_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
+        broadcast_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
         odometry_velocity: array("WN", vec3)  # last sample, m/s
         odometry_angular_velocity: array("WN", vec3)  # last sample, rad/s
@@ -300,22 +300,22 @@ def state_struct(p: Precision) -> Any:
         arriving: array("WNN", wp.int32)  # per receiver and sender: tick of sending of what arrives now; -1: nothing
         inbox_rotation: array("WNN", mat33)  # per receiver and sender
         inbox_position: array("WNN", vec3)  # map
-        inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: never heard
-        inbox_stamp: array("WNN", wp.int32)  # the same as the receiver believes
+        inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: nothing received
+        inbox_stamp: array("WNN", wp.int32)  # the same by the receiver's clock
 
         estimate_rotation: array("WN", mat33)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame
         covariance: array("WN", mat66)  # P over (2 lambda, p)
         corrected_tick: array("WN", wp.int32)  # tick of the observer's last correction
-        nis: array("WN", wp.float64)  # normalised innovation squared of its last tick, where it tells it
-        nis_dof: array("WN", wp.int32)  # degrees of freedom; 0: there was no correction, or it is not told
+        nis: array("WN", wp.float64)  # normalised innovation squared of its last tick, if the observer gives it
+        nis_dof: array("WN", wp.int32)  # degrees of freedom; 0: no correction, or not given
 
         gramian_11: array("WNB", mat33)  # block sums of int C^T C dt, map axes
         gramian_12: array("WNB", mat33)
         gramian_22: array("WNB", mat33)
-        gramian_time: array("WNB", scalar)  # s, or m where the window is a way
-        gramian_way: array("WN", scalar)  # m, `way_driven` at its last sample: the most so far
-        way_driven: array("WN", scalar)  # m forwards since the reset, by odometry; where the window is a way
+        gramian_time: array("WNB", scalar)  # s, or m where the window is a distance
+        gramian_distance_at: array("WN", scalar)  # m, `distance_driven` at its last sample: the most so far
+        distance_driven: array("WN", scalar)  # m forwards since the reset, by odometry; where the window is a distance
 
     return State
 

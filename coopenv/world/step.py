@@ -126,7 +126,7 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
                 send_message(model, state, memory, world, vehicle, 0)
 
     def revive(model: Model, state: State, memory: Memory, hold: Hold, ticks: int):
-        """Start the observers anew whose vehicle's restart falls into the next ticks. One thread per world."""
+        """Restart the observers of vehicles whose restart falls into the next ticks. One thread per world."""
         world = wp.tid()
         if hold[world] == 0:
             tick = state.tick[world]

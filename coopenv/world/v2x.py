@@ -34,13 +34,13 @@ MOST_CLOCK_TICKS = wp.constant(1.0e8)
 @wp.func
 def draw_faults(model: Any, state: Any, world: int, vehicle: int):
     """Draw what goes wrong with a vehicle in an episode."""
-    o = type(state.told_shift[world, vehicle])()
+    o = type(state.broadcast_shift[world, vehicle])()
     state.clock[world, vehicle] = 0
     state.restart_tick[world, vehicle] = NEVER
     state.lie_tick[world, vehicle] = NEVER
     state.lie_vector[world, vehicle] = o
-    state.told_shift[world, vehicle] = o
-    state.told_turn[world, vehicle] = o
+    state.broadcast_shift[world, vehicle] = o
+    state.broadcast_turn[world, vehicle] = o
     if model.clocks == 1:
         draw_clock(model, state, world, vehicle, o)
     if model.restarts == 1:
@@ -61,7 +61,7 @@ def draw_clock(model: Any, state: Any, world: int, vehicle: int, o: Any):
 
 @wp.func
 def draw_restart(model: Any, state: Any, world: int, vehicle: int, o: Any):
-    """Draw at which tick, the first one of a decision, a vehicle starts anew."""
+    """Draw the tick of a vehicle's restart, the first of a decision."""
     fault = model.fault[vehicle]
     one = o.dtype(1.0)
     words = random_words(state.seed[world], state.episode[world], 0, vehicle, RESTART)
@@ -102,7 +102,7 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if model.alters == 0:
         return
     fault = model.fault[vehicle]
-    shift = type(state.told_shift[world, vehicle])()
+    shift = type(state.broadcast_shift[world, vehicle])()
     turn = type(shift)()
     one = shift.dtype(1.0)
     if is_lying(state, world, vehicle, tick):
@@ -118,26 +118,26 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
             for axis in range(3):
                 shift[axis] += fault.corruption_size * signed_uniform(words[axis], one)
                 turn[axis] += fault.corruption_turn * signed_uniform(more[axis], one)
-    state.told_shift[world, vehicle] = shift
-    state.told_turn[world, vehicle] = turn
+    state.broadcast_shift[world, vehicle] = shift
+    state.broadcast_turn[world, vehicle] = turn
 
 
 @wp.func
 def as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, position: Any):
     """Return the pose that a vehicle broadcasts at this tick in place of (R, position), in their precision."""
-    told_R = R
-    told = position
+    sent_R = R
+    sent_position = position
     if model.alters == 1:
-        told = position + type(position)(state.told_shift[world, vehicle])
-        turn = type(position)(state.told_turn[world, vehicle])
+        sent_position = position + type(position)(state.broadcast_shift[world, vehicle])
+        turn = type(position)(state.broadcast_turn[world, vehicle])
         if wp.length_sq(turn) > turn.dtype(0.0):
-            told_R = R * exp_so3(turn)
-    return told_R, told
+            sent_R = R * exp_so3(turn)
+    return sent_R, sent_position
 
 
 @wp.func
 def claimed_std(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Return what a liar claims to know its pose by, rad and m; 0: what it knows."""
+    """Return the standard deviations that a lying sender claims for its pose, rad and m; 0: its own."""
     std = model.fault[vehicle].lie_std
     if model.alters == 0 or not is_lying(state, world, vehicle, tick):
         std = type(std)(0.0)
@@ -146,7 +146,7 @@ def claimed_std(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @wp.func
 def content_tick(model: Any, state: Any, world: int, sender: int, sent: int) -> int:
-    """Return the tick of whose message another message, sent at some tick, has the content."""
+    """Return the tick at which the content of a message was made: earlier than `sent` under the fault `replay`."""
     if model.alters == 1 and model.fault[sender].lie == REPLAY and is_lying(state, world, sender, sent):
         old = wp.max(sent - model.fault[sender].lie_replay, 0)
         if state.outbox_tick[world, sender, old % model.radio.slots] == old:
@@ -156,7 +156,7 @@ def content_tick(model: Any, state: Any, world: int, sender: int, sent: int) -> 
 
 @wp.func
 def stamp(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int) -> int:
-    """Return when a message that arrives at a tick was sent, as the receiver believes: both have clocks."""
+    """Return the tick of sending of a message by the receiver's clock; both clocks may be off."""
     if model.clocks == 0:
         return sent
     return wp.clamp(sent + state.clock[world, sender] - state.clock[world, receiver], 0, tick)
@@ -164,11 +164,11 @@ def stamp(model: Any, state: Any, world: int, receiver: int, sender: int, sent: 
 
 @wp.func
 def forget_everything(model: Any, state: Any, world: int, vehicle: int):
-    """Leave a vehicle that starts anew with what its computer knows by itself: it may be anywhere near the landmarks.
+    """Reset a vehicle that restarts to what its computer knows: the map alone.
 
-    Its estimate is amid them, in the map's axes; nothing has been heard.
+    Its estimate is the mean of the landmarks, in the map's axes; its inbox is empty.
     """
-    o = type(state.told_shift[world, vehicle])()
+    o = type(state.broadcast_shift[world, vehicle])()
     i3 = identity3(o)
     middle = type(o)()
     for landmark in range(model.landmarks):
@@ -186,7 +186,7 @@ def forget_everything(model: Any, state: Any, world: int, vehicle: int):
 
 @wp.func
 def has_restarted(model: Any, state: Any, world: int, vehicle: int) -> bool:
-    """Return whether a vehicle has started anew in this episode, before the next tick."""
+    """Return whether a vehicle has restarted in this episode, before the next tick."""
     begun = state.restart_tick[world, vehicle]
     return model.restarts == 1 and begun > 0 and state.tick[world] + 1 >= begun
 
@@ -202,32 +202,33 @@ def start_covariance(model: Any, state: Any, world: int, vehicle: int):
 
 @device_function
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due and it is there."""
+    """Broadcast a vehicle's estimate (Rhat, Rhat phat) if a message is due and the vehicle is present."""
     slot = tick % model.radio.slots
     sent = int(-1)
     if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
         sent = tick
         R = state.estimate_rotation[world, vehicle]
-        told_R, told = as_broadcast(model, state, world, vehicle, R, R * state.estimate_position[world, vehicle])
-        state.outbox_rotation[world, vehicle, slot] = told_R
-        state.outbox_position[world, vehicle, slot] = told
+        position = R * state.estimate_position[world, vehicle]
+        sent_R, sent_position = as_broadcast(model, state, world, vehicle, R, position)
+        state.outbox_rotation[world, vehicle, slot] = sent_R
+        state.outbox_position[world, vehicle, slot] = sent_position
     state.outbox_tick[world, vehicle, slot] = sent
 
 
 @device_function
 def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int):
-    """Let a receiver hear at a tick what a sender put on the air at another one, unless it has heard something newer.
+    """Copy a sender's message into the receiver's inbox, unless the message there has a later stamp.
 
-    By clocks that are off it may seem so.
+    Stamps are by clocks that may be off.
     """
-    believed = stamp(model, state, world, receiver, sender, sent, tick)
-    if model.clocks == 1 and believed <= state.inbox_stamp[world, receiver, sender]:
+    stamped = stamp(model, state, world, receiver, sender, sent, tick)
+    if model.clocks == 1 and stamped <= state.inbox_stamp[world, receiver, sender]:
         return
     slot = content_tick(model, state, world, sender, sent) % model.radio.slots
     state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
     state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
     state.inbox_tick[world, receiver, sender] = sent
-    state.inbox_stamp[world, receiver, sender] = believed
+    state.inbox_stamp[world, receiver, sender] = stamped
 
 
 @device_function
@@ -276,7 +277,7 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
 
 @device_function
 def fresh(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
-    """Return whether a message has been heard and is not older than the staleness limit."""
+    """Return whether a message has been received and is not older than the staleness limit."""
     sent = state.inbox_stamp[world, receiver, sender]
     if sent < 0:
         return False

@@ -131,7 +131,7 @@ class World:
             keys: of the random streams, one per world, reduced modulo 2^64; None (for all or for one) keeps a world's
                 key and draws a new episode from it.
             mask: (W,) bool.
-            options: for a source of ticks that is not on the device; others need none.
+            options: for a source of ticks on the host; None otherwise.
         """
         chosen = np.ones(self.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         if keys is not None:
@@ -195,7 +195,7 @@ class World:
         self._run(("receive", vehicle), host_kernels(self.precision)["receive"], PerWorld(self.mask), vehicle)
 
     def broadcast(self, vehicle: int) -> None:
-        """Let a vehicle, whose estimate has been written, send it."""
+        """Broadcast the estimate that has been written for a vehicle."""
         self._run(("broadcast", vehicle), host_kernels(self.precision)["broadcast"], PerWorld(self.mask), vehicle)
 
     def finish(self) -> None:

@@ -39,7 +39,7 @@ def test_it_is_the_mean_over_the_last_metres() -> None:
         engine.step(np.array([[[rng.uniform(-1, 1), 0.2]] * 4]) if tick % 6 == 1 else None, ticks=1)
         if tick % 3:
             continue
-        now = float(engine.view("way_driven")[0, 0])
+        now = float(engine.view("distance_driven")[0, 0])
         if now > way:
             R = engine.view("estimate_rotation")[0, 0]
             G = np.zeros((6, 6))
