@@ -26,7 +26,7 @@ from coopenv.world.embedded import Source
 from coopenv.world.model import Precision
 from coopenv.world.random import COUNT as PARAMETER_COUNT
 from coopenv.world.random import draw_parameters
-from coopenv.world.reset import believe, draw_presence, place_agent, place_vehicle
+from coopenv.world.reset import draw_presence, place_agent, place_vehicle, set_initial_estimate
 from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
 
@@ -163,7 +163,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
         position = record.true_position[0, vehicle]
         if wp.isfinite(position[0]):
             recall_truth(model, state, record, world, vehicle, 0)
-        believe(model, state, world, vehicle)
+        set_initial_estimate(model, state, world, vehicle)
         R = record.start_rotation[vehicle]
         if wp.isfinite(R[0, 0]):
             state.estimate_rotation[world, vehicle] = R
