@@ -21,7 +21,7 @@ class Drifting:
         self._now = time
         return vehicle in self.who and time >= self.since
 
-    def told(self, observer: Any, message: Message) -> Message:
+    def broadcast(self, observer: Any, message: Message) -> Message:
         """Return what is broadcast instead; what it tells of whom it saw agrees with it."""
         if message.position is None:
             return message
@@ -42,7 +42,7 @@ class Replaying:
         self._vehicle = vehicle
         return vehicle in self.who and time >= 15.0
 
-    def told(self, observer: Any, message: Message) -> Message:
+    def broadcast(self, observer: Any, message: Message) -> Message:
         """Return what is broadcast instead."""
         sent = self._sent.setdefault(self._vehicle, [])
         sent.append(message)

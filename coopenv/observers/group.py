@@ -48,7 +48,7 @@ class Tamper(Protocol):
     def applies(self, vehicle: int, time: float) -> bool:
         """Return whether it changes the message of a vehicle at a time, s."""
 
-    def told(self, observer: Observer, message: Message) -> Message:
+    def broadcast(self, observer: Observer, message: Message) -> Message:
         """Return what is broadcast in place of a message."""
 
 
@@ -130,10 +130,10 @@ class Group:
         observer, replay, kept = self.observers[vehicle], 0, 0
         self.mail.expect_as(vehicle, message)
         if interference is not None:
-            message = interference.told(observer, vehicle, message)
+            message = interference.broadcast(observer, vehicle, message)
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
         if tamper is not None and tamper.applies(vehicle, k * self.briefing.dt):
-            message = tamper.told(observer, message)
+            message = tamper.broadcast(observer, message)
         if not self.mail.post(vehicle, k, message, replay, kept) and unchanged:
             check_message(message)
 

@@ -37,7 +37,7 @@ class Interference:
             self, **{name: getattr(self, name)[k] for name in ("shift", "turn", "std", "replay", "restarts")}
         )
 
-    def told(self, observer: Any, vehicle: int, message: Message) -> Message:
+    def broadcast(self, observer: Any, vehicle: int, message: Message) -> Message:
         """Return the message that a vehicle broadcasts in place of one."""
         return altered(observer, message, self.shift[vehicle], self.turn[vehicle], float(self.std[vehicle]))
 

@@ -137,7 +137,7 @@ class Throws:
     def applies(self, vehicle: int, time: float) -> bool:
         return vehicle == 1
 
-    def told(self, observer: Any, message: Message) -> Any:
+    def broadcast(self, observer: Any, message: Message) -> Any:
         self.count += 1
         return self.messages[self.count % len(self.messages)](message)
 

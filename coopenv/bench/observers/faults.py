@@ -88,7 +88,7 @@ class Lie:
         """Return whether a message of a vehicle at a time (s) is a lie."""
         return vehicle == self.sender and time >= self.start
 
-    def told(self, observer: Any, message: Message) -> Message:
+    def broadcast(self, observer: Any, message: Message) -> Message:
         """Return the message as it is broadcast, see `interference.altered`."""
         return altered(observer, message, np.array(self.offset), std=self.std)
 

@@ -11,7 +11,7 @@ and the commands w, v, late by the lead and spread by the wheels' response, move
 
 over a tick: W is the integral of w + share (g - 1) w, g the wheels' gain as it was measured on one kind of robot (a
 share of 0 is another kind), G is that of g over the time in which a turn is commanded, T is that time, V and U are the
-integrals of v and v |w|. A robot told to drive straight does so. A step of the commanded rate takes effect a jitter
+integrals of v and v |w|. A robot that is to drive straight does so. A step of the commanded rate takes effect a jitter
 sooner or later, which leaves an error in the heading. All of this noise is as large as the innovations say
 (`NoiseLevel`). With no spread in the last nine numbers and a fixed level it is the textbook filter.
 
@@ -20,8 +20,8 @@ a share s of the innovation's variance that is due to motion and r the normalise
 
     d log p / dl = s (r - 1) / 2,    E[(d log p / dl)^2] = s^2 / 2
 
-(in a steady state the covariance grows with the deviation of the noise, not with its square). r is bounded, so that a
-misread bearing says little; what was learnt fades, so that another floor is found out.
+(in a steady state the covariance grows with the deviation of the noise, not with its square). r is bounded, so that an
+outlier has little effect; old information fades, so that the level adapts to another floor.
 """
 
 import math
@@ -34,6 +34,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers.planar.model import (
     ARC,
     BIAS,
+    COMMANDED,
     DRIFT,
     HEADING,
     LEAD,
@@ -46,14 +47,13 @@ from coopenv.observers.planar.model import (
     SPEED_SCALE,
     STATES,
     SWITCHING,
-    TOLD,
     TURN,
     TURN_OFFSET,
     TURN_SCALE,
     TURNING,
     CommandHistory,
+    OdometryStep,
     PlanarPose,
-    Step,
     Tuning,
     X,
     Y,
@@ -108,12 +108,12 @@ class PlanarMotion:
         self._off = np.zeros(2)  # m, along and across, that an unsure heading has led astray since it was seen
 
     def copy(self) -> Self:
-        """Return another one like it; what was commanded, and the level of the noise, they share."""
+        """Return a copy that shares the command history and the noise level."""
         other = copy(self)
         other.state, other.covariance = self.state.copy(), self.covariance.copy()
         return other
 
-    def advance(self, dt: float, turn: float, path: float) -> Step:
+    def advance(self, dt: float, turn: float, path: float) -> OdometryStep:
         """Move the estimate on by dt in s, over which the commands amount to a turn in rad and a path in m."""
         self.command(dt, turn, path)
         return self.move(dt)
@@ -124,14 +124,15 @@ class PlanarMotion:
             self.history = CommandHistory(self.tuning.wheels, MAX_LEAD_S, dt)
         self.history.add(dt, turn, path)
 
-    def move(self, dt: float) -> Step:
+    def move(self, dt: float) -> OdometryStep:
         """Move the estimate on by dt in s, by what was commanded."""
         k, s = self.tuning, self.state
         if self.history is None:
-            return Step(0.0, 0.0, 0.0, 0.0)
+            return OdometryStep(0.0, 0.0, 0.0, 0.0)
         done, late = self.history.response(dt, float(s[LEAD]))
         turning, turning_late = (
-            sums[TOLD] + s[SHARE] * (sums[TURN] - sums[TOLD]) - s[TURN_OFFSET] * sums[TURNING] for sums in (done, late)
+            sums[COMMANDED] + s[SHARE] * (sums[TURN] - sums[COMMANDED]) - s[TURN_OFFSET] * sums[TURNING]
+            for sums in (done, late)
         )
         turned = s[TURN_SCALE] * turning + s[DRIFT] * dt
         driven = s[SPEED_SCALE] * done[PATH] + s[SPEED_OFFSET] * done[ARC] - s[SLOWDOWN] * done[SLOWING]
@@ -140,7 +141,7 @@ class PlanarMotion:
         shrunk, astray = self._astray(float(driven))
         turn_row, along = np.zeros(STATES), np.zeros(STATES)
         turn_row[TURN_SCALE], turn_row[TURN_OFFSET] = turning, -s[TURN_SCALE] * done[TURNING]
-        turn_row[LEAD], turn_row[SHARE] = s[TURN_SCALE] * turning_late, s[TURN_SCALE] * (done[TURN] - done[TOLD])
+        turn_row[LEAD], turn_row[SHARE] = s[TURN_SCALE] * turning_late, s[TURN_SCALE] * (done[TURN] - done[COMMANDED])
         turn_row[DRIFT] = dt
         along[SPEED_SCALE], along[SPEED_OFFSET], along[SLOWDOWN] = done[PATH], done[ARC], -done[SLOWING]
         along[LEAD] = s[SPEED_SCALE] * late[PATH] + s[SPEED_OFFSET] * late[ARC] - s[SLOWDOWN] * late[SLOWING]
@@ -168,7 +169,7 @@ class PlanarMotion:
         p[X, Y] += (q_path - q_side) * c * sn
         p[Y, X] = p[X, Y]
         self.covariance = p
-        return Step(float(turned), float(driven), q_turn, q_path)
+        return OdometryStep(float(turned), float(driven), q_turn, q_path)
 
     def _astray(self, driven: float) -> tuple[float, tuple[float, float]]:
         """Return what a path in m shrinks by, and what an unsure heading adds along and across, m^2.
@@ -183,7 +184,7 @@ class PlanarMotion:
         return shrunk, (along, across)
 
 
-MISREAD = 0.02  # share of bearings that may be anything
+MISREAD = 0.02  # share of outliers among bearings
 
 
 class PlanarFilter(PlanarMotion):
@@ -195,27 +196,27 @@ class PlanarFilter(PlanarMotion):
         return self._correct(*self._to(bearing, h, direction), self.tuning.bearing_std**2 + bent, self.covariance)
 
     def robot(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with a bearing in rad to a robot that tells where it thinks it is; return the same."""
+        """Correct with a bearing in rad to a robot at its reported pose; return the same."""
         h, direction, bent = self._line_to(other)
         theirs = np.array([-h[X], -h[Y], 0.0])
         return self._fuse(*self._to(bearing, h, direction), bent, theirs, other)
 
     def seen(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
+        """Correct with a received bearing in rad from a robot at its reported pose to this one; return the same."""
         h, direction, bent = self._line_to(other)
         theirs = np.array([-h[X], -h[Y], -1.0])
         back = direction + math.pi  # from them to us; its derivatives are those of the line from us to them
         return self._fuse(h, wrapped(bearing - (back - float(other.pose[2]))), bent, theirs, other)
 
-    def place(self, pose: Array, covariance: Array) -> None:
-        """Put it at a pose (3,) with a covariance (3, 3); what is known of the wheels stays."""
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """Set the pose (3,) and its covariance (3, 3); the calibration stays."""
         self.state[:3] = pose
         self.covariance[:3] = 0.0
         self.covariance[:, :3] = 0.0
         self.covariance[:3, :3] = covariance
 
-    def doubt(self) -> None:
-        """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
+    def reset_calibration(self) -> None:
+        """Reset the covariance of the calibration; its values are clipped to two initial standard deviations."""
         k = self.tuning
         std = np.array(k.std)
         self.state[3:] = np.clip(self.state[3:], k.mean - 2 * std, k.mean + 2 * std)
@@ -224,8 +225,8 @@ class PlanarFilter(PlanarMotion):
         self.covariance[range(3, STATES), range(3, STATES)] = std**2
         self.level = NoiseLevel(k.level_std)
 
-    def tell(self) -> PlanarPose:
-        """Return what others need: the heading is the camera's, from which bearings count (bias taken off)."""
+    def broadcast_pose(self) -> PlanarPose:
+        """Return the pose to broadcast: its heading is that of the camera, without the bearing bias."""
         return picked(self.state, self.covariance)
 
     def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
@@ -271,9 +272,9 @@ class PlanarFilter(PlanarMotion):
         ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
         ratio = innovation**2 / (own + theirs + noise)
         self._weigh(ratio, own + theirs + noise)
-        if ours_by == 0.0 or ratio > k.others_gate:  # nothing is gained, or it is a lie
+        if ours_by == 0.0 or ratio > k.others_gate:  # no gain of information, or an inconsistent message
             return ratio
-        grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # nobody shares a calibration
+        grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # calibrations are independent
         return self._correct(h, innovation, noise + theirs * theirs_by, p * np.outer(grown, grown))
 
     def _correct(self, h: Array, innovation: float, noise: float, prior: Array) -> float:
@@ -297,6 +298,6 @@ class PlanarFilter(PlanarMotion):
         return ratio
 
     def _weigh(self, ratio: float, variance: float) -> None:
-        """Remember how likely a bearing was; it may be anything once in a while."""
+        """Store the likelihood of a bearing; with a small probability it is an outlier."""
         fits = math.exp(-ratio / 2) / math.sqrt(2 * math.pi * variance)
         self.evidence = math.log((1 - MISREAD) * fits + MISREAD / (2 * math.pi))

@@ -11,23 +11,23 @@ from coopenv.observers.contract import Received, Tick
 from coopenv.observers.planar.model import PlanarPose, misfit
 
 OLDEST_S = 2.0
-SPEED = 0.15  # m/s, by which a robot may have moved since it told where it is
-LEAST_STD = (0.01, 0.002)  # m, rad; nobody knows better
+SPEED = 0.15  # m/s at which a sender may have moved since its message
+LEAST_STD = (0.01, 0.002)  # m, rad: least standard deviations of a received pose
 FARTHEST_M = 1e6
-MOST_SEEN = 64  # robots, of which one message may tell
+MOST_SEEN = 64  # sightings in one message
 POSE_NUMBERS = 9  # x, y, heading and the triangle of their covariance
 LOWER = np.tril_indices(3)
 
 
-def place_of(received: Received) -> PlanarPose | None:
-    """Return where a robot is by its own word; None where that is no place or older than 2 s.
+def received_position(received: Received) -> PlanarPose | None:
+    """Return the position that a message reports; None if it is not plausible or older than 2 s.
 
-    Of a neighbour's heading nothing is needed, so it is 0 and certain.
+    The heading of a neighbour is not needed: it is 0 with a variance of 0.
     """
-    position, told = received.message.position, received.message.covariance
-    if position is None or told is None or not 0.0 <= received.age <= OLDEST_S:
+    position, reported = received.message.position, received.message.covariance
+    if position is None or reported is None or not 0.0 <= received.age <= OLDEST_S:
         return None
-    p, P = np.asarray(position, dtype=float), np.asarray(told, dtype=float)
+    p, P = np.asarray(position, dtype=float), np.asarray(reported, dtype=float)
     if p.shape != (3,) or P.ndim != 2 or min(P.shape) < 2 or not _plausible(p[:2], P[:2, :2]):
         return None
     covariance = np.zeros((3, 3))
@@ -37,33 +37,33 @@ def place_of(received: Received) -> PlanarPose | None:
 
 
 class Sightings(NamedTuple):
-    """What a robot tells of whom it saw."""
+    """The bearings to other robots in a message."""
 
-    by: PlanarPose  # where it was
+    by: PlanarPose  # pose of the sender at these bearings
     seen: list[tuple[int, float]]  # targets and bearings, rad
-    sure: bool  # whether landmarks showed it lately that it is not lost
+    localised: bool  # whether a recent bearing to a landmark fitted the sender's pose
 
 
 def sightings_of(extra: Mapping[str, Array]) -> Sightings | None:
-    """Return what a robot tells of whom it saw; None where that makes no sense."""
-    seen, bearing, told, sure = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from", "sure"))
-    if any(numbers.dtype.kind not in "buif" for numbers in (seen, bearing, told, sure)):
+    """Return the sightings in a message; None if they are malformed or not plausible."""
+    seen, bearing, by, localised = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from", "sure"))
+    if any(numbers.dtype.kind not in "buif" for numbers in (seen, bearing, by, localised)):
         return None
-    if told.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape or len(seen) > MOST_SEEN:
+    if by.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape or len(seen) > MOST_SEEN:
         return None
-    pose, covariance = told[:3].astype(float), np.zeros((3, 3))
-    covariance[LOWER] = told[3:]
+    pose, covariance = by[:3].astype(float), np.zeros((3, 3))
+    covariance[LOWER] = by[3:]
     covariance += np.tril(covariance, -1).T
     if not _plausible(pose, covariance) or not np.isfinite(bearing.astype(float)).all():
         return None
-    by = PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD])))
+    sender = PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD])))
     angles = zip(seen.tolist(), bearing.astype(float).tolist(), strict=True)
-    return Sightings(by, list(angles), sure.shape == (1,) and bool(sure[0]))
+    return Sightings(sender, list(angles), localised.shape == (1,) and bool(localised[0]))
 
 
-def _plausible(where: Array, covariance: Array) -> bool:
-    """Return whether numbers are finite, a place is on this site and a covariance is one."""
-    if not (np.isfinite(where).all() and np.isfinite(covariance).all()) or np.abs(where).max() > FARTHEST_M:
+def _plausible(pose: Array, covariance: Array) -> bool:
+    """Return whether a pose is finite and near, and its covariance symmetric and positive semidefinite."""
+    if not (np.isfinite(pose).all() and np.isfinite(covariance).all()) or np.abs(pose).max() > FARTHEST_M:
         return False
     scale = float(np.abs(covariance).max())
     if scale > FARTHEST_M**2 or not np.allclose(covariance, covariance.T, atol=1e-3 * scale):
@@ -71,129 +71,135 @@ def _plausible(where: Array, covariance: Array) -> bool:
     return bool(np.linalg.eigvalsh(covariance)[0] >= -1e-3 * scale)
 
 
-FASTEST = 0.6  # m/s, that a robot may drive
-WIDE = 5.0  # standard deviations that a place may change by
-SILENCE_S = 1.0  # after which a place may be any: who was lost says nothing, and comes back elsewhere
-HONEST = 2.5  # mean of the innovation squared up to which a robot is honest; 1 where covariances are
-MOST = 40.0  # of the sum
-LARGEST = 16.0  # that one sighting adds
-FITS = 4.0  # innovation squared of a sighting that fits
-CLEAR = 0.2  # rad; sightings that are less certain say nothing about a lie
-ENOUGH = 20  # sightings in a row that fit, after which a robot is believed again
-WITNESSES = 2  # that it takes against a robot which says that it is sure of its place
-CLAIM_S = 15.0  # for which that counts
-CONTRADICTS = 10.0  # of the sum of one witness
+FASTEST = 0.6  # m/s: largest speed of a robot
+WIDE = 5.0  # standard deviations by which a reported position may change in addition
+SILENCE_S = 1.0  # after which a reported position may be anywhere: a lost robot sends nothing, and returns elsewhere
+HONEST = 2.5  # mean of the squared innovation up to which a sender is not suspect; 1 for consistent covariances
+MOST = 40.0  # gate of the cumulative sum
+LARGEST = 16.0  # most that one sighting adds to the sum
+FITS = 4.0  # squared innovation up to which a sighting agrees
+CLEAR = 0.2  # rad: less certain sightings do not count for readmission
+ENOUGH = 20  # agreeing sightings in a row after which a sender is readmitted
+CONTRADICTIONS = 2  # senders that must contradict a localised sender before it is excluded
+LOCALISED_S = 15.0  # for which a sender's report that it is localised counts
+CONTRADICTS = 10.0  # gate of the sum over the sightings of one sender
 
 
-class Trust:
-    """What one robot thinks of the word of another."""
+class RobotMonitor:
+    """Fault tests of one sender: its reports, innovations of bearings to it, and sightings by other senders.
+
+    Innovations count in cumulative sums: Page, Continuous inspection schemes, Biometrika 41, 1954.
+    """
 
     def __init__(self) -> None:
-        self.believed = True
+        self.excluded = False
         self._sum, self._fitting = 0.0, 0
-        self._told: dict[int, float] = {}  # the sums of witnesses
-        self._sure = -math.inf
+        self._sums: dict[int, float] = {}  # of the sightings of every other sender
+        self._localised = -math.inf
         self._time = -math.inf
         self._last: PlanarPose | None = None
 
-    def hear(self, time: float, place: PlanarPose) -> None:
-        """Take a place that was told at a time in s."""
+    def test_report(self, time: float, reported: PlanarPose) -> None:
+        """Exclude the sender if its reported position, valid at a time in s, has jumped."""
         if time <= self._time:
             return
         if self._last is not None and time - self._time < SILENCE_S:
-            moved = math.dist(place.pose[:2].tolist(), self._last.pose[:2].tolist())
-            spread = sum(float(word.covariance[0, 0] + word.covariance[1, 1]) for word in (place, self._last))
+            moved = math.dist(reported.pose[:2].tolist(), self._last.pose[:2].tolist())
+            spread = sum(float(of.covariance[0, 0] + of.covariance[1, 1]) for of in (reported, self._last))
             if moved > FASTEST * (time - self._time) + WIDE * math.sqrt(spread):
-                self.doubt()
-        self._time, self._last = time, place
+                self.exclude()
+        self._time, self._last = time, reported
 
-    def see(self, ratio: float, variance: float, sure: bool) -> None:
-        """Take the innovation squared of a sighting, its variance in rad^2, and whether one's own place is sure."""
-        if not self.believed:
-            self._fitted(ratio < FITS and variance < CLEAR**2 and sure)
-        elif sure:
+    def test_innovation(self, ratio: float, variance: float, localised: bool) -> None:
+        """Test a bearing to or from the sender by its normalised innovation squared and its variance, rad^2.
+
+        `localised`: landmarks confirm the receiver's own pose.
+        """
+        if self.excluded:
+            self._count_fitting(ratio < FITS and variance < CLEAR**2 and localised)
+        elif localised:
             self._sum = max(self._sum + min(ratio, LARGEST) - HONEST, 0.0)
             if self._sum > MOST:
-                self.doubt()
+                self.exclude()
 
-    def witness(self, by: int, ratio: float, variance: float) -> None:
-        """Take how far off it was to a robot whose place is sure, squared and normalised, and the variance, rad^2."""
-        told = self._told.get(by, 0.0)
-        self._told[by] = min(max(told + min(ratio, LARGEST) - HONEST, 0.0), MOST)
-        if not self.believed:
-            self._fitted(ratio < FITS and variance < CLEAR**2)
+    def test_sighting(self, by: int, ratio: float, variance: float) -> None:
+        """Test a bearing from a localised sender `by` to this one, as in `test_innovation`."""
+        total = self._sums.get(by, 0.0)
+        self._sums[by] = min(max(total + min(ratio, LARGEST) - HONEST, 0.0), MOST)
+        if self.excluded:
+            self._count_fitting(ratio < FITS and variance < CLEAR**2)
 
-    def accusers(self) -> list[int]:
-        """Return who contradicts this one."""
-        return [by for by, told in self._told.items() if told > CONTRADICTS]
+    def contradicting(self) -> list[int]:
+        """Return the senders whose sightings contradict this one."""
+        return [by for by, total in self._sums.items() if total > CONTRADICTS]
 
-    def claim(self, time: float, sure: bool) -> None:
-        """Take whether it says, at a time in s, that landmarks show where it is."""
-        self._sure = time if sure else self._sure
+    def note_localised(self, time: float, localised: bool) -> None:
+        """Note whether the sender reports at a time in s that landmarks confirm its pose."""
+        self._localised = time if localised else self._localised
 
-    def accused(self, time: float, everyone: Mapping[int, "Trust"]) -> bool:
-        """Return whether others show that this one lies, and not they."""
-        by = self.accusers()
-        if not by or sum(self._told.values()) < MOST:
+    def is_contradicted(self, time: float, monitors: Mapping[int, "RobotMonitor"]) -> bool:
+        """Return whether sightings show a fault of this sender, and not of the senders that made them."""
+        by = self.contradicting()
+        if not by or sum(self._sums.values()) < MOST:
             return False
-        if time - self._sure > CLAIM_S:
+        if time - self._localised > LOCALISED_S:
             return True
-        return len(by) >= WITNESSES and all(len(everyone[j].accusers()) < len(by) for j in by)
+        return len(by) >= CONTRADICTIONS and all(len(monitors[j].contradicting()) < len(by) for j in by)
 
-    def doubt(self) -> None:
-        """Believe this one no more."""
-        self.believed, self._fitting = False, 0
+    def exclude(self) -> None:
+        """Exclude the sender."""
+        self.excluded, self._fitting = True, 0
 
-    def _fitted(self, fits: bool) -> None:
+    def _count_fitting(self, fits: bool) -> None:
         self._fitting = self._fitting + 1 if fits else 0
         if self._fitting >= ENOUGH:
-            self.believed, self._sum = True, 0.0
-            self._told.clear()
+            self.excluded, self._sum = False, 0.0
+            self._sums.clear()
 
 
-SWAYED_S = 60.0  # for so long, who has believed a liar may be off
+FUSED_S = 60.0  # for which a fused report may still affect the receiver's pose
 
 
-class Circle:
-    """What one robot thinks of the words of all others, by what they tell and what is seen of them."""
+class RobotMonitors:
+    """Fault detection and exclusion of senders, from their reports and from sightings of them."""
 
     def __init__(self, bearing_std: float) -> None:
         self._bearing_std = bearing_std
-        self._trust: dict[int, Trust] = {}
-        self._used: dict[int, float] = {}  # when the word of each counted last, s
+        self._monitors: dict[int, RobotMonitor] = {}
+        self._fused: dict[int, float] = {}  # by sender: when a report of it was fused last, s
 
-    def of(self, target: int) -> Trust:
-        """Return what is thought of one."""
-        return self._trust.setdefault(target, Trust())
+    def of(self, target: int) -> RobotMonitor:
+        """Return the monitor of a sender."""
+        return self._monitors.setdefault(target, RobotMonitor())
 
-    def hear(self, tick: Tick) -> None:
-        """Test what others tell of their places against what they told before."""
+    def test_reports(self, tick: Tick) -> None:
+        """Test the received positions against the earlier ones."""
         for target, received in tick.messages.items():
-            if (place := place_of(received)) is not None:
-                self.of(target).hear(tick.time - received.age, place)
+            if (reported := received_position(received)) is not None:
+                self.of(target).test_report(tick.time - received.age, reported)
 
-    def believes(self, target: int, time: float) -> bool:
-        """Return whether a robot is believed, whose word counts now if it is."""
-        believed = self.of(target).believed
-        if believed:
-            self._used[target] = time
-        return believed
+    def accepts(self, target: int, time: float) -> bool:
+        """Return whether a sender is not excluded; its report then counts as fused at a time in s."""
+        accepted = not self.of(target).excluded
+        if accepted:
+            self._fused[target] = time
+        return accepted
 
-    def witness(self, tick: Tick, by: int, told: Sightings) -> None:
-        """Compare what a robot that is sure of its place saw of others with their word."""
-        witness = self.of(by)
-        witness.claim(tick.time, told.sure)
-        if not (told.sure and witness.believed):
+    def test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
+        """Test the reported positions against the sightings of a localised sender."""
+        sender = self.of(by)
+        sender.note_localised(tick.time, sightings.localised)
+        if not sightings.localised or sender.excluded:
             return
-        for target, bearing in told.seen:
-            place = place_of(tick.messages[target]) if target in tick.messages else None
-            if place is not None:
-                trust = self.of(target)
-                trust.witness(by, *misfit(bearing, told.by, place, self._bearing_std))
-                if trust.believed and trust.accused(tick.time, self._trust):
-                    trust.doubt()
+        for target, bearing in sightings.seen:
+            reported = received_position(tick.messages[target]) if target in tick.messages else None
+            if reported is not None:
+                monitor = self.of(target)
+                monitor.test_sighting(by, *misfit(bearing, sightings.by, reported, self._bearing_std))
+                if not monitor.excluded and monitor.is_contradicted(tick.time, self._monitors):
+                    monitor.exclude()
 
-    def misled(self, time: float) -> bool:
-        """Return whether somebody is not believed any more whose word has counted lately; everyone is told of once."""
-        liars = [target for target in self._used if not self._trust[target].believed]
-        return any(time - self._used.pop(target, -math.inf) < SWAYED_S for target in liars)
+    def fused_excluded(self, time: float) -> bool:
+        """Return whether a recently fused sender is excluded now; every exclusion is reported once."""
+        excluded = [target for target in self._fused if self._monitors[target].excluded]
+        return any(time - self._fused.pop(target, -math.inf) < FUSED_S for target in excluded)

@@ -1,14 +1,14 @@
-"""Several planar filters side by side: what a robot believes whose heading one Gaussian cannot hold.
+"""A Gaussian sum of planar filters, for a heading that is too uncertain for a single Gaussian.
 
 Bearings and paths are linear in a heading that is known to half a radian, and in none that is not. A filter less sure
 than that is split along its heading into three, each with the wheels that lead there (a Gaussian is nearly the sum of
 three narrower ones; the numbers are those of least squares between the densities). Bearings then decide between them by
-their likelihood; filters that have become unlikely are dropped, and those that have come to say the same are merged:
+their likelihood; filters that have become unlikely are dropped, and filters with nearly the same pose are merged:
 Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans. Automatic Control
 17(4), 1972.
 
-Another filter stands for the few robots whose odometry drifts even where it says that they drive straight, as that of a
-gyro does, where that of commands does not. It is dropped as soon as it is unlikely.
+Another filter is for the few robots whose heading drifts while their commands are to drive straight. It is dropped as
+soon as it is unlikely.
 """
 
 import math
@@ -19,7 +19,7 @@ import numpy as np
 
 from coopenv.estimation.poses import Array
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.model import HEADING, STATES, PlanarPose, Step, Tuning, picked, wrapped
+from coopenv.observers.planar.model import HEADING, STATES, OdometryStep, PlanarPose, Tuning, picked, wrapped
 
 WIDEST = 0.5  # rad, of the heading of one filter
 MOST = 15
@@ -55,7 +55,7 @@ class Mixture:
         """Covariance of the state, with what the filters differ in."""
         return self.filters[0].covariance if len(self.filters) == 1 else self._moments()[1]
 
-    def advance(self, dt: float, turn: float, path: float) -> Step:
+    def advance(self, dt: float, turn: float, path: float) -> OdometryStep:
         """Move all filters on; return the step of the likeliest one."""
         self._known = None
         self.filters[0].command(dt, turn, path)
@@ -68,36 +68,36 @@ class Mixture:
         return self._take(lambda one: one.landmark(bearing, x, y), 1.0)
 
     def robot(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with a bearing in rad to a robot that tells where it thinks it is; return the same."""
+        """Correct with a bearing in rad to a robot at its reported pose; return the same."""
         return self._take(lambda one: one.robot(bearing, other), TEMPERED)
 
     def seen(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
+        """Correct with a received bearing in rad from a robot at its reported pose to this one; return the same."""
         return self._take(lambda one: one.seen(bearing, other), TEMPERED)
 
     def misfit(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[float, float]:
         """Return the normalised innovation squared of a bearing to or from a robot, and its variance, rad^2."""
         return self.filters[int(np.argmax(self._weights))].misfit(bearing, other, seen)
 
-    def place(self, pose: Array, covariance: Array) -> None:
-        """Put it at a pose (3,) with a covariance (3, 3); what is known of the wheels stays."""
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """Set the pose (3,) and its covariance (3, 3); the calibration stays."""
         if len(self.filters) > 1:
             mean, joint = self._moments()
             one = self.filters[int(np.argmax(self._weights))]
             one.state, one.covariance = mean, joint
             self._keep([one], np.ones(1))
         self._known = None
-        self.filters[0].place(pose, covariance)
+        self.filters[0].set_pose(pose, covariance)
 
-    def doubt(self) -> None:
-        """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
+    def reset_calibration(self) -> None:
+        """Reset the covariance of the calibration; its values are clipped to two initial standard deviations."""
         self._known = None
         for one in self.filters:
-            one.doubt()
+            one.reset_calibration()
 
-    def tell(self) -> PlanarPose:
-        """Return what others need."""
-        return self.filters[0].tell() if len(self.filters) == 1 else picked(*self._moments())
+    def broadcast_pose(self) -> PlanarPose:
+        """Return the pose to broadcast."""
+        return self.filters[0].broadcast_pose() if len(self.filters) == 1 else picked(*self._moments())
 
     def _take(self, correct: Callable[[PlanarFilter], float], power: float) -> float:
         if len(self.filters) == 1:
@@ -119,7 +119,7 @@ class Mixture:
         self._share()
 
     def _share(self) -> None:
-        """Let all filters have the history and the noise of the likeliest one, which alone learns how large it is."""
+        """Share the command history and the noise level of the likeliest filter, which alone adapts it."""
         self._known = None
         best = self.filters[int(np.argmax(self._weights))]
         for one in self.filters:
@@ -147,7 +147,7 @@ class Mixture:
         self._keep(filters, np.array(weights))
 
     def _merge(self) -> None:
-        """Merge the first two that say the same, narrow enough together."""
+        """Merge the first two filters with nearly the same pose."""
         for i, one in enumerate(self.filters):
             for j in range(i):
                 other = self.filters[j]

@@ -13,7 +13,7 @@ STATES = 12
 
 
 class PlanarPose(NamedTuple):
-    """What a robot tells another: x m, y m, heading rad (3,), and their covariance (3, 3)."""
+    """A broadcast pose: x m, y m, heading rad (3,), and its covariance (3, 3)."""
 
     pose: Array
     covariance: Array
@@ -38,7 +38,7 @@ def left_out(dx: float, dy: float, square: float, covariance: Array) -> float:
     """Return the variance of a bearing, rad^2, that its linearisation leaves out.
 
     That is of the second order in the covariance (2, 2) of the line's ends, m^2: where these are as uncertain as the
-    line is long, a bearing says little. The line is (dx, dy) in m, `square` its length squared.
+    line is long, a bearing has little information. The line is (dx, dy) in m, `square` its length squared.
     """
     (xx, xy), (_, yy) = covariance.tolist()
     along = (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / square
@@ -59,7 +59,7 @@ def unsure(variance: float) -> tuple[float, float, float]:
 
 
 def misfit(bearing: float, by: PlanarPose, to: PlanarPose, bearing_std: float) -> tuple[float, float]:
-    """Return the normalised square of how far a bearing in rad is off between two told poses, and its variance."""
+    """Return the normalised innovation squared of a bearing in rad between two reported poses, and its variance."""
     dx, dy = (to.pose[:2] - by.pose[:2]).tolist()
     square = max(dx * dx + dy * dy, NEAREST_M**2)
     both = by.covariance[:2, :2] + to.covariance[:2, :2]
@@ -71,19 +71,19 @@ def misfit(bearing: float, by: PlanarPose, to: PlanarPose, bearing_std: float) -
 
 TURNING_RATE = 1e-6  # rad/s; a smaller command is one to drive straight
 DRIVING_SPEED = 1e-6  # m/s; a smaller command is one to turn on the spot
-TURN, TURNING, PATH, ARC, SLOWING, SWITCHING, TOLD = range(7)
+TURN, TURNING, PATH, ARC, SLOWING, SWITCHING, COMMANDED = range(7)
 """What the wheels make of commands: commanded turn times gain, rad; commanded turning times gain, s; commanded path, m;
 commanded turning, s; path times rate of turn, m rad/s; squares of the steps in the commanded rate, rad^2/s^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """How a kind of robot follows its commands v and w; the default does at once what it is told."""
+    """Response of a kind of robot to its commands v and w; by default it is immediate."""
 
     delay: tuple[float, ...] = (0.0,)  # s after the lead by which commands are early
     share: tuple[float, ...] = (1.0,)  # of the response at these delays; they sum to one
     arc: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
-    """(curvature |w| / v in 1/m, gain): how much it turns against what it is told, between and beyond linear."""
+    """(curvature |w| / v in 1/m, gain): turn over commanded turn, linear between and beyond."""
     spot: float = 1.0  # the same gain of turns on the spot
     slow: float = 0.0  # m/s, below which arcs tighter than 1/m gain more, by:
     slow_gain: float = 0.0
@@ -99,8 +99,8 @@ class Wheels:
         return float(np.interp(curvature, curvatures, gains)) + more
 
 
-class Step(NamedTuple):
-    """What the odometry says of one tick."""
+class OdometryStep(NamedTuple):
+    """Odometry of one tick."""
 
     turned: float  # rad
     driven: float  # m

@@ -14,7 +14,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.fusion import LOWER, Circle, Sightings, place_of, sightings_of
+from coopenv.observers.planar.fusion import LOWER, RobotMonitors, Sightings, received_position, sightings_of
 from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.model import (
     BIAS,
@@ -22,13 +22,13 @@ from coopenv.observers.planar.model import (
     HEADING,
     TEXTBOOK,
     TURN_SCALE,
+    OdometryStep,
     PlanarPose,
-    Step,
     Tuning,
     X,
     Y,
 )
-from coopenv.observers.planar.search import Known, LossTest, Memory, find_pose
+from coopenv.observers.planar.search import LossTest, PoseInformation, SightingHistory, find_pose
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m
@@ -37,7 +37,7 @@ OUT_OF_PLANE_STD = 1e-3  # rad and m
 class PlanarEkf:
     """Extended Kalman filter of x, y and heading.
 
-    It believes its odometry and its neighbours, and is for robots on a plane alone. A neighbour's covariance is added
+    It fuses odometry, bearings and received positions, for robots on a plane only. A neighbour's covariance is added
     to the bearing's variance, as if its errors were independent (Roumeliotis, Bekey, "Distributed multirobot
     localization", IEEE Trans. Robotics and Automation 18(5), 2002, without its cross-correlations).
     """
@@ -50,7 +50,7 @@ class PlanarEkf:
         self._me = setup.landmarks + setup.vehicle
         self._sightings: list[tuple[int, float]] = []
         self._before = PlanarPose(np.zeros(3), np.zeros((3, 3)))
-        self._heard: dict[int, float] = {}
+        self._received: dict[int, float] = {}
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose with a covariance (6, 6) in LEFT coordinates."""
@@ -60,7 +60,7 @@ class PlanarEkf:
         covariance = turn @ initial_covariance[PLANE] @ turn.T
         self._begin(np.array([p[0], p[1], heading]), covariance)
         self._sightings.clear()
-        self._heard.clear()
+        self._received.clear()
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
@@ -75,10 +75,10 @@ class PlanarEkf:
         return self._estimate()
 
     def message(self) -> Message:
-        """Return position and covariance, and under which bearing whom it saw since the last message.
+        """Return position and covariance, and the bearings to other robots since the last message.
 
-        The pose that goes with the sightings is the one before they corrected it, so that who was seen does not hear
-        its own estimate back.
+        The pose sent with these bearings is the one before they corrected it. The receiver's own estimate therefore
+        does not return to it.
         """
         state, covariance = self.filter.state, np.zeros((3, 3))
         covariance[:2, :2], covariance[2, 2] = self.filter.covariance[:2, :2], OUT_OF_PLANE_STD**2
@@ -97,45 +97,45 @@ class PlanarEkf:
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter: PlanarFilter | Mixture = PlanarFilter(self.tuning, pose, covariance)
 
-    def _advance(self, dt: float, turn: float, path: float) -> Step:
+    def _advance(self, dt: float, turn: float, path: float) -> OdometryStep:
         return self.filter.advance(dt, turn, path)
 
     def _look(self, tick: Tick) -> None:
-        """Correct with what the camera saw, landmarks first."""
+        """Correct by the bearings of a frame, landmarks first."""
         for target, b, position, message in sorted(tick.usable(), key=lambda entry: entry[3] is not None):
             bearing = math.atan2(b[1], b[0])
             if message is None:
                 self._see_landmark(tick, target, bearing, float(position[0]), float(position[1]))
-            elif (place := place_of(tick.messages[target])) is not None:
+            elif (reported := received_position(tick.messages[target])) is not None:
                 if not self._sightings:
-                    self._before = self.filter.tell()
+                    self._before = self.filter.broadcast_pose()
                 self._sightings.append((target, bearing))
-                self._see_robot(tick, target, bearing, place)
+                self._see_robot(tick, target, bearing, reported)
 
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self.filter.landmark(bearing, x, y)
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
-        self.filter.robot(bearing, place)
+    def _see_robot(self, tick: Tick, target: int, bearing: float, reported: PlanarPose) -> None:
+        self.filter.robot(bearing, reported)
 
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
         self.filter.seen(bearing, by)
 
-    def _witness(self, tick: Tick, by: int, told: Sightings) -> None:
-        """Take what a robot tells of all that it saw; of use to who doubts words."""
+    def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
+        """Test the reports of other senders by the sightings of one; this filter has no such test."""
 
     def _take_sightings(self, tick: Tick) -> None:
-        """Correct with the bearings under which others saw this robot; each message counts once."""
+        """Correct by the received bearings to this robot; each message counts once."""
         for target, received in tick.messages.items():
             extra, sent = received.message.extra, tick.time - received.age
-            if "seen" not in extra or sent < self._heard.get(target, -math.inf) + tick.dt / 2:
+            if "seen" not in extra or sent < self._received.get(target, -math.inf) + tick.dt / 2:
                 continue
-            self._heard[target] = sent
-            if (told := sightings_of(extra)) is not None:
-                self._witness(tick, target, told)
-                for seen, bearing in told.seen:
+            self._received[target] = sent
+            if (sightings := sightings_of(extra)) is not None:
+                self._test_sightings(tick, target, sightings)
+                for seen, bearing in sightings.seen:
                     if seen == self._me:
-                        self._be_seen(tick, target, bearing, told.by)
+                        self._be_seen(tick, target, bearing, sightings.by)
 
     def _estimate(self) -> Estimate:
         x, y, heading = self.filter.state[:3].tolist()
@@ -152,22 +152,22 @@ def _from_body(heading: float) -> Array:
     return np.array([[0.0, c, -s], [0.0, s, c], [1.0, 0.0, 0.0]])
 
 
-CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
-LOST_HEADING_STD = math.pi / math.sqrt(3)  # rad, of a heading that may be any
+CLEAR_STD = (8.0, 1.6)  # m, rad; above these a single bearing cannot correct the pose, and bearings are collected
+LOST_HEADING_STD = math.pi / math.sqrt(3)  # rad, of an unknown heading
 LEAST_LOST_STD = 5.0  # m
-SPANS_S = (10.0, 30.0)  # of what is searched: the shortest one that gives an answer counts
+SPANS_S = (10.0, 30.0)  # of the sightings in a search; the shortest span with a solution counts
 SEARCH_PERIOD_S = 0.4
-ENOUGH = 8  # bearings, which contradict what was known before
-SWAYED_STD = (0.5, 0.5, 0.3)  # m, m, rad, by which who has believed a liar may be off
-MOST_FAILED = 15  # searches with so many bearings, after which what was known before does not count
+ENOUGH = 8  # bearings that contradict the prior
+EXCLUSION_STD = (0.5, 0.5, 0.3)  # m, m, rad: possible error of a pose that has fused an excluded sender
+MOST_FAILED = 15  # searches with so many bearings after which the prior is dropped
 
 
 class PlanarRobust(PlanarEkf):
-    """Calibrates its odometry online, tells others that it saw them, and fuses by split covariance intersection.
+    """Calibrates its odometry online, broadcasts its sightings, and fuses by split covariance intersection.
 
-    It notices when it is lost: when bearings do not fit any more, or when it has become so uncertain that a single
-    bearing cannot correct it. Then it states a large covariance, sends nothing, and searches for the pose that the
-    bearings of the last half minute agree on.
+    It declares itself lost when most bearings fail the gate, or when its covariance is so large that a single bearing
+    cannot correct it. It then states a large covariance, sends nothing, and searches for the pose that agrees with the
+    bearings of the last half minute.
 
     Messages hold position and covariance (72 bytes), and after a sighting a pose with its covariance in single
     precision (36 bytes), whether landmarks were seen lately (1), and 5 bytes for each robot seen.
@@ -184,19 +184,19 @@ class PlanarRobust(PlanarEkf):
         if len(tick.landmarks):
             self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
         self._now = tick.time
-        self._circle.hear(tick)
-        self._unsettle(tick.time)
+        self._monitors.test_reports(tick)
+        self._inflate_after_exclusion(tick.time)
         estimate = super().update(tick)
-        if self.lost:  # in a later tick than the one that showed it: bearings that misled do not at once say where
+        if self.lost:  # not in the tick of the loss, whose bearings are the contradicting ones
             if not (self._news and tick.time >= self._next_search):
                 return estimate
             self._search(tick.time)
         elif self._test.lost:
-            self._memory.forget(self._test.since)  # until then it may have been elsewhere
-            self._give_up()
+            self._history.forget(self._test.since)  # earlier sightings may be of another pose
+            self._declare_unknown()
         elif self._unclear():
-            self._memory.forget(math.inf)  # what it saw is in the estimate
-            self._lose()
+            self._history.forget(math.inf)  # these sightings are in the estimate
+            self._declare_lost()
         else:
             return estimate
         return self._estimate()
@@ -209,119 +209,122 @@ class PlanarRobust(PlanarEkf):
         message = super().message()
         if "seen" not in message.extra:
             return message
-        extra: dict[str, Any] = {**message.extra, "sure": np.array([self._test.sure(self._now)], np.uint8)}
+        extra: dict[str, Any] = {**message.extra, "sure": np.array([self._test.localised(self._now)], np.uint8)}
         return replace(message, extra=extra)
 
     def tampered(self, message: Message) -> Message:
-        """Return a message about another place than this robot's with sightings that agree with it."""
+        """Return a message with a changed position whose sightings agree with it."""
         if message.position is None or "from" not in message.extra:
             return message
-        told = np.array(message.extra["from"])
-        told[:2] += (message.position[:2] - self.filter.state[:2]).astype(told.dtype)
-        return replace(message, extra={**message.extra, "from": told})
+        by = np.array(message.extra["from"])
+        by[:2] += (message.position[:2] - self.filter.state[:2]).astype(by.dtype)
+        return replace(message, extra={**message.extra, "from": by})
 
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter: Mixture = Mixture(self.tuning, pose, covariance)
-        self._test, self._memory = LossTest(), Memory()
-        self._circle = Circle(self.tuning.bearing_std)
+        self._test, self._history = LossTest(), SightingHistory()
+        self._monitors = RobotMonitors(self.tuning.bearing_std)
         self._now, self._next_search, self._failed, self._news = 0.0, 0.0, 0, False
         self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
         if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
-            self._lose()
+            self._declare_lost()
 
-    def _advance(self, dt: float, turn: float, path: float) -> Step:
+    def _advance(self, dt: float, turn: float, path: float) -> OdometryStep:
         step = self.filter.advance(dt, turn, path)
-        self._memory.move(step)
+        self._history.move(step)
         self._news = False
         if self.lost:
-            self._drift(step)
+            self._inflate_while_lost(step)
         else:
             self.filter.split()
         return step
 
-    def _drift(self, step: Step) -> None:
-        """Widen the pose by what was turned and driven since the loss: errors of scale and heading last."""
+    def _inflate_while_lost(self, step: OdometryStep) -> None:
+        """Inflate the covariance by the turn and path since the loss: errors of scale and heading are constant."""
         state, covariance = self.filter.state, self.filter.covariance
         before = self._turned
         self._adrift, self._turned = self._adrift + abs(step.driven), before + abs(step.turned)
         by_scale = float(covariance[TURN_SCALE, TURN_SCALE]) * (self._turned**2 - before**2)
         heading = min(float(covariance[HEADING, HEADING]) + by_scale, LOST_HEADING_STD**2)
         variance = self._from + self._adrift**2 * min(heading, 1.0)
-        self.filter.place(state[:3].copy(), np.diag([variance, variance, heading]))
+        self.filter.set_pose(state[:3].copy(), np.diag([variance, variance, heading]))
 
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self._remember(tick.time, target, bearing, True, PlanarPose(np.array([x, y, 0.0]), np.zeros((3, 3))))
         if not self.lost:
             self._test.take(tick.time, self.filter.landmark(bearing, x, y))
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
-        if self._believes(tick, target, bearing, place, seen=False):
-            self._remember(tick.time, target, bearing, True, place)
+    def _see_robot(self, tick: Tick, target: int, bearing: float, reported: PlanarPose) -> None:
+        if self._accepts(tick, target, bearing, reported, seen=False):
+            self._remember(tick.time, target, bearing, True, reported)
             if not self.lost:
-                self._test.take_of_robot(tick.time, self.filter.robot(bearing, place))
+                self._test.take_of_robot(tick.time, self.filter.robot(bearing, reported))
 
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
-        if self._believes(tick, target, bearing, by, seen=True):
+        if self._accepts(tick, target, bearing, by, seen=True):
             self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
             if not self.lost:
                 self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
 
-    def _believes(self, tick: Tick, target: int, bearing: float, place: PlanarPose, seen: bool) -> bool:
-        """Return whether a robot is believed, now that it was seen or saw this one."""
+    def _accepts(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool) -> bool:
+        """Test a sender by a bearing to or from it; return whether it is not excluded."""
         if not self.lost:
-            self._circle.of(target).see(*self.filter.misfit(bearing, place, seen), self._test.sure(tick.time))
-        return self._circle.believes(target, tick.time)
+            ratio, variance = self.filter.misfit(bearing, there, seen)
+            self._monitors.of(target).test_innovation(ratio, variance, self._test.localised(tick.time))
+        return self._monitors.accepts(target, tick.time)
 
-    def _witness(self, tick: Tick, by: int, told: Sightings) -> None:
-        self._circle.witness(tick, by, told)
-        self._unsettle(tick.time)
+    def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
+        self._monitors.test_sightings(tick, by, sightings)
+        self._inflate_after_exclusion(tick.time)
 
-    def _unsettle(self, now: float) -> None:
-        """Be less sure of one's own place where others have led it astray."""
-        if self._circle.misled(now) and not self.lost and not self._test.sure(now):
+    def _inflate_after_exclusion(self, now: float) -> None:
+        """Inflate the covariance if a sender whose reports were fused is excluded now."""
+        if self._monitors.fused_excluded(now) and not self.lost and not self._test.localised(now):
             state, covariance = self.filter.state, self.filter.covariance
-            self.filter.place(state[:3].copy(), covariance[:3, :3] + np.diag(np.square(SWAYED_STD)))
+            self.filter.set_pose(state[:3].copy(), covariance[:3, :3] + np.diag(np.square(EXCLUSION_STD)))
 
     def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
-        """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""
+        """Store a sighting; an own bearing counts from the heading, without the bias."""
         self._news = True
         angle -= float(self.filter.state[BIAS]) if own else 0.0
         noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
         point = (float(there.pose[0]), float(there.pose[1]))
         variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
-        self._memory.see(time, target, angle, own, point, variance, noise)
+        self._history.add(time, target, angle, own, point, variance, noise)
 
     def _unclear(self) -> bool:
         variance = np.diag(self.filter.covariance)
         return bool(variance[X] + variance[Y] > CLEAR_STD[0] ** 2)
 
-    def _lose(self) -> None:
-        """State that the pose is unknown."""
+    def _declare_lost(self) -> None:
+        """Declare the pose lost."""
         covariance = self.filter.covariance
         self.lost, self._adrift, self._turned, self._failed = True, 0.0, 0.0, 0
         self._from = float(covariance[X, X] + covariance[Y, Y])
         self._test.clear()
 
-    def _give_up(self) -> None:
-        """State that nothing is known of the pose; what the wheels were found to be is doubtful, too."""
-        self.filter.place(self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD])))
-        self.filter.doubt()
-        self._lose()
+    def _declare_unknown(self) -> None:
+        """Declare the pose lost with an uninformative prior, and reset the calibration."""
+        self.filter.set_pose(
+            self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD]))
+        )
+        self.filter.reset_calibration()
+        self._declare_lost()
 
     def _search(self, now: float) -> None:
-        """Look for a pose that agrees with what was seen."""
+        """Search for a pose that agrees with the sightings."""
         self._next_search = now + SEARCH_PERIOD_S
         state, covariance = self.filter.state, self.filter.covariance
         information: Array = np.asarray(np.linalg.inv(covariance[:3, :3]), dtype=np.float64)
-        before = Known(state[:3].copy(), information)
+        before = PoseInformation(state[:3].copy(), information)
         for span in SPANS_S:
-            lines = self._memory.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
+            lines = self._history.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
             found, contradicted = find_pose(lines, before)
             if found is not None:
                 left = np.asarray(np.linalg.inv(found.information + information), dtype=np.float64)
-                self.filter.place(found.pose, left)
+                self.filter.set_pose(found.pose, left)
                 self.lost = False
                 return
         self._failed += contradicted and len(lines.angle) >= ENOUGH
         if self._failed >= MOST_FAILED:
-            self._give_up()  # what was known before is wrong
+            self._declare_unknown()  # the prior is wrong

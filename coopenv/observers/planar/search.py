@@ -1,9 +1,9 @@
-"""Where a robot is that hardly knows: bearings of several frames, carried by odometry, to points whose place is known.
+"""Search for the pose of a lost robot: bearings of several frames, propagated by odometry, to known points.
 
 For a heading, each bearing is a line on which the robot lies, so that its position follows from linear least squares;
-72 headings are tried at once. What was known before, however little, counts as a Gaussian. Misread bearings are
-weighted down (Geman, McClure). The best poses are refined over position and heading. One counts as found when most
-bearings agree with it, no other pose comes near, and it is certain enough; otherwise the answer stays unknown.
+72 headings are tried at once. The prior is a Gaussian. Misread bearings are
+weighted down (Geman, McClure). The best poses are refined over position and heading. A pose is accepted if most
+bearings agree with it, every other pose costs much more, and its covariance is small enough.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar.model import Step
+from coopenv.observers.planar.model import OdometryStep
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
 WINDOW = 10  # bearings
@@ -23,7 +23,7 @@ LONG_WINDOW = 30
 HIGHEST_MEAN = 5.0  # of the normalised innovation squared over the long window, 1 for an honest filter
 LARGEST = 25.0  # that one bearing counts in it
 FITS = 9.0  # the same up to which a bearing to a landmark shows that the robot is not lost
-TRUST_S = 15.0  # for so long; meanwhile a robot whose bearings do not fit is itself lost, or lies
+LOCALISED_S = 15.0  # for which that holds; in this time another robot whose bearings do not fit is lost or faulty
 SHORTEST_S = 1.0  # that the window must span: one bad frame is no loss
 
 
@@ -32,27 +32,27 @@ class LossTest:
 
     def __init__(self) -> None:
         self._last: deque[tuple[float, float]] = deque(maxlen=LONG_WINDOW)
-        self._sure = -math.inf
+        self._localised = -math.inf
 
     def clear(self) -> None:
-        """Forget them."""
+        """Clear the test."""
         self._last.clear()
-        self._sure = -math.inf
+        self._localised = -math.inf
 
     def take(self, time: float, ratio: float) -> None:
         """Take the normalised innovation squared of a bearing to a landmark at a time in s."""
         if ratio <= FITS:
-            self._sure = time
+            self._localised = time
         self._last.append((time, min(ratio, LARGEST)))
 
     def take_of_robot(self, time: float, ratio: float) -> None:
         """Take that of a bearing to or from a robot, which counts where no landmark was seen lately."""
-        if not self.sure(time):
+        if not self.localised(time):
             self._last.append((time, min(ratio, LARGEST)))
 
-    def sure(self, time: float) -> bool:
-        """Return whether a landmark showed lately that the robot is not lost."""
-        return time - self._sure <= TRUST_S
+    def localised(self, time: float) -> bool:
+        """Return whether a recent bearing to a landmark fitted the pose."""
+        return time - self._localised <= LOCALISED_S
 
     @property
     def since(self) -> float:
@@ -91,7 +91,7 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
+class SightingLines:
     """m sightings, seen from where the robot is now: offset (m, 2) in m in its body, and so on, all (m,)."""
 
     offset: Array
@@ -103,8 +103,8 @@ class Lines:
     target: Array
 
 
-class Memory:
-    """The trail of one robot's odometry, and what it saw on it."""
+class SightingHistory:
+    """The dead reckoning of one robot, and its recent sightings."""
 
     def __init__(self) -> None:
         self._trail = np.zeros(5)
@@ -115,13 +115,13 @@ class Memory:
         while self._seen and self._seen[0].time < before:
             self._seen.popleft()
 
-    def move(self, step: Step) -> None:
-        """Go on by what the odometry says of a tick."""
+    def move(self, step: OdometryStep) -> None:
+        """Propagate the dead reckoning by the odometry of a tick."""
         middle = self._trail[2] + step.turned / 2
         moved = step.driven * np.cos(middle), step.driven * np.sin(middle)
         self._trail += (*moved, step.turned, step.turn_variance, step.path_variance)
 
-    def see(
+    def add(
         self,
         time: float,
         target: int,
@@ -131,11 +131,11 @@ class Memory:
         variance: float,
         angle_variance: float,
     ) -> None:
-        """Remember a sighting; what is given is as in `Sighting`."""
+        """Add a sighting; arguments as in `Sighting`."""
         trail = tuple(self._trail.tolist())
         self._seen.append(Sighting(time, target, angle, own, point, variance, angle_variance, trail))
 
-    def lines(self, now: float, span: float, scale_variance: float) -> Lines:
+    def lines(self, now: float, span: float, scale_variance: float) -> SightingLines:
         """Return the sightings of the last `span` in s; `scale_variance` is that of the odometry's scale of turns."""
         x, y, heading, turn_sum, path_sum = self._trail
         kept = [s for s in self._seen if now - s.time <= span]
@@ -146,10 +146,10 @@ class Memory:
         own = np.array([float(s.own) for s in kept])
         lost = np.abs(turn_sum - trail[:, 3]) + scale_variance * turned**2
         spread = np.array([s.angle_variance for s in kept]) + own * lost
-        # a heading that is wrong by now also leads astray along the way back
+        # an error of the present heading also shifts the earlier positions
         drift = np.abs(path_sum - trail[:, 4]) + lost * (offset**2).sum(axis=1) / 3
         use = spread < LARGEST_ERROR**2
-        return Lines(
+        return SightingLines(
             offset[use],
             (np.array([s.angle for s in kept]) + own * turned)[use],
             own[use],
@@ -170,30 +170,30 @@ SHARE = 0.75  # of all bearings that must agree
 WORST = 4.0  # mean of those squares of the bearings that agree, 1 where all is as it should be
 MARGIN = 12.0  # by which the cost of any other pose is larger
 APART = (0.5, 0.3)  # m, rad: poses further apart than that are different ones
-CERTAIN = (1.0, 0.35)  # m, rad: standard deviation of a pose that counts
+CERTAIN = (1.0, 0.35)  # m, rad: largest standard deviations of an accepted pose
 NEAREST_M = 0.3
-GROWTH = 2.0  # of the covariance of what bearings say, for a pose to be certain
-SHARED = 2.0  # by which it is larger still, or as much as they fit worse: those of the same odometry share errors
+GROWTH = 2.0  # factor on the covariance of the sightings in that test
+SHARED = 2.0  # least factor on the covariance of the result: sightings with the same odometry share errors
 
 
-class Known(NamedTuple):
+class PoseInformation(NamedTuple):
     """A pose (x m, y m, heading rad) and the information (3, 3) about it."""
 
     pose: Array
     information: Array
 
 
-class Answer(NamedTuple):
-    """What a search gives."""
+class SearchResult(NamedTuple):
+    """Result of a search."""
 
-    found: Known | None  # the pose, and what the sightings alone say about it; None: unknown, or one of several
-    contradicted: bool = False  # whether no pose fits the sightings and what was known before
+    found: PoseInformation | None  # the pose, with the information of the sightings alone; None: unknown or ambiguous
+    contradicted: bool = False  # whether no pose fits both the sightings and the prior
 
 
-def find_pose(lines: Lines, before: Known) -> Answer:
-    """Return the pose that the sightings agree on with each other and with what was known before."""
+def find_pose(lines: SightingLines, before: PoseInformation) -> SearchResult:
+    """Return the pose that agrees with the sightings and with the prior `before`."""
     if len(lines.angle) < FEWEST:
-        return Answer(None)
+        return SearchResult(None)
     headings = np.arange(HEADINGS, dtype=np.float64) * (2 * np.pi / HEADINGS) - np.pi
     poses: Array = np.column_stack([_positions(lines, headings, before), headings])
     best = np.argsort(_cost(lines, poses, before))[:REFINED]
@@ -205,20 +205,20 @@ def find_pose(lines: Lines, before: Known) -> Answer:
     squares = _squares(lines, poses[first : first + 1])[0]
     agree = squares < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
-        return Answer(None, contradicted=True)
+        return SearchResult(None, contradicted=True)
     worse = float(squares[agree].mean())  # than noise, which has 1
     if worse > WORST or len(np.unique(lines.target[agree])) < FEWEST_TARGETS:
-        return Answer(None)
+        return SearchResult(None)
     if (other & (cost < cost[first] + MARGIN)).any():
-        return Answer(None)
-    said = information[first] / GROWTH
-    left = np.linalg.inv(said + before.information)
+        return SearchResult(None)
+    of_sightings = information[first] / GROWTH
+    left = np.linalg.inv(of_sightings + before.information)
     if left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2:
-        return Answer(None)
-    return Answer(Known(poses[first], said / max(SHARED, worse)))
+        return SearchResult(None)
+    return SearchResult(PoseInformation(poses[first], of_sightings / max(SHARED, worse)))
 
 
-def _positions(lines: Lines, headings: Array, before: Known) -> Array:
+def _positions(lines: SightingLines, headings: Array, before: PoseInformation) -> Array:
     """Return (n, 2) where the lines meet for headings (n,), m."""
     off = _wrapped(headings - before.pose[2])
     expected = before.information[:2, :2] @ before.pose[:2] - off[:, None] * before.information[:2, 2]
@@ -244,7 +244,7 @@ def _turned(offset: Array, heading: Array) -> Array:
     return np.stack([c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1]], axis=-1)
 
 
-def _residuals(lines: Lines, poses: Array) -> tuple[Array, Array, Array]:
+def _residuals(lines: SightingLines, poses: Array) -> tuple[Array, Array, Array]:
     """Return angles between lines and points, rad, their variances, and vectors to the points, for poses (n, 3)."""
     away = lines.point - poses[:, None, :2] - _turned(lines.offset, poses[:, 2:])
     square = np.maximum((away**2).sum(axis=-1), NEAREST_M**2)
@@ -253,27 +253,27 @@ def _residuals(lines: Lines, poses: Array) -> tuple[Array, Array, Array]:
     return residual, lines.angle_variance + lines.variance / square, away
 
 
-def _squares(lines: Lines, poses: Array) -> Array:
+def _squares(lines: SightingLines, poses: Array) -> Array:
     residual, variance, _ = _residuals(lines, poses)
     return residual**2 / variance
 
 
-def _off(poses: Array, before: Known) -> Array:
-    """Return (n, 3) how far poses are from what was known."""
+def _off(poses: Array, before: PoseInformation) -> Array:
+    """Return (n, 3) the differences of poses from the prior."""
     off: Array = poses - before.pose
     off[:, 2] = _wrapped(off[:, 2])
     return off
 
 
-def _cost(lines: Lines, poses: Array, before: Known) -> Array:
+def _cost(lines: SightingLines, poses: Array, before: PoseInformation) -> Array:
     """Return (n,) how badly poses fit; a bearing that does not fit at all counts as one that hardly does."""
     off = _off(poses, before)
     unlikely = np.einsum("ni,ij,nj->n", off, before.information, off)
     return np.asarray(np.minimum(_squares(lines, poses), AGREES).sum(axis=-1) + unlikely)
 
 
-def _refined(lines: Lines, poses: Array, before: Known) -> tuple[Array, Array]:
-    """Return poses (n, 3) after some Gauss-Newton steps and what the lines alone say about them (n, 3, 3)."""
+def _refined(lines: SightingLines, poses: Array, before: PoseInformation) -> tuple[Array, Array]:
+    """Return poses (n, 3) after some Gauss-Newton steps and the information of the lines alone (n, 3, 3)."""
     poses = poses.copy()
     for _ in range(ROUNDS):
         residual, variance, away = _residuals(lines, poses)

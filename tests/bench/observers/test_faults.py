@@ -149,8 +149,8 @@ def test_an_observer_may_lie_in_its_own_words() -> None:
         def tampered(self, message: Message) -> Message:
             return replace(message, extra={"twice": 2.0 * message.position})
 
-    assert_array_equal(Lie(0, 0.0).told(Own(), Message(position=np.ones(3))).extra["twice"], [8.0, 10.0, 2.0])
-    bare = Lie(0, 0.0).told(object(), Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32)))
+    assert_array_equal(Lie(0, 0.0).broadcast(Own(), Message(position=np.ones(3))).extra["twice"], [8.0, 10.0, 2.0])
+    bare = Lie(0, 0.0).broadcast(object(), Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32)))
     assert bare.covariance is not None and bare.covariance.shape == (6, 6) and bare.rotation is None
     assert bare.covariance.dtype == np.float32  # a lie takes no more bytes
 

@@ -85,7 +85,7 @@ def test_who_starts_without_a_pose_searches():
 
 
 def test_who_is_unsure_of_the_heading_says_so():
-    """A robot that turns 0.6 times what it is told and sees nothing at first is not sure of a wrong place."""
+    """A robot that turns 0.6 times what it is commanded and sees nothing at first does not converge to a wrong pose."""
     result = run(PlanarRobust, recording_of(barrier_robots(11, 45.0, 0.6), "blind"))
     assert not result.failure and (result.anees(after=0.05) < 3).all()
 
@@ -108,7 +108,7 @@ class Babbling:
     def applies(self, vehicle, time):
         return vehicle == 0
 
-    def told(self, observer, message):
+    def broadcast(self, observer, message):
         self.count += 1
         return Message() if self.silent else _hostile(self.count % 9)
 

@@ -14,6 +14,7 @@ from coopenv.observers.planar.model import (
     ARC,
     BIAS,
     CALIBRATING,
+    COMMANDED,
     HEADING,
     IROBOT_CREATE,
     LEAD,
@@ -23,7 +24,6 @@ from coopenv.observers.planar.model import (
     STATES,
     SWITCHING,
     TEXTBOOK,
-    TOLD,
     TURN,
     TURN_SCALE,
     TURNING,
@@ -70,7 +70,7 @@ def test_response_is_the_delayed_and_spread_command():
 
     done = response[0]
     assert done[TURN] == pytest.approx(expected(lambda t: rate(t, 1)), abs=1e-9)
-    assert done[TOLD] == pytest.approx(done[TURN])
+    assert done[COMMANDED] == pytest.approx(done[TURN])
     assert done[PATH] == pytest.approx(expected(lambda t: rate(t, 0)), abs=1e-9)
     assert done[ARC] == pytest.approx(expected(lambda t: float(rate(t, 1) != 0)), abs=1e-9)
     assert done[TURNING] == pytest.approx(done[ARC])

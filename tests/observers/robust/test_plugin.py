@@ -102,7 +102,7 @@ def test_a_joint_liar_is_as_sure_in_every_entry():
         def message(self):
             message = super().message()
             if self.setup.vehicle == 2 and message.position is not None and "factor" in message.extra:
-                lies.append(Lie(2, 0.0).told(self, message))
+                lies.append(Lie(2, 0.0).broadcast(self, message))
             return message
 
     run(Watched, record)
