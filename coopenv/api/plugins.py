@@ -32,9 +32,9 @@ class PlugIns:
         if world.device != "cpu":
             raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
         self.name, self._world = name, world
-        briefing = world.briefing
-        self.groups = [Group(factory, briefing) for _ in range(world.worlds)]
-        self._order: Sequence[int] = briefing.order
+        observer_init = world.observer_init
+        self.groups = [Group(factory, observer_init) for _ in range(world.worlds)]
+        self._order: Sequence[int] = observer_init.order
         self._ticking = np.zeros(world.worlds, dtype=bool)  # worlds that are in the tick under way
         self._failures: dict[int, str] = {}
 

@@ -18,8 +18,8 @@ from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.estimation.poses import Array
 from coopenv.estimation.validity import are_numbers, are_rotations
 from coopenv.observers.contract import Message, check_message
-from coopenv.observers.recording import Briefing, Sensed
-from coopenv.observers.runner import briefing_of
+from coopenv.observers.recording import ObserverInit, Sensed
+from coopenv.observers.runner import observer_init_of
 from coopenv.scenario import Scenario
 from coopenv.world.dynamics import ACCELERATION, PAN, SPEED, STEERING
 from coopenv.world.world import World
@@ -244,9 +244,9 @@ class SensingWorld(World, ABC):
         """(N,) ticks of it of which nothing came."""
 
     @cached_property
-    def briefing(self) -> Briefing:
+    def observer_init(self) -> ObserverInit:
         """What observers are told before the first tick."""
-        return briefing_of(self.scenario, self.model)
+        return observer_init_of(self.scenario, self.model)
 
     @abstractmethod
     def sensed(self, world: int, k: int) -> Sensed:

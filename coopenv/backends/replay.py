@@ -12,7 +12,7 @@ import warp as wp
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.backends.feed import RECORDED, Feed
 from coopenv.base.errors import CoopenvError, DataError
-from coopenv.observers.recording import Briefing, Recording, Sensed, check_recording, is_due
+from coopenv.observers.recording import ObserverInit, Recording, Sensed, check_recording, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import override, parse_scenario
@@ -130,9 +130,9 @@ class ReplayWorld(SensingWorld):
         super().__init__(scenario, *arguments)
 
     @cached_property
-    def briefing(self) -> Briefing:
+    def observer_init(self) -> ObserverInit:
         """What observers are told before the first tick."""
-        return self._recording.briefing
+        return self._recording.observer_init
 
     def sensed(self, world: int, k: int) -> Sensed:
         """Return what was sensed at tick k, the same in every world and in float64 whatever the precision."""

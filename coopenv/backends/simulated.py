@@ -122,7 +122,7 @@ class Simulated(TickGenerator):
             world.view("command")[0] = command.rows
             world.fetch()
             world.sense()
-            for vehicle in world.briefing.order:
+            for vehicle in world.observer_init.order:
                 world.receive(vehicle)
                 world.broadcast(vehicle)
             world.finish()

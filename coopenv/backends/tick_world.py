@@ -22,7 +22,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_se3
 from coopenv.observers.contract import Message
 from coopenv.observers.kernel_observer import views_of
-from coopenv.observers.recording import MEASURED, Briefing, Sensed, check_tick, is_due
+from coopenv.observers.recording import MEASURED, ObserverInit, Sensed, check_tick, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.world.embedded import HOST
@@ -55,7 +55,7 @@ class TickWorld(SensingWorld):
         scenario = backend.scenario
         observer = find_embedded(scenario.observer.name) or HOST
         super().__init__(scenario, 1, dtype, device, 1, observer, start_covariances(scenario))
-        self._present = _nothing(self.briefing)
+        self._present = _nothing(self.observer_init)
         self._ticks: Iterator[Sensed] = iter(())
         self._adopted: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """Rotation and body-frame position by which vehicles that are estimated elsewhere believe to be."""
@@ -81,7 +81,7 @@ class TickWorld(SensingWorld):
     def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Begin an episode of the backend, see `World.reset`."""
         self._ticks = iter(())
-        self._present = _nothing(self.briefing)
+        self._present = _nothing(self.observer_init)
         self._adopted.clear()
         self._clear_marks()
         self._take(self._backend.reset(None if keys is None or keys[0] is None else int(keys[0]), options or {}), 0)
@@ -144,7 +144,7 @@ class TickWorld(SensingWorld):
     def _take(self, tick: Sensed, k: int) -> None:
         """Check a tick and put it where the kernels read it."""
         try:
-            check_tick(tick, k, self.briefing)
+            check_tick(tick, k, self.observer_init)
         except CoopenvError as error:
             raise CoopenvError(f"{self._name}: {error}") from None
         last, self._present = self._present, self._completed(tick)
@@ -186,7 +186,7 @@ class TickWorld(SensingWorld):
             if message.position is not None:
                 R = np.eye(3) if message.rotation is None else np.asarray(message.rotation, dtype=float)
                 self.view("inbox_rotation")[0, receiver, sender] = R
-                position = message.position - R @ self.briefing.setups[sender].marker
+                position = message.position - R @ self.observer_init.setups[sender].marker
                 self.view("inbox_position")[0, receiver, sender] = position
                 self.view("inbox_tick")[0, receiver, sender] = self.view("inbox_stamp")[0, receiver, sender] = sent
         self._present = replace(now, messages=accepted)
@@ -197,10 +197,10 @@ class TickWorld(SensingWorld):
         for (_, sender), received in self._present.messages.items() if here is not None else ():
             R, place = received.message.rotation, received.message.position
             if R is not None and place is not None:
-                self._adopted[sender] = R, R.T @ place - self.briefing.setups[sender].marker
+                self._adopted[sender] = R, R.T @ place - self.observer_init.setups[sender].marker
         for sender, (R, p) in self._adopted.items():
             self.view("estimate_rotation")[0, sender], self.view("estimate_position")[0, sender] = R, p
-        if isinstance(self._backend, Conversing) and int(self.view("tick")[0]) % self.briefing.period == 0:
+        if isinstance(self._backend, Conversing) and int(self.view("tick")[0]) % self.observer_init.period == 0:
             self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
 
     def _told(self, vehicle: int) -> Told:
@@ -230,26 +230,26 @@ class TickWorld(SensingWorld):
             self._parts[vehicle] = SimpleNamespace(
                 memory=memory,
                 state=state,
-                setup=self.briefing.setups[vehicle],
+                setup=self.observer_init.setups[vehicle],
                 unit=unit,
                 units=lambda seconds: round(seconds / unit),
             )
         return self._parts[vehicle]
 
 
-def _nothing(briefing: Briefing) -> Sensed:
+def _nothing(observer_init: ObserverInit) -> Sensed:
     """Return what there is before the first tick: no motion, nothing in view."""
-    N, T = len(briefing.setups), len(briefing.setups[0].target_names)
+    N, T = len(observer_init.setups), len(observer_init.setups[0].target_names)
     return Sensed(
         index=-1,
-        dt=briefing.dt,
+        dt=observer_init.dt,
         rotation=np.tile(np.eye(3), (N, 1, 1)),
         translation=np.zeros((N, 3)),
         velocity=np.zeros((N, 3)),
         angular_velocity=np.zeros((N, 3)),
         bearings=np.full((N, T, 3), np.nan),
         visible=np.zeros((N, T), bool),
-        landmarks=np.zeros((briefing.setups[0].landmarks, 3)),
+        landmarks=np.zeros((observer_init.setups[0].landmarks, 3)),
         odometry_age=np.full(N, np.inf),
     )
 

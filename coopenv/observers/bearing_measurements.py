@@ -100,8 +100,8 @@ def corrected(kind: int, R: Array, p: Array, dx: Array, P: Array) -> tuple[Array
     return R, p, congruent(recentring(kind, dx), P)
 
 
-class Pose(Protocol):
-    """A pose with an error about it."""
+class PoseWithError(Protocol):
+    """A pose, and the kind of its error."""
 
     @property
     def R(self) -> Array:  # noqa: N802
@@ -113,40 +113,44 @@ class Pose(Protocol):
 
     @property
     def kind(self) -> int:
-        """Which error it is, see pose_errors.py."""
+        """LEFT, RIGHT or INVARIANT."""
 
 
-class Sight(NamedTuple):
-    """The bearings of a frame that can be used."""
+class BearingMeasurements(NamedTuple):
+    """The usable bearings of a frame."""
 
     bearings: Array  # (m, 3) unit vectors, body frame
-    positions: Array  # (m, 3) of the points, as known or told, map frame, m
-    covariances: Array  # (m, 3, 3) of the points, m^2, zero where they are known or nothing is stated
+    positions: Array  # (m, 3) of the points, as known or reported, map frame, m
+    covariances: Array  # (m, 3, 3) of the points, m^2, zero for known points and without a reported covariance
     targets: NDArray[np.int64]  # (m,)
     messages: tuple[Message | None, ...]  # (m,) None for landmarks
 
-    def only(self, kept: NDArray[np.bool_]) -> "Sight":
-        """Return those of a mask (m,)."""
+    def only(self, kept: NDArray[np.bool_]) -> "BearingMeasurements":
+        """Return the bearings of a mask (m,)."""
         messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
-        return Sight(self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages)
+        return BearingMeasurements(
+            self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages
+        )
 
-    def one(self, n: int) -> "Sight":
-        """Return the n-th one alone."""
+    def one(self, n: int) -> "BearingMeasurements":
+        """Return the n-th bearing alone."""
         k = slice(n, n + 1)
-        return Sight(self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k])
+        return BearingMeasurements(
+            self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k]
+        )
 
 
-class Lines(NamedTuple):
-    """Bearings, linearised."""
+class LinearisedBearings(NamedTuple):
+    """Linearised bearings."""
 
     residual: Array  # (m, 2) rad, in the tangent planes
-    H: Array  # (m, 2, n) derivative of what is measured by the error
-    N: Array  # (m, 2, 2) rad^2, covariance of the residuals given one's own pose
-    G: Array  # (m, 2, 3) derivative of what is measured by the points, map axes, rad/m
+    H: Array  # (m, 2, n) derivative of the measurement by the error
+    N: Array  # (m, 2, 2) rad^2, covariance of the residuals given the own pose
+    G: Array  # (m, 2, 3) derivative of the measurement by the points, map axes, rad/m
 
-    def only(self, kept: NDArray[np.bool_]) -> "Lines":
-        """Return those of a mask (m,)."""
-        return Lines(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
+    def only(self, kept: NDArray[np.bool_]) -> "LinearisedBearings":
+        """Return the bearings of a mask (m,)."""
+        return LinearisedBearings(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
@@ -158,8 +162,8 @@ class Lines(NamedTuple):
         return self.residual.ravel(), self.H.reshape(-1, self.H.shape[-1]), dense(self.N)
 
 
-def sight_of(tick: Tick, weighed: bool = True) -> Sight | None:
-    """Return what can be used of a frame, None where there is nothing; `weighed`: with the covariances told."""
+def usable_bearings(tick: Tick, weighed: bool = True) -> BearingMeasurements | None:
+    """Return the usable bearings of a frame, None without any; `weighed`: with the reported covariances."""
     seen = tick.usable()
     if not seen:
         return None
@@ -169,11 +173,13 @@ def sight_of(tick: Tick, weighed: bool = True) -> Sight | None:
             if message is not None and message.covariance is not None:
                 covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
-    return Sight(np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages)
+    return BearingMeasurements(
+        np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages
+    )
 
 
 def point_covariance(message: Message) -> Array:
-    """Return the covariance (3, 3) in map axes of the position that a message tells, from whatever it states."""
+    """Return the covariance (3, 3) in map axes of a reported position; zero if the message has none."""
     if message.covariance is None or len(message.covariance) == 3 or message.rotation is None:
         return np.zeros((3, 3)) if message.covariance is None else message.covariance[:3, :3]
     R = message.rotation
@@ -201,18 +207,18 @@ def put_derivative(row: Array, u: Array, about: Array, factor: float) -> None:
         row[k + 3] = -u[k] * factor
 
 
-def linearised(pose: Pose, tick: Tick, sight: Sight) -> Lines:
-    """Return the lines at a pose; the points' covariances are noise, as if independent of the pose."""
+def linearised(pose: PoseWithError, tick: Tick, measured: BearingMeasurements) -> LinearisedBearings:
+    """Linearise bearings at a pose; the points' covariances are noise, as if independent of the pose."""
     variance = tick.noise.bearing_std**2
     lever_arm = np.asarray(tick.lever_arm, float)
-    return Lines(*linearise(pose.R, pose.p, pose.kind == RIGHT, lever_arm, *sight[:3], variance))
+    return LinearisedBearings(*linearise(pose.R, pose.p, pose.kind == RIGHT, lever_arm, *measured[:3], variance))
 
 
 @compiled(MATRIX, VECTOR, FLAG, VECTOR, MATRIX, MATRIX, MATRICES, NUMBER)
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return residuals, H, N and G as in `Lines`; `right`: the error is about the map's axes.
+    """Return residuals, H, N and G as in `LinearisedBearings`; `right`: the error is about the map's axes.
 
     With the rows j of J, and g = R j, the derivative by a left error is (j x a, -j), by a right one (g x z, -g).
     """
@@ -238,9 +244,11 @@ def linearise(
     return residual, H, N, G
 
 
-def ahead(pose: Pose, tick: Tick, sight: Sight) -> NDArray[np.bool_]:
-    """Return (m,) whether the points are where the bearings point, and not opposite."""
-    of: NDArray[np.bool_] = _ahead(pose.R, pose.p, np.asarray(tick.lever_arm, float), sight.bearings, sight.positions)
+def ahead(pose: PoseWithError, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
+    """Return (m,) whether the points are ahead along the bearings, and not behind."""
+    of: NDArray[np.bool_] = _ahead(
+        pose.R, pose.p, np.asarray(tick.lever_arm, float), measured.bearings, measured.positions
+    )
     return of
 
 
@@ -275,7 +283,7 @@ def dense(blocks: Array) -> Array:
 
 @compiled(MATRICES, MATRIX, MATRICES)
 def spread(H: Array, P: Array, N: Array) -> Array:
-    """Return (m, 2, 2) H P H^T + N of every line."""
+    """Return (m, 2, 2) H P H^T + N of every bearing."""
     S = N.copy()
     for n in range(len(H)):
         HPH = congruent(H[n], P)

@@ -1,8 +1,8 @@
 """Extended Kalman filter over the stacked left errors of all vehicles: the upper reference.
 
 Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transactions on Robotics and Automation 18(5),
-2002, in its centralised form; errors and Jacobians as in mekf.py. A bearing from i to a point z_j = p_j + R_j m_j of
-vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|. Each vehicle has a gate (gate.py); corrections are
+2002, in its centralised form; errors and Jacobians as in error_state_filters.py. A bearing from i to a point z_j = p_j
++ R_j m_j of vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|. Each vehicle has a gate; corrections are
 linearised half way (correction.py).
 """
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
-from coopenv.observers.bearing_measurements import Lines, Sight, linearised
+from coopenv.observers.bearing_measurements import BearingMeasurements, LinearisedBearings, linearised
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import Gate, Stacked, halfway
+from coopenv.observers.correction import InnovationGate, Stacked, halfway
 from coopenv.observers.error_state_filters import LeftError
 
 Masks = dict[int, NDArray[np.bool_]]
@@ -30,8 +30,8 @@ class Centralised:
     joint = True
 
     def __init__(self, setups: Sequence[Setup], gated: bool = True) -> None:
-        """Take the setups of all; without `gated` every bearing is believed."""
-        self.gated, self.gates = gated, [Gate() for _ in setups]
+        """Take the setups of all; without `gated` every bearing is used."""
+        self.gated, self.gates = gated, [InnovationGate() for _ in setups]
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
 
@@ -47,7 +47,7 @@ class Centralised:
 
     @staticmethod
     def block(i: int) -> slice:
-        """Return where vehicle i stands in the state."""
+        """Return the place of vehicle i in the state."""
         return slice(6 * i, 6 * i + 6)
 
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
@@ -76,34 +76,34 @@ class Centralised:
     def correct(self, ticks: Sequence[Tick], seen: Masks) -> None:
         """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
-        lines = {i: self.lines(i, ticks[i], mask) for i, mask in seen.items()}
+        linear = {i: self.linearise(i, ticks[i], mask) for i, mask in seen.items()}
         if self.gated:
             kept = {
                 i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
-                for i, (of, in_front) in lines.items()
+                for i, (of, in_front) in linear.items()
             }
-            lines = {i: (of.only(kept[i]), in_front) for i, (of, in_front) in lines.items()}
+            linear = {i: (of.only(kept[i]), in_front) for i, (of, in_front) in linear.items()}
             seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
-        first = _stacked([of for of, _ in lines.values()])
+        first = _stacked([of for of, _ in linear.values()])
         if not len(first[0]):
             return
 
         def look(at: Array) -> Stacked:
             self.poses = moved(before, at)
-            residual, H, N = _stacked([self.lines(i, ticks[i], mask)[0] for i, mask in seen.items()])
+            residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
             return residual, H.dot(recentring(at)), N
 
         dx, P, _ = halfway(P, first, look)
         G = recentring(dx)
         self.poses, self.P = moved(before, dx), G.dot(P).dot(G.T)
 
-    def lines(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[Lines, NDArray[np.bool_]]:
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
         R, p = self.poses[i]
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
-        known = Sight(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
+        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
         own = linearised(LeftError(R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
@@ -114,7 +114,7 @@ class Centralised:
         return own._replace(H=H), (((z - p).dot(R) - tick.lever_arm) * bearings).sum(1) > 0.0
 
     def place(self, target: int, tick: Tick) -> Array:
-        """Return (3,) where a target is, or is believed to be, map frame, m."""
+        """Return (3,) the known or estimated position of a target, map frame, m."""
         if target < self.landmarks:
             landmark: Array = tick.landmarks[target]
             return landmark
@@ -146,5 +146,5 @@ def _within(mask: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool
     return result
 
 
-def _stacked(lines: Sequence[Lines]) -> Stacked:
-    return Lines(*(np.concatenate(parts) for parts in zip(*lines, strict=True))).stacked()
+def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:
+    return LinearisedBearings(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()

@@ -1,24 +1,24 @@
 """The Kalman update of the zoo, with bearings linearised half way between prediction and correction.
 
-Linearised at the prediction, gain and innovation depend on the same noise of odometry: ranges between vehicles that
-hardly move against each other drift outwards; linearised at the correction, they drift inwards; half way the drift
-vanishes, as a Stratonovich integral has none (docs/observers.md#linearisation has the comparison).
+For two vehicles with little relative motion, linearising at the predicted pose biases the estimated range outwards,
+because gain and innovation depend on the same noise. Linearising at the corrected pose biases it inwards. Half way the
+bias vanishes, as in a Stratonovich integral (docs/observers.md#linearisation has the comparison).
 
-The other form is iterated to where the correction leads, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
+The other form is iterated to convergence, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
 filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993; with a line search as in
 Skoglund, Hendeby and Axehill, Extended Kalman filter modifications based on an optimization view point, FUSION 2015.
 
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation, 2001, section 5.4: the
-normalised innovation squared r^T S^-1 r of an honest bearing has a chi-square distribution of 2 degrees of freedom. S
-counts the prior, the sender's covariance where the filter uses one, and the bearing's noise. A target must also be
-where the bearing points, and not behind (cheirality).
+normalised innovation squared r^T S^-1 r of a correct bearing has a chi-square distribution of 2 degrees of freedom. S
+contains the prior, the sender's covariance if the filter uses it, and the bearing's noise. The target must also be
+ahead along the bearing (cheirality).
 
-A filter that is sure of a wrong pose would refuse what contradicts it for ever. Trackers give up a track when what
-fits it stays away, and hold a new one for tentative until it is confirmed (Blackman and Popoli, Design and analysis of
-modern tracking systems, 1999, chapter 6). So does this gate: it opens, which means that it takes everything, where the
-prior is so wide that a linearised innovation has no meaning, and where most bearings are refused; it closes when few
-would be. Targets mistaken now and then, and one sender of two or more that lies, do not open it; a lie that is told
-while it is open is believed.
+With a gate alone, a filter with a wrong pose and a small covariance rejects all bearings for ever. Trackers drop a
+track without confirming measurements, and a new track is tentative until it is confirmed (Blackman and Popoli, Design
+and analysis of modern tracking systems, 1999, chapter 6). Likewise this gate opens, which means that it accepts all
+bearings, if the prior is too wide for linearised innovations or if most bearings are rejected. It closes when few
+bearings would be rejected. Occasional wrong associations do not open it, nor does one faulty sender of two or more.
+While the gate is open, a faulty message is fused.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from coopenv.estimation.compiled_algebra import eliminated, place, product, tran
 from coopenv.estimation.poses import Array, solve
 from coopenv.observers.bearing_measurements import (
     RIGHT,
-    Sight,
+    BearingMeasurements,
     corrected,
     dense,
     linearise,
@@ -42,7 +42,7 @@ from coopenv.observers.bearing_measurements import (
 )
 from coopenv.observers.contract import Tick
 
-CLOSE = 1e-3  # rad, by which the last step of an iteration may turn a line of sight
+CLOSE = 1e-3  # rad: largest turn of a line of sight by the last step
 MOST = 8  # steps, and halvings of a step
 
 Stacked = tuple[Array, Array, Array]
@@ -84,7 +84,7 @@ def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array,
 
 
 def turn_of_sight(dx: Array, distance: float) -> float:
-    """Return by how much an error (6n,) of n poses turns the line of sight to a point at a distance in m, rad."""
+    """Return the angle, rad, by which an error (6n,) turns the line of sight to a point, given its distance in m."""
     size = np.abs(dx).reshape(-1, 2, 3).max(axis=(0, 2))
     return float(max(size[0], size[1] / distance))
 
@@ -107,10 +107,10 @@ def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
 
 
 def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float]:
-    """Return what `halfway` does of an update iterated to where it leads.
+    """Return (dx, P+, r^T S^-1 r at the prediction) of an update iterated to convergence.
 
-    Steps are halved until the cost x^T P^-1 x + r^T N^-1 r falls. `bend` returns by how much an error (n,) turns a line
-    of sight, rad.
+    Steps are halved until the cost x^T P^-1 x + r^T N^-1 r falls. `bend` returns the angle by which an error (n,) turns
+    a line of sight, rad.
     """
 
     def cost(x: Array, residual: Array, N: Array) -> float:
@@ -138,39 +138,39 @@ def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float
 
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 WIDE = 0.5  # rad^2, trace of S: about 30 degrees per axis. Chosen
-AVERAGING = 1.0  # s, over which the share of refused bearings is averaged. Chosen
-LOST_SHARE, FOUND_SHARE = 0.6, 0.1
-"""Averaged shares of refused bearings above which the gate opens, and below which it closes. Chosen: one wrong target
-of two does not open it, and one of three does not let it close."""
+AVERAGING = 1.0  # s, over which the share of rejected bearings is averaged. Chosen
+OPENING_SHARE, CLOSING_SHARE = 0.6, 0.1
+"""Averaged shares of rejected bearings above which the gate opens, and below which it closes. Chosen: one wrong target
+of two does not open the gate; one of three keeps it open."""
 
 
-class Gate:
-    """The gate of one vehicle."""
+class InnovationGate:
+    """Innovation gate of one vehicle."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Begin anew."""
-        self.share = 0.0  # of refused bearings, averaged
+        self.share = 0.0  # of rejected bearings, averaged
         self.is_open = False
         self.time = 0.0  # s, of the last frame
 
     def passed(self, time: float, residual: Array, S: Array, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return (m,) which bearings of a frame to take.
+        """Return (m,) which bearings of a frame are accepted.
 
         Args:
             time: s.
             residual: (m, 2) rad, in the tangent planes.
-            S: (m, 2, 2) rad^2, their covariances; where one is none, or not a number, its bearing is never taken.
-            in_front: (m,) whether the targets are where the bearings point.
+            S: (m, 2, 2) rad^2, their covariances; a bearing with an invalid covariance is never accepted.
+            in_front: (m,) whether the targets are ahead along the bearings.
         """
-        definite, fits, refused, widest = judged(residual, S, in_front)
-        self.share += (refused - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
+        definite, fits, rejected, widest = judged(residual, S, in_front)
+        self.share += (rejected - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
         if widest > WIDE:
             self.share = 1.0
         self.time = time
-        self.is_open = self.share > (FOUND_SHARE if self.is_open else LOST_SHARE)
+        self.is_open = self.share > (CLOSING_SHARE if self.is_open else OPENING_SHARE)
         taken: NDArray[np.bool_] = definite if self.is_open else fits
         return taken
 
@@ -192,13 +192,13 @@ FRAME = types.Tuple((VECTOR, MATRIX, MATRIX, MATRICES, NUMBER))
 Frame = tuple[Array, Array, Array, Array, float]
 
 
-def frame_of(tick: Tick, sight: Sight) -> Frame:
-    """Return what compiled functions need of a frame."""
+def frame_of(tick: Tick, measured: BearingMeasurements) -> Frame:
+    """Return the arguments of compiled functions for a frame."""
     return (
         np.asarray(tick.lever_arm, float),
-        sight.bearings,
-        sight.positions,
-        sight.covariances,
+        measured.bearings,
+        measured.positions,
+        measured.covariances,
         tick.noise.bearing_std**2,
     )
 

@@ -1,27 +1,26 @@
-"""Error-state filter that fuses neighbours by covariance intersection with what is told of them.
+"""Error-state filter that fuses neighbours by covariance intersection.
 
 Source: Julier and Uhlmann, A non-divergent estimation algorithm in the presence of unknown correlations, 1997. For a
 bearing to a neighbour P becomes P / w, and the neighbour's part of the noise H_j P_j H_j^T / (1 - w): the two may be
 correlated in any way. The bearing's own noise is independent and stays whole. w minimises det P+. Consistent, at the
 price of information. With the gain that is best for that bound it is also the discorrelated minimum variance of Zhu and
 Kia, Cooperative localization under limited connectivity, IEEE Transactions on Robotics 35(6), 2019, for vehicles that
-correct themselves alone. It is not split covariance intersection, which is in split_covariance_intersection.py: P and
-P_j count as dependent as a whole.
+correct themselves alone. Unlike in split covariance intersection, P and P_j
+count as dependent as a whole.
 
 Source: Li, Nashashibi and Yang, Split covariance intersection filter: theory and its application to vehicle
 localization, IEEE Transactions on Intelligent Transportation Systems 14(4), 2013; Li and Nashashibi, Cooperative
 multi-vehicle localization using split covariance intersection filter, IEEE Intelligent Transportation Systems Magazine
-5(2), 2013. The covariance is the sum of a part of errors that others may share and one of errors that are one's own,
-P = P_d + P_i. Odometry: P_d <- F P_d F^T, P_i <- F P_i F^T + Q. A measurement with R_d and R_i:
+5(2), 2013. The covariance is the sum of a part that may correlate with the errors of other vehicles and an independent
+part, P = P_d + P_i. Odometry: P_d <- F P_d F^T, P_i <- F P_i F^T + Q. A measurement with R_d and R_i:
 
     P_1 = P_d / w + P_i,  P_2 = R_d / (1 - w) + R_i,  K = P_1 H^T (H P_1 H^T + P_2)^-1,  P+ = (I - K H) P_1,
     P_i+ = (I - K H) P_i (I - K H)^T + K R_i K^T,  P_d+ = P+ - P_i+,  w minimises det P+.
 
-A landmark has R_d = 0. Of a bearing to a neighbour the noise is R_i, and the neighbour's covariance is R_d, both parts
-of it: what is its own when it tells it has been told before, and is shared from then on. (Were its independent part
-taken for independent each time, nobody downstream of one leader would ever have a dependent part, and the filter would
-be mekf_covariance.) That P_i is independent of what others tell holds as long as nobody hears of itself: it is an
-assumption where vehicles see each other in a circle.
+A landmark has R_d = 0. For a bearing to a neighbour, the noise is R_i and the whole covariance of the neighbour is R_d:
+its independent part is shared from its first message on. (If it counted as independent in every message, no follower of
+a single leader would have a dependent part, and the filter would be mekf_covariance.) P_i is independent of received
+messages as long as a vehicle's own information does not return to it. In a circle of vehicles this is an assumption.
 """
 
 from dataclasses import replace
@@ -32,14 +31,20 @@ import numpy as np
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled
 from coopenv.estimation.compiled_algebra import congruent
 from coopenv.estimation.poses import Array
-from coopenv.observers.bearing_measurements import Lines, Sight, corrected, linearised, recentring
+from coopenv.observers.bearing_measurements import (
+    BearingMeasurements,
+    LinearisedBearings,
+    corrected,
+    linearised,
+    recentring,
+)
 from coopenv.observers.contract import Tick
 from coopenv.observers.correction import FRAME, Frame, frame_of, halfway_gain, joseph, updated
 from coopenv.observers.error_state_filters import Mekf
 
-LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w short of 1, which leaves the measurement out
+LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w; 1 leaves the measurement out
 CLOSE = 1e-9  # to which w is found
-VAGUE = 10.0  # rad^2, of a bearing to a neighbour whose place is so uncertain that it says nothing
+VAGUE = 10.0  # rad^2, of a bearing to a neighbour whose position is too uncertain to be used
 
 
 @compiled(MATRIX, MATRIX)
@@ -85,7 +90,7 @@ def best_weight(prior: Array, own: Array, theirs: Array) -> float:
 
 @compiled(MATRIX, MATRIX, MATRIX, NUMBER)
 def weight(P: Array, H: Array, N: Array, variance: float) -> float:
-    """Return w for one bearing whose own noise has a variance; 1 where the neighbour's place is too uncertain."""
+    """Return w for one bearing whose own noise has a variance; 1 if the neighbour's position is too uncertain."""
     own = variance * np.eye(2)
     return best_weight(congruent(H, P), own, N - own) if N[0, 0] + N[1, 1] < VAGUE else 1.0
 
@@ -93,32 +98,32 @@ def weight(P: Array, H: Array, N: Array, variance: float) -> float:
 class CovarianceIntersection(Mekf):
     """Kalman filter; neighbours by covariance intersection.
 
-    Landmarks come first, by a Kalman update, then neighbours one at a time.
-    It tells the normalised innovation of the landmarks; an inflated one has no distribution.
+    Landmarks come first, by a Kalman update, then neighbours one at a time. The normalised innovation is that of the
+    landmarks; an inflated one has no known distribution.
     """
 
     sends_covariance = True
 
-    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by bearings, which are linearised at the prediction."""
-        known = np.array([m is None or m.covariance is None for m in sight.messages])
+        known = np.array([m is None or m.covariance is None for m in measured.messages])
         if known.any():
-            super().correct(tick, sight.only(known), lines.only(known))
+            super().correct(tick, measured.only(known), linear.only(known))
         for n in np.flatnonzero(~known).tolist():
-            self.intersect(tick, sight.one(n))
+            self.intersect(tick, measured.one(n))
 
-    def intersect(self, tick: Tick, one: Sight) -> None:
+    def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
-        state, lines = self.state, linearised(self.state, tick, one)
-        w = weight(state.P, lines.H[0], lines.N[0], tick.noise.bearing_std**2)
+        state, linear = self.state, linearised(self.state, tick, one)
+        w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
         if w < 1.0:
             inflated = one._replace(covariances=one.covariances / (1.0 - w))
             R, p, P, _ = updated(state.kind, state.R, state.p, state.P / w, frame_of(tick, inflated))
-            self.state = self.belief(R, p, P)
+            self.state = self.state_type(R, p, P)
 
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])
-"""Among which w is searched: near one as finely as at 60 Hz a little inflation adds up."""
+"""Values of w that are tried: fine steps near 1, because small inflations add up at 60 Hz."""
 
 
 @compiled(MATRIX)
@@ -172,13 +177,13 @@ def updated_parts(
 class SplitCovarianceIntersection(Mekf):
     """Kalman filter; neighbours by split intersection.
 
-    It sends position and covariance. It tells the normalised innovation of the landmarks.
+    It sends position and covariance. The normalised innovation is that of the landmarks.
     """
 
     sends_covariance = True
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
-        """Start at a pose, whose errors are one's own."""
+        """Start at a pose with independent errors."""
         super().reset(initial_pose, initial_covariance)
         self.independent = self.state.P.copy()  # P_i
 
@@ -187,25 +192,25 @@ class SplitCovarianceIntersection(Mekf):
         self.independent = replace(self.state, P=self.independent).predicted(tick).P
         super().predict(tick)
 
-    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
-        known = np.array([m is None or m.covariance is None for m in sight.messages])
+        known = np.array([m is None or m.covariance is None for m in measured.messages])
         if known.any():
-            self.nis = self.intersect(tick, sight.only(known))
+            self.nis = self.intersect(tick, measured.only(known))
             self.nis_dof = 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.intersect(tick, sight.one(n))
+            self.intersect(tick, measured.one(n))
 
-    def intersect(self, tick: Tick, sight: Sight) -> float:
+    def intersect(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings to landmarks, or by one to a neighbour; return the normalised innovation squared."""
         state, P, P_i = self.state, self.state.P, self.independent
-        if sight.covariances.any():
-            lines = linearised(state, tick, sight)
-            w = best_split_weight(P - P_i, P_i, lines.H[0], lines.N[0], tick.noise.bearing_std**2)
+        if measured.covariances.any():
+            linear = linearised(state, tick, measured)
+            w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
             if w == 1.0:
                 return 0.0
             P = (P - P_i) / w + P_i
-            sight = sight._replace(covariances=sight.covariances / (1.0 - w))
-        R, p, P, P_i, nis = updated_parts(state.kind, state.R, state.p, P, P_i, frame_of(tick, sight))
-        self.state, self.independent = self.belief(R, p, P), P_i
+            measured = measured._replace(covariances=measured.covariances / (1.0 - w))
+        R, p, P, P_i, nis = updated_parts(state.kind, state.R, state.p, P, P_i, frame_of(tick, measured))
+        self.state, self.independent = self.state_type(R, p, P), P_i
         return float(nis)

@@ -13,17 +13,26 @@ from coopenv.observers import bearing_measurements
 from coopenv.observers.bearing_measurements import (
     INVARIANT,
     RIGHT,
-    Lines,
-    Sight,
+    BearingMeasurements,
+    LinearisedBearings,
     across,
     ahead,
     dense,
     from_left,
     linearised,
-    sight_of,
+    usable_bearings,
 )
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import FRAME, Frame, Gate, Stacked, frame_of, iterated, turn_of_sight, updated
+from coopenv.observers.correction import (
+    FRAME,
+    Frame,
+    InnovationGate,
+    Stacked,
+    frame_of,
+    iterated,
+    turn_of_sight,
+    updated,
+)
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.riccati.kernels import RICCATI
 
@@ -81,17 +90,17 @@ class LeftError:
 
 
 class PoseObserver:
-    """What observers share that believe in one pose and a covariance, and tell where their marker is."""
+    """Base of observers that estimate one pose with a covariance and broadcast the position of their marker."""
 
-    belief: ClassVar[type[LeftError]] = LeftError
+    state_type: ClassVar[type[LeftError]] = LeftError
     sends_covariance = True
 
     def __init__(self, setup: Setup) -> None:
-        self.marker = setup.marker  # what others measure
+        self.marker = setup.marker  # the point that cameras of other vehicles measure
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        self.state = self.belief.start(*initial_pose, initial_covariance)
+        self.state = self.state_type.start(*initial_pose, initial_covariance)
 
     def message(self) -> Message:
         """Return the marker's position, and its covariance if this observer sends it."""
@@ -100,7 +109,7 @@ class PoseObserver:
 
 
 class Mekf(PoseObserver):
-    """Error-state filter; trusts the positions that it hears.
+    """Error-state filter; takes received positions as exact.
 
     It sends its position alone.
     """
@@ -108,9 +117,9 @@ class Mekf(PoseObserver):
     sends_covariance = False
 
     def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Take a setup; without `gated` every bearing is believed."""
+        """Take a setup; without `gated` every bearing is used."""
         super().__init__(setup)
-        self.gated, self.gate = gated, Gate()
+        self.gated, self.gate = gated, InnovationGate()
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
@@ -122,45 +131,45 @@ class Mekf(PoseObserver):
         self.predict(tick)
         self.nis: float | None = None
         self.nis_dof = 0
-        sight = sight_of(tick, self.sends_covariance) if tick.due else None
-        if sight is not None:
-            self.take(tick, sight)
+        measured = usable_bearings(tick, self.sends_covariance) if tick.due else None
+        if measured is not None:
+            self.take(tick, measured)
         return self.state.estimate(self.nis, self.nis_dof)
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
         self.state = self.state.predicted(tick)
 
-    def take(self, tick: Tick, sight: Sight) -> None:
-        """Correct by what passes the gate."""
-        lines = linearised(self.state, tick, sight)
+    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
+        """Correct by the bearings that pass the gate."""
+        linear = linearised(self.state, tick, measured)
         if self.gated:
-            S = self.spread(tick, sight, lines)
-            kept = self.gate.passed(tick.time, lines.residual, S, ahead(self.state, tick, sight))
+            S = self.spread(tick, measured, linear)
+            kept = self.gate.passed(tick.time, linear.residual, S, ahead(self.state, tick, measured))
             if not kept.all():
-                sight, lines = sight.only(kept), lines.only(kept)
-        if len(lines.residual):
-            self.correct(tick, sight, lines)
+                measured, linear = measured.only(kept), linear.only(kept)
+        if len(linear.residual):
+            self.correct(tick, measured, linear)
 
-    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
+    def spread(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
         """Return (m, 2, 2) the covariances of the innovations."""
-        return lines.spread(self.state.P)
+        return linear.spread(self.state.P)
 
-    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by bearings, which are linearised at the prediction."""
-        self.nis = self.fuse(tick, sight)
-        self.nis_dof = 2 * len(lines.residual)
+        self.nis = self.fuse(tick, measured)
+        self.nis_dof = 2 * len(linear.residual)
 
-    def fuse(self, tick: Tick, sight: Sight) -> float:
+    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
         before = self.state
-        R, p, P, nis = updated(before.kind, before.R, before.p, before.P, frame_of(tick, sight))
-        self.state = self.belief(R, p, P)
+        R, p, P, nis = updated(before.kind, before.R, before.p, before.P, frame_of(tick, measured))
+        self.state = self.state_type(R, p, P)
         return float(nis)
 
 
 class MekfCovariance(Mekf):
-    """Error-state filter; weighs what it hears by covariance.
+    """Error-state filter; weighs received positions by covariance.
 
     It sends position and covariance, and adds a sender's covariance to the bearing's noise.
     """
@@ -169,7 +178,7 @@ class MekfCovariance(Mekf):
 
 
 class MekfCovarianceUngated(MekfCovariance):
-    """Error-state filter that believes every bearing.
+    """Error-state filter that accepts every bearing.
 
     It is `mekf_covariance` without a gate and without cheirality.
     """
@@ -188,7 +197,7 @@ class InvariantError(LeftError):
 class LeftInvariant(Mekf):
     """Invariant filter, left error; sends covariances."""
 
-    belief: ClassVar[type[LeftError]] = InvariantError
+    state_type: ClassVar[type[LeftError]] = InvariantError
     sends_covariance = True
 
 
@@ -217,19 +226,19 @@ class RightError(LeftError):
 class RightInvariant(Mekf):
     """Invariant filter, right error; sends covariances."""
 
-    belief: ClassVar[type[LeftError]] = RightError
+    state_type: ClassVar[type[LeftError]] = RightError
     sends_covariance = True
 
 
 class IteratedEkf(MekfCovariance):
     """Error-state filter that iterates corrections; sends covariances."""
 
-    def fuse(self, tick: Tick, sight: Sight) -> float:
-        """Correct by bearings, linearised anew until the pose stays where it is; return what `Mekf.fuse` does."""
-        before, distance = self.state, float(lengths(sight.positions - self.state.p).min())
+    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
+        """Correct by bearings, linearised anew until convergence; return their normalised innovation squared."""
+        before, distance = self.state, float(lengths(measured.positions - self.state.p).min())
 
         def look(at: Array) -> Stacked:
-            residual, H, N = linearised(before.moved(at, before.P), tick, sight).stacked()
+            residual, H, N = linearised(before.moved(at, before.P), tick, measured).stacked()
             return residual, H.dot(before.recentring(at)), N
 
         dx, P, nis = iterated(before.P, look(np.zeros(6)), look, lambda dx: turn_of_sight(dx, distance))
@@ -259,20 +268,20 @@ MEAN_WEIGHT = 2.0  # weight of the mean in covariances: 3 - alpha^2. In means it
 class Ukf(Mekf):
     """Unscented (sigma-point) filter; sends covariances."""
 
-    belief: ClassVar[type[LeftError]] = InvariantError
+    state_type: ClassVar[type[LeftError]] = InvariantError
     sends_covariance = True
 
-    def take(self, tick: Tick, sight: Sight) -> None:
-        """Correct by what passes the gate."""
-        P, frame = self.state.P, frame_of(tick, sight)
+    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
+        """Correct by the bearings that pass the gate."""
+        P, frame = self.state.P, frame_of(tick, measured)
         xi = sigma_points(P)
-        lines = linearised(self.state, tick, sight)
-        mean, S, y = unscented(self.state.R, self.state.p, xi, lines.N, frame)
-        r = lines.residual.ravel() - mean
+        linear = linearised(self.state, tick, measured)
+        mean, S, y = unscented(self.state.R, self.state.p, xi, linear.N, frame)
+        r = linear.residual.ravel() - mean
         if self.gated:
-            each = np.arange(len(sight.targets))
+            each = np.arange(len(measured.targets))
             blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
-            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, ahead(self.state, tick, sight)).repeat(2)
+            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, ahead(self.state, tick, measured)).repeat(2)
             if not kept.any():
                 return
             if not kept.all():
@@ -304,7 +313,7 @@ def unit(v: Array) -> Array:
 def unscented(R: Array, p: Array, xi: Array, N: Array, frame: Frame) -> tuple[Array, Array, Array]:
     """Return the mean (2m,) and covariance (2m, 2m) of bearings in the tangent planes at the mean's, noise N included.
 
-    The third is what each of the sigma points xi (k, 6) adds, (k, 2m).
+    The third is the deviation of each sigma point xi (k, 6), (k, 2m).
     """
     lever_arm, _, positions, _, _ = frame
     m, k = len(positions), len(xi)

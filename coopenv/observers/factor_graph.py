@@ -4,7 +4,7 @@ Source: Dellaert and Kaess, Factor graphs for robot perception, Foundations and 
 smoother of GTSAM. Variables are the camera's pose at key frames and the points seen from them. Factors: odometry
 between key frames, points known to lie at a position, and bearings, which are averaged between key frames: of each
 target the mean residual to the predicted bearing, in map axes, added to the bearing predicted at the key frame.
-Bearings are gated one by one before (gate.py).
+Bearings are gated one by one before.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import gtsam
 import numpy as np
 
 from coopenv.estimation.poses import Array, adjoint
-from coopenv.observers.bearing_measurements import ahead, linearised, sight_of
+from coopenv.observers.bearing_measurements import ahead, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
-from coopenv.observers.correction import Gate
+from coopenv.observers.correction import InnovationGate
 from coopenv.observers.error_state_filters import LeftError, PoseObserver
 
 LAG = 1.0  # s
@@ -28,7 +28,7 @@ EXACT = 1e-10 * np.eye(3)  # m^2, of points that are known
 
 @dataclass
 class Residuals:
-    """What one target's bearings since the last key frame miss of the predicted ones."""
+    """Residuals of the bearings to one target since the last key frame."""
 
     position: Array = field(default_factory=lambda: np.zeros(3))  # m, map frame, last one
     covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # m^2, of it
@@ -43,9 +43,9 @@ class FactorGraph(PoseObserver):
     """
 
     def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Remember the camera's place, too; without `gated` every bearing is believed."""
+        """Store the setup; without `gated` every bearing is used."""
         super().__init__(setup)
-        self.gated, self.gate = gated, Gate()
+        self.gated, self.gate = gated, InnovationGate()
         self.lever_arm, self.noise = setup.lever_arm, setup.noise
         self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
         self.to_body = adjoint(np.eye(3), setup.lever_arm)
@@ -99,19 +99,19 @@ class FactorGraph(PoseObserver):
         return self.state.estimate()
 
     def collect(self, tick: Tick) -> None:
-        """Add up what the bearings of a frame miss."""
-        sight, R, p = sight_of(tick), self.state.R, self.state.p
-        if sight is None:
+        """Add up the residuals of a frame."""
+        measured, R, p = usable_bearings(tick), self.state.R, self.state.p
+        if measured is None:
             return
         if self.gated:
-            lines = linearised(self.state, tick, sight)
-            S, in_front = lines.spread(self.state.P), ahead(self.state, tick, sight)
-            sight = sight.only(self.gate.passed(tick.time, lines.residual, S, in_front))
-        for n, target in enumerate(sight.targets.tolist()):
-            position = sight.positions[n]
+            linear = linearised(self.state, tick, measured)
+            S, in_front = linear.spread(self.state.P), ahead(self.state, tick, measured)
+            measured = measured.only(self.gate.passed(tick.time, linear.residual, S, in_front))
+        for n, target in enumerate(measured.targets.tolist()):
+            position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
-            seen.position, seen.covariance = position, sight.covariances[n]
-            seen.total = seen.total + R @ (sight.bearings[n] - unit((position - p) @ R - self.lever_arm))
+            seen.position, seen.covariance = position, measured.covariances[n]
+            seen.total = seen.total + R @ (measured.bearings[n] - unit((position - p) @ R - self.lever_arm))
             seen.count += 1
 
     def smooth(self) -> None:
@@ -123,7 +123,7 @@ class FactorGraph(PoseObserver):
             self.smoother.update(self.graph, self.values, self.stamps)
             pose = self.smoother.calculateEstimatePose3(self.pose_key)
             covariance = self.smoother.marginalCovariance(self.pose_key)
-        except RuntimeError:  # what the graph holds does not determine its variables
+        except RuntimeError:  # the factors do not determine the variables
             self.restart()
             return
         R, P = pose.rotation().matrix(), self.to_body @ covariance @ self.to_body.T
@@ -131,7 +131,7 @@ class FactorGraph(PoseObserver):
         self.clear()
 
     def add_odometry(self) -> None:
-        """Add the pose of a key frame, held to the last one by odometry."""
+        """Add the pose of a key frame, with odometry as the factor to the last one."""
         before, turn, c = self.pose_key, self.increment.R, self.lever_arm
         moved = gtsam.Pose3(gtsam.Rot3(turn), self.increment.p + turn @ c - c)
         spread = self.to_camera @ self.increment.P @ self.to_camera.T

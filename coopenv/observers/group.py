@@ -25,7 +25,7 @@ from coopenv.observers.contract import (
 )
 from coopenv.observers.interference import Interference
 from coopenv.observers.mailbox import Mailbox
-from coopenv.observers.recording import Briefing, Sensed
+from coopenv.observers.recording import ObserverInit, Sensed
 
 
 class ObserverError(CoopenvError):
@@ -58,17 +58,17 @@ class Group:
     What observers raise, or return that is no estimate, becomes an `ObserverError`.
     """
 
-    def __init__(self, factory: Factory, briefing: Briefing, tamper: Tamper | None = None) -> None:
-        self.factory, self.briefing, self.tamper = factory, briefing, tamper
+    def __init__(self, factory: Factory, observer_init: ObserverInit, tamper: Tamper | None = None) -> None:
+        self.factory, self.observer_init, self.tamper = factory, observer_init, tamper
         self.joint = bool(getattr(factory, "joint", False))
 
     def start(self, rotation: Array, position: Array, interference: Interference | None = None) -> None:
         """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m."""
-        setups = self.briefing.setups
-        self.mail = Mailbox(self.briefing)
+        setups = self.observer_init.setups
+        self.mail = Mailbox(self.observer_init)
         self.coordinates: Coordinates | None = None
         self.observers: list[Observer] = []
-        covariances = [P.copy() for P in self.briefing.start_covariance]
+        covariances = [P.copy() for P in self.observer_init.start_covariance]
         poses = [(R.copy(), p.copy()) for R, p in zip(rotation, position, strict=True)]
         if self.joint:
             try:
@@ -88,7 +88,7 @@ class Group:
     def update(
         self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike, interference: Interference | None = None
     ) -> Answer:
-        """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
+        """Let one vehicle's observer take a tick; vehicles come in the order of the observer_init.
 
         `inbox_tick` is as for `Mailbox.inbox`; `interference` is what the world's faults do at this tick.
         """
@@ -98,10 +98,10 @@ class Group:
                 self._restart(vehicle, sensed)
             observer = self.observers[vehicle]
             heard = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
-            tick = sensed.tick(self.briefing.setups[vehicle], heard)
+            tick = sensed.tick(self.observer_init.setups[vehicle], heard)
             begin = perf_counter()
             estimate = observer.update(tick)
-            message = observer.message() if k % self.briefing.period == 0 else None
+            message = observer.message() if k % self.observer_init.period == 0 else None
             elapsed = perf_counter() - begin
             self._check(estimate)
             if message is not None:
@@ -113,7 +113,7 @@ class Group:
     def _restart(self, vehicle: int, sensed: Sensed) -> None:
         """Let a vehicle's observer lose all and start anew, knowing nothing but that it is about the landmarks."""
         middle = sensed.landmarks.mean(axis=0) if len(sensed.landmarks) else np.zeros(3)
-        self.observers[vehicle] = self.factory(self.briefing.setups[vehicle])
+        self.observers[vehicle] = self.factory(self.observer_init.setups[vehicle])
         self.observers[vehicle].reset((np.eye(3), middle), UNKNOWN.copy())
         self.mail.forget(vehicle)
 
@@ -132,7 +132,7 @@ class Group:
         if interference is not None:
             message = interference.broadcast(observer, vehicle, message)
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
-        if tamper is not None and tamper.applies(vehicle, k * self.briefing.dt):
+        if tamper is not None and tamper.applies(vehicle, k * self.observer_init.dt):
             message = tamper.broadcast(observer, message)
         if not self.mail.post(vehicle, k, message, replay, kept) and unchanged:
             check_message(message)
@@ -145,7 +145,7 @@ class Group:
 
     def update_all(self, sensed: Sensed) -> list[Answer]:
         """Let a joint observer take a tick of every vehicle."""
-        setups = self.briefing.setups
+        setups = self.observer_init.setups
         try:
             ticks = [sensed.tick(setup, {}) for setup in setups]
             begin = perf_counter()
@@ -168,8 +168,8 @@ class Group:
 
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
         """Return an error that says whose observer failed, when, and how."""
-        whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
-        return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {told(error)}")
+        whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
+        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {told(error)}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""
@@ -195,10 +195,10 @@ class Group:
             observers, coordinates, mail = (copied[name] for name in ("observers", "coordinates", "mail"))
             kind, listed = (JointObserver, [observers]) if self.joint else (Observer, observers)
             fit = isinstance(listed, list) and all(isinstance(observer, kind) for observer in listed)
-            fit = fit and len(listed) == (1 if self.joint else len(self.briefing.setups))
+            fit = fit and len(listed) == (1 if self.joint else len(self.observer_init.setups))
             if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
-            Mailbox(self.briefing).set_state(mail)
+            Mailbox(self.observer_init).set_state(mail)
         except Exception as error:  # of anything that is no state
             raise CoopenvError(f"state: the observers do not fit: {told(error)}") from error
         return dict(copied)
@@ -208,7 +208,7 @@ class Group:
         if not state:
             vars(self).pop("mail", None)
             return
-        self.coordinates, self.mail = state["coordinates"], Mailbox(self.briefing)
+        self.coordinates, self.mail = state["coordinates"], Mailbox(self.observer_init)
         self.mail.set_state(state["mail"])
         if self.joint:
             self.whole = state["observers"]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, Received, check_message, check_received
-from coopenv.observers.recording import Briefing, sealed
+from coopenv.observers.recording import ObserverInit, sealed
 
 MOST_CONTENTS = 100_000  # bytes of a message
 
@@ -33,20 +33,20 @@ class Heard(NamedTuple):
 class Mailbox:
     """Carries the observers' messages; which of them arrive when is the radio's business."""
 
-    def __init__(self, briefing: Briefing) -> None:
-        self.briefing = briefing
-        self.sent: list[dict[int, Message | None]] = [{} for _ in briefing.setups]
+    def __init__(self, observer_init: ObserverInit) -> None:
+        self.observer_init = observer_init
+        self.sent: list[dict[int, Message | None]] = [{} for _ in observer_init.setups]
         """Per sender: tick of sending to message, of those that may still be under way; None: it is no message."""
-        self.said: list[dict[int, Message]] = [{} for _ in briefing.setups]
+        self.said: list[dict[int, Message]] = [{} for _ in observer_init.setups]
         """Per sender that may replay: tick to what it had to say."""
-        self.heard: list[dict[int, Heard]] = [{} for _ in briefing.setups]
+        self.heard: list[dict[int, Heard]] = [{} for _ in observer_init.setups]
         """Per receiver: sender to what was heard last."""
-        self.bytes = np.zeros(len(briefing.setups))
-        self.refused = np.zeros(len(briefing.setups), dtype=np.int64)
+        self.bytes = np.zeros(len(observer_init.setups))
+        self.refused = np.zeros(len(observer_init.setups), dtype=np.int64)
         """Per receiver: messages that were none."""
         self.forms: dict[int, tuple[int, ...]] = {}
         """Per vehicle: the shape of the covariances that it sends itself, in which it expects those of others."""
-        self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in briefing.setups]
+        self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in observer_init.setups]
         """Per receiver: the targets that are vehicles."""
 
     def expect_as(self, vehicle: int, message: Message) -> None:
@@ -66,7 +66,7 @@ class Mailbox:
             while (oldest := next(iter(said))) < k - kept:
                 del said[oldest]
         sent[k] = self._sound(vehicle, message)
-        while (oldest := next(iter(sent))) < k - self.briefing.flight - 1:
+        while (oldest := next(iter(sent))) < k - self.observer_init.flight - 1:
             del sent[oldest]
         if k > 0:
             self.bytes[vehicle] += _size(message)
@@ -86,7 +86,7 @@ class Mailbox:
         `arrived` is what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`; `clock`
         (N,) is by how many ticks vehicles' clocks are ahead.
         """
-        b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
+        b, landmarks, heard = self.observer_init, self.observer_init.setups[vehicle].landmarks, self.heard[vehicle]
         ticks, received = np.asarray(inbox_tick).tolist(), {}
         ahead = None if clock is None else np.asarray(clock).tolist()
         for target in self._senders[vehicle]:
@@ -129,7 +129,7 @@ class Mailbox:
             if _size(message) > MOST_CONTENTS:
                 return None
             copied = _copied(message)
-            check_received(copied, self.briefing.setups[sender].planar)
+            check_received(copied, self.observer_init.setups[sender].planar)
         except (CoopenvError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError):
             return None
         return copied
@@ -142,7 +142,7 @@ class Mailbox:
 
     def set_state(self, state: Any) -> None:
         """Take over what `get_state` returned, so that nobody can change it; anything else raises what it raises."""
-        senders = range(len(self.briefing.setups))
+        senders = range(len(self.observer_init.setups))
         sent, heard, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
         refused = np.asarray(state["refused"], np.int64)
         said = [{index(k): _checked(message) or Message() for k, message in own.items()} for own in state["said"]]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Briefing:
+class ObserverInit:
     """What observers are told before the first tick, and how their messages travel."""
 
     setups: tuple[Setup, ...]
@@ -172,9 +172,9 @@ class Recording:
         return int(lag[arrived].max(initial=0))
 
     @property
-    def briefing(self) -> Briefing:
+    def observer_init(self) -> ObserverInit:
         """What observers are told before the first tick."""
-        return Briefing(
+        return ObserverInit(
             self.setups, self.order, self.dt, self.period, self.staleness, self.flight, self.start_covariance
         )
 
@@ -324,7 +324,7 @@ def _invalid(values: Mapping[str, Array], about: Mapping[str, Any], ticks: bool)
         yield name, everywhere(valid, *range(rows, valid.ndim)), f"not {rule.must_be}{unless}"
 
 
-def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
+def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     """Refuse a tick that is not number `index` or holds what no kernel may read; rows of the missing are not read.
 
     Raises:
@@ -335,16 +335,16 @@ def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
     given = {name: _value_of(tick, name) for name in names}
     given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
-    for problem in _misshapen(given, sizes_of(briefing.setups), KINDS_OF_TICKS):
+    for problem in _misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
-    absent = given.get("missing", np.zeros(len(briefing.setups), bool))
+    absent = given.get("missing", np.zeros(len(observer_init.setups), bool))
     seen = tick.visible & ~absent[:, None]
     given |= {"visible": seen, "bearings": np.where(seen[..., None], tick.bearings, np.nan)}
     problems = _invalid(given, {"now": index, "period": 1}, ticks=False)
     for name, valid, problem in chain(problems, _invalid_messages(tick, len(absent))):
         valid = valid | absent if valid.ndim and name in ROWS_OF_MISSING else valid
         if not valid.all():
-            whose = f" of {briefing.setups[int(np.argmin(valid))].name}" if valid.ndim else ""
+            whose = f" of {observer_init.setups[int(np.argmin(valid))].name}" if valid.ndim else ""
             raise CoopenvError(f"tick {index}: {name}{whose}: {problem}")
 
 

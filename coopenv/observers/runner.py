@@ -19,7 +19,7 @@ from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, SensorNoise, Setup
 from coopenv.observers.group import Answer, Group, ObserverError, Tamper
-from coopenv.observers.recording import Briefing, Recording, Truth
+from coopenv.observers.recording import ObserverInit, Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
 
@@ -88,7 +88,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     """
     factory = find(observer)
     r, failure = recording, ""
-    group, shape = Group(factory, r.briefing, tamper), (r.ticks, len(r.setups))
+    group, shape = Group(factory, r.observer_init, tamper), (r.ticks, len(r.setups))
     R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
     nis, nis_dof, elapsed = np.full(shape, np.nan), np.zeros(shape, np.int64), np.full(shape, np.nan)
     try:
@@ -172,7 +172,7 @@ def _errors(
 EXACT_START_STD = 1e-3  # rad and m, where a scenario starts its estimates at the truth
 
 
-def briefing_of(scenario: Scenario, model: Any) -> Briefing:
+def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
     """Return what the observers of a simulated world are told."""
     s, L, places = scenario, len(scenario.landmarks), scenario.cameras
     cameras, noises = model.camera.numpy(), model.noise.numpy()
@@ -192,7 +192,7 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
         )
         for i, name in enumerate(s.vehicle_names)
     )
-    return Briefing(
+    return ObserverInit(
         setups=setups,
         order=tuple(int(i) for i in model.order.numpy()),
         dt=1.0 / s.rates.camera,

@@ -1,27 +1,22 @@
-"""Schmidt-Kalman filter: neighbours are considered with all cross-covariances, never corrected.
+"""Filters that consider the poses of their neighbours (Schmidt-Kalman), and the pairwise filter of Luft et al.
 
 Source: Schmidt, Application of state-space methods to navigation problems, Advances in Control Systems 3, 1966; for
 vehicles that consider each other, the cross-covariances of Roumeliotis and Bekey, Distributed multirobot localization,
-IEEE Transactions on Robotics and Automation 18(5), 2002. One's own pose and those of the neighbours in view are one
-state, in which the gain of the neighbours is zero. What neighbours have in common with each other is what they tell:
-each sends the cross-covariances that it keeps with its own. What changes those is carried on as neighbours.py tells.
+IEEE Transactions on Robotics and Automation 18(5), 2002. The own pose and those of the neighbours in view are one
+state, in which the gain of the neighbours is zero. The cross-covariances between two neighbours are received: each
+vehicle sends those that it keeps with its own neighbours.
 
-The error of a neighbour j is that of its marker's pose as it tells it, R_j = Rhat_j Exp(theta), z_j = zhat_j + Rhat_j
-rho. C_ij is the covariance of one's own error with it. One's own errors change by F (odometry) and by P+ P-^-1
-(bearings); the product of these since the last message, a vehicle's factor, is told, so that a neighbour carries its
-C_ij on by C_ij <- C_ij factor_j^T. Source of this rule: Luft, Schubert, Roumeliotis and Burgard, Recursive
-decentralized localization for multi-robot systems with asynchronous pairwise communication, International Journal of
-Robotics Research 37(10), 2018. It is exact for odometry and landmarks; for bearings to a third vehicle it holds if the
-two have nothing in common but what the first one knows. For messages that were lost the factor that came stands in.
+The error of a neighbour j is that of its marker's reported pose, R_j = Rhat_j Exp(theta), z_j = zhat_j + Rhat_j rho.
+C_ij is its covariance with the own error. The own error changes by F (odometry) and by P+ P-^-1 (bearings). The product
+of these since the last message is the vehicle's factor. It is sent, so that a neighbour propagates its C_ij by C_ij <-
+C_ij factor_j^T. For lost messages the received factor stands in. Source of this rule: Luft, Schubert, Roumeliotis and
+Burgard, Recursive decentralized localization for multi-robot systems with asynchronous pairwise communication,
+International Journal of Robotics Research 37(10), 2018. It is exact for odometry and landmarks. For bearings to a third
+vehicle it holds if that vehicle correlates with j only by way of i.
 
-Source: Luft, Schubert, Roumeliotis and Burgard, Recursive decentralized localization for multi-robot systems with
-asynchronous pairwise communication, International Journal of Robotics Research 37(10), 2018. Sigma_ij is kept in
-factors; odometry and landmarks change one's own alone, and a bearing from i to j changes Sigma_ij exactly, while every
-other one is carried on by Sigma_ii+ Sigma_ii-^-1.
-
-The deviation: there a measurement corrects both vehicles, which exchange covariances and factors both ways. Here
-messages are broadcast, and who is seen does not learn of it: j is considered with its covariance and the
-cross-covariance, and only i is corrected. The product Sigma_ij is kept by i; j's factor carries it on (neighbours.py).
+In that work a measurement corrects both vehicles, which exchange covariances and factors both ways. Here messages are
+broadcast, and the target of a bearing does not receive it: j is considered, and only i is corrected. The product
+Sigma_ij is kept by i and propagated by j's factor.
 """
 
 from collections.abc import Sequence
@@ -34,35 +29,44 @@ from numba import types
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
 from coopenv.estimation.compiled_algebra import eliminated, place, product, transformed
 from coopenv.estimation.poses import Array, cholesky, skew
-from coopenv.observers.bearing_measurements import LEFT, Lines, Sight, corrected, dense, linearise, moved, recentring
+from coopenv.observers.bearing_measurements import (
+    LEFT,
+    BearingMeasurements,
+    LinearisedBearings,
+    corrected,
+    dense,
+    linearise,
+    moved,
+    recentring,
+)
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import FRAME, Frame, frame_of, gain, joseph
 from coopenv.observers.error_state_filters import LeftError, Mekf
 
 IDENTITY = np.eye(6)
 PLACES = types.Array(types.int64, 1, "A", readonly=True)
-MOST_LOST = 60  # messages in a row for which a factor stands in
+MOST_LOST = 60  # lost messages in a row that a received factor may stand for
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
-"""Factors of cross-covariances where no joint distribution has them: a sender may lie, the rule approximates."""
+"""Factors on cross-covariances that make the joint covariance positive definite, if the received ones do not."""
 
 
 @dataclass(frozen=True)
-class Neighbour:
-    """What is known of a neighbour."""
+class ConsideredNeighbour:
+    """The last report of a neighbour, and its covariance with the own error."""
 
     number: int  # of its last message
-    R: Array  # (3, 3) as told
-    P: Array  # (6, 6) as told, about its marker
+    R: Array  # (3, 3) as reported
+    P: Array  # (6, 6) as reported, about its marker
     cross: Array  # (6, 6) C_ij
 
 
-class Considering(Mekf):
-    """The part of a filter that keeps cross-covariances; its own error is a left one."""
+class ConsiderFilter(Mekf):
+    """Base of the filters that keep cross-covariances; the own error is a left one."""
 
     sends_covariance = True
 
     def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Take a setup; without `gated` every bearing is believed."""
+        """Take a setup; without `gated` every bearing is used."""
         super().__init__(setup, gated)
         self.to_marker = np.eye(6)  # own left error to that of the marker's pose
         self.to_marker[3:, :3] = -skew(setup.marker)
@@ -70,9 +74,9 @@ class Considering(Mekf):
         self.from_marker[3:, :3] = skew(setup.marker)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
-        """Start at a pose that has nothing to do with others'."""
+        """Start at a pose that is independent of the other vehicles."""
         super().reset(initial_pose, initial_covariance)
-        self.neighbours: dict[int, Neighbour] = {}
+        self.neighbours: dict[int, ConsideredNeighbour] = {}
         self.factor, self.number = IDENTITY, 0
 
     def message(self) -> Message:
@@ -86,35 +90,35 @@ class Considering(Mekf):
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
-        self.carry(LeftError.transition(tick.rotation, tick.translation))
+        self.propagate_cross_covariances(LeftError.transition(tick.rotation, tick.translation))
         super().predict(tick)
 
-    def carry(self, A: Array, others: Sequence[int] | None = None) -> None:
-        """Let the own error be A times what it was, in the factor and in cross-covariances; `others`: in whose."""
+    def propagate_cross_covariances(self, A: Array, others: Sequence[int] | None = None) -> None:
+        """Multiply the own error by A in the factor and in the cross-covariances with `others` (None: all)."""
         for j in self.neighbours if others is None else others:
             of = self.neighbours[j]
-            self.neighbours[j] = Neighbour(of.number, of.R, of.P, A.dot(of.cross))
+            self.neighbours[j] = ConsideredNeighbour(of.number, of.R, of.P, A.dot(of.cross))
         self.factor = A.dot(self.factor)
 
-    def take(self, tick: Tick, sight: Sight) -> None:
-        """Hear who is seen, then correct."""
-        for target, message in zip(sight.targets.tolist(), sight.messages, strict=True):
+    def take(self, tick: Tick, measured: BearingMeasurements) -> None:
+        """Receive the reports of the vehicles in view, then correct."""
+        for target, message in zip(measured.targets.tolist(), measured.messages, strict=True):
             if message is not None:
-                self.hear(target, message)
-        super().take(tick, sight)
+                self.receive(target, message)
+        super().take(tick, measured)
 
-    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
-        """Return (m, 2, 2) the covariances of the innovations, with what the two errors have in common."""
-        S = super().spread(tick, sight, lines)
-        for n, target in enumerate(sight.targets.tolist()):
+    def spread(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations, cross-covariances included."""
+        S = super().spread(tick, measured, linear)
+        for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
-                common = lines.H[n].dot(of.cross[:, 3:]).dot(lines.G[n].dot(of.R).T)
+                common = linear.H[n].dot(of.cross[:, 3:]).dot(linear.G[n].dot(of.R).T)
                 S[n] += common + common.T
         return S
 
-    def hear(self, target: int, message: Message) -> None:
-        """Take what a neighbour tells of itself, if it is what this observer sends."""
+    def receive(self, target: int, message: Message) -> None:
+        """Take the report of a neighbour, if it runs the same observer."""
         factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
         if message.rotation is None or message.covariance is None or np.shape(message.covariance) != (6, 6):
             return
@@ -127,28 +131,28 @@ class Considering(Mekf):
             lost = max(1, min(now - of.number, MOST_LOST))
             cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
         cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
-        self.neighbours[target] = Neighbour(now, message.rotation, message.covariance, cross)
+        self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
 
-    def consider(self, tick: Tick, sight: Sight, told: Array | None = None) -> float:
+    def consider(self, tick: Tick, measured: BearingMeasurements, between: Array | None = None) -> float:
         """Correct by bearings to landmarks and to neighbours that are known; return the squared innovation.
 
-        `told` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the sight.
+        `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the bearings.
         """
-        targets = sight.targets.tolist()
+        targets = measured.targets.tolist()
         seen = [t for t in targets if t in self.neighbours]
         of, before = [self.neighbours[t] for t in seen], self.state
-        joint = self.joint_covariance(of, told)
+        joint = self.joint_covariance(of, between)
         places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
-        exact = frame_of(tick, sight._replace(covariances=np.zeros((len(targets), 3, 3))))
+        exact = frame_of(tick, measured._replace(covariances=np.zeros((len(targets), 3, 3))))
         R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
         self.state = LeftError(R, p, P)
-        self.carry(carried, [t for t in self.neighbours if t not in seen])
+        self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
-            self.neighbours[target] = Neighbour(was.number, was.R, was.P, cross)
+            self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
         return float(nis)
 
-    def joint_covariance(self, of: Sequence[Neighbour], told: Array | None) -> Array:
+    def joint_covariance(self, of: Sequence[ConsideredNeighbour], between: Array | None) -> Array:
         """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
         size = 6 + 6 * len(of)
         joint = np.zeros((size, size))
@@ -156,8 +160,8 @@ class Considering(Mekf):
         for n, one in enumerate(of):
             k = slice(6 * n + 6, 6 * n + 12)
             joint[k, k], joint[:6, k], joint[k, :6] = one.P, one.cross, one.cross.T
-            if told is not None:
-                joint[k, 6 : 6 * n + 6] = told[n, :n].transpose(1, 0, 2).reshape(6, -1)
+            if between is not None:
+                joint[k, 6 : 6 * n + 6] = between[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[6 : 6 * n + 6, k] = joint[k, 6 : 6 * n + 6].T
         if not of or _has_factor(joint):
             return joint
@@ -171,14 +175,14 @@ class Considering(Mekf):
 
 @compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
 def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (2m, 6 + 6k) the derivative of m bearings by one's own error and those of k neighbours.
+    """Return (2m, 6 + 6k) the derivative of m bearings by the own error and those of k neighbours.
 
     Args:
         H: (m, 2, 6) by the error about where it is linearised.
         G: (m, 2, 3) by the points, map axes.
-        recentring: (6, 6) of one's own error.
+        recentring: (6, 6) of the own error.
         turns: (k, 3, 3) the neighbours' orientations.
-        places: (m,) which of them is seen, -1: none.
+        places: (m,) the neighbour of each bearing, -1: none.
     """
     whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
     for n in range(len(H)):
@@ -193,18 +197,18 @@ def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: 
 def considered(
     R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
 ) -> tuple[Array, Array, Array, Array, Array, float]:
-    """Correct one's own pose by bearings, linearised half way (correction.py), and no neighbour's (Schmidt).
+    """Correct the own pose by bearings, linearised half way (correction.py); neighbours are considered (Schmidt).
 
     Args:
-        R: (3, 3) one's own orientation.
-        p: (3,) one's own position.
-        joint: (6 + 6k, 6 + 6k) covariance of one's own error and those of k neighbours.
+        R: (3, 3) the own orientation.
+        p: (3,) the own position.
+        joint: (6 + 6k, 6 + 6k) covariance of the own error and those of k neighbours.
         frame: the bearings; points have no covariances.
         turns: see `joint_jacobian`.
         places: see `joint_jacobian`.
 
     Returns:
-        Orientation, position, covariance (6, 6), what carries cross-covariances with others on (6, 6), those with the
+        Orientation, position, covariance (6, 6), the factor (6, 6) of the other cross-covariances, those with the
         neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
     """
     residual, H, N, G = linearise(R, p, False, *frame)
@@ -229,7 +233,7 @@ def considered(
 
 @compiled(MATRIX, MATRIX, MATRIX)
 def bounded(cross: Array, P: Array, of: Array) -> Array:
-    """Return (6, 6) a cross-covariance within what any two errors can have in common: what is told may be anything."""
+    """Return (6, 6) a received cross-covariance, clipped to correlations of at most 1."""
     result = np.zeros((6, 6))
     for i in range(6):
         for j in range(6):
@@ -247,36 +251,36 @@ def _has_factor(P: Array) -> bool:
     return True
 
 
-class SchmidtKalman(Considering):
+class SchmidtKalman(ConsiderFilter):
     """Considers neighbours with cross-covariances.
 
     It sends its pose with covariance, its factor, and the cross-covariances that it keeps.
     """
 
     def message(self) -> Message:
-        """Return what others need to consider this vehicle and what it has in common with its neighbours."""
-        told = super().message()
+        """Return pose, covariance and factor, and the cross-covariances with the neighbours."""
+        report = super().message()
         targets = sorted(self.neighbours)
         cross = np.array([self.to_marker.dot(self.neighbours[t].cross) for t in targets]).reshape(-1, 6, 6)
-        extra: dict[str, Array] = {**told.extra, "targets": np.array(targets, float), "cross": cross}
-        return Message(told.position, told.rotation, told.covariance, extra)
+        extra: dict[str, Array] = {**report.extra, "targets": np.array(targets, float), "cross": cross}
+        return Message(report.position, report.rotation, report.covariance, extra)
 
-    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by all bearings at once."""
         seen = [
             (target, message)
-            for target, message in zip(sight.targets.tolist(), sight.messages, strict=True)
+            for target, message in zip(measured.targets.tolist(), measured.messages, strict=True)
             if target in self.neighbours and message is not None
         ]
-        told = np.zeros((len(seen), len(seen), 6, 6))
+        between = np.zeros((len(seen), len(seen), 6, 6))
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
-                told[n, m] = told_of(message, other) + told_of(its, target).T
-        self.nis, self.nis_dof = self.consider(tick, sight, told), 2 * len(sight.targets)
+                between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
+        self.nis, self.nis_dof = self.consider(tick, measured, between), 2 * len(measured.targets)
 
 
-def told_of(message: Message, target: int) -> Array:
-    """Return the cross-covariance (6, 6) of a sender with a target as it tells it, zero where it tells none."""
+def sent_cross_covariance(message: Message, target: int) -> Array:
+    """Return the sent cross-covariance (6, 6) of a sender with a target, zero if the message has none."""
     targets, cross = (np.asarray(message.extra.get(name, ())) for name in ("targets", "cross"))
     if targets.ndim != 1 or cross.shape != (len(targets), 6, 6):
         return np.zeros((6, 6))
@@ -284,16 +288,16 @@ def told_of(message: Message, target: int) -> Array:
     return np.asarray(cross[found[0]]) if len(found) else np.zeros((6, 6))
 
 
-class Pairwise(Considering):
+class Pairwise(ConsiderFilter):
     """Keeps cross-covariances pair by pair.
 
-    It sends its pose with covariance and its factor. It tells the normalised innovation of the landmarks.
+    It sends its pose with covariance and its factor. The normalised innovation is that of the landmarks.
     """
 
-    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
-        known = np.array([target not in self.neighbours for target in sight.targets.tolist()])
+        known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
         if known.any():
-            self.nis, self.nis_dof = self.consider(tick, sight.only(known)), 2 * int(known.sum())
+            self.nis, self.nis_dof = self.consider(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.consider(tick, sight.one(n))
+            self.consider(tick, measured.one(n))

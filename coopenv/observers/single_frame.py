@@ -1,11 +1,11 @@
 """The pose from the bearings of one frame (P3P, PnP); odometry carries it to the next one, and counts no further.
 
-Source: candidates by robust/p3p.py; among them that which agrees with most bearings, then that nearest to the pose
+Source: candidates by robust/p3p.py; among them the one that agrees with most bearings, then the one nearest to the pose
 predicted by odometry (Fischler and Bolles, Random sample consensus, Communications of the ACM 24(6), 1981, with all
 triples in place of random ones); then Gauss-Newton over all bearings that agree. Where Gauss-Newton from the predicted
 pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
 
-Source: composition of the increments; covariance as in the prediction of the left-error filter (see mekf.py).
+Source: composition of the increments; covariance as in the prediction of the left-error filter.
 """
 
 from itertools import combinations
@@ -14,7 +14,7 @@ from math import inf, sqrt
 import numpy as np
 
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.bearing_measurements import Sight, ahead, linearised, normalised, sight_of
+from coopenv.observers.bearing_measurements import BearingMeasurements, ahead, linearised, normalised, usable_bearings
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.error_state_filters import LeftError, PoseObserver
 from coopenv.observers.robust.p3p import solve_p3p
@@ -26,9 +26,9 @@ LONGEST_TURN = 1.0  # rad, of a step
 BEARING_GATE = 25.0  # squared residual of a bearing over its variance, (5 sigma)^2
 POSE_GATE = 45.0
 """Squared distance to the predicted pose over its variance; chi-square with 6 degrees of freedom beyond it: 5e-8."""
-PATIENCE = 1.0  # s for which bearings must contradict the predicted pose before a pose far from it is believed
+PATIENCE = 1.0  # s for which bearings must contradict the predicted pose before a pose far from it is accepted
 NARROW_STD = 0.5
-"""rad, of the predicted orientation: below it Gauss-Newton from there finds what is to be found near it."""
+"""rad, of the predicted orientation: below it Gauss-Newton from there finds the pose near it."""
 LARGEST_STD = 0.15
 """Largest standard deviation of the position over the distance to the nearest point; beyond it geometry is weak."""
 
@@ -50,25 +50,25 @@ class PerspectivePoints(PoseObserver):
     def update(self, tick: Tick) -> Estimate:
         """Append the increment, and replace the pose by that of the frame where it has one."""
         self.state = self.state.predicted(tick)
-        seen = sight_of(tick) if tick.due else None
+        seen = usable_bearings(tick) if tick.due else None
         if seen is not None and len(seen.targets) >= 3:
             self.take(tick, seen)
         return self.state.estimate()
 
-    def take(self, tick: Tick, data: Sight) -> None:
-        """Take the pose of a frame if there is one to be believed."""
+    def take(self, tick: Tick, data: BearingMeasurements) -> None:
+        """Take the pose of a frame if it is accepted."""
         found = refined(self.state, tick, data)
         if found is None or distance(found, self.state) > POSE_GATE:
             expected = (misfits(self.state, tick, data, self.state.P) < BEARING_GATE).all()
             self.contradicted = 0.0 if expected else self.contradicted + tick.dt
             if expected and self.state.P[0, 0] + self.state.P[1, 1] + self.state.P[2, 2] < NARROW_STD**2:
-                return  # weak geometry at a pose that may well be right
+                return  # weak geometry at a plausible pose
             found = self.chosen(tick, data)
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: Sight) -> LeftError | None:
-        """Return of all candidates that which agrees with most bearings, then that nearest to the predicted pose."""
+    def chosen(self, tick: Tick, data: BearingMeasurements) -> LeftError | None:
+        """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array(list(combinations(range(len(data.bearings)), 3))[:MOST_TRIPLES])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
@@ -83,7 +83,7 @@ class PerspectivePoints(PoseObserver):
         return best
 
 
-def misfits(pose: LeftError, tick: Tick, data: Sight, P: Array | None = None) -> Array:
+def misfits(pose: LeftError, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
@@ -94,7 +94,7 @@ def misfits(pose: LeftError, tick: Tick, data: Sight, P: Array | None = None) ->
     return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
 
 
-def refined(start: LeftError, tick: Tick, data: Sight) -> LeftError | None:
+def refined(start: LeftError, tick: Tick, data: BearingMeasurements) -> LeftError | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):

@@ -54,23 +54,23 @@ def record(
         faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
         on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
-    L, briefing = len(scenario.landmarks), engine.world.briefing
+    L, observer_init = len(scenario.landmarks), engine.world.observer_init
     names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
     start_rotation = views["estimate_rotation"][0, 0]
     for values in (*kept.values(), start_rotation):
         values.setflags(write=False)  # observers get views
     return Recording(
-        setups=briefing.setups,
-        order=briefing.order,
-        dt=briefing.dt,
-        period=briefing.period,
-        staleness=briefing.staleness,
+        setups=observer_init.setups,
+        order=observer_init.order,
+        dt=observer_init.dt,
+        period=observer_init.period,
+        staleness=observer_init.staleness,
         due=is_due(np.arange(len(ticks)), engine.world.model.observer.rate / scenario.rates.camera),
         inbox_tick=views["inbox_tick"][:, 0].astype(np.int64),
         start_rotation=start_rotation,
         start_position=(start_rotation @ views["estimate_position"][0, 0][..., None])[..., 0],
-        start_covariance=briefing.start_covariance,
+        start_covariance=observer_init.start_covariance,
         truth=Truth(views["rotation"][:, 0, L:], views["position"][:, 0, L:]),
         scenario=scenario,
         drawn=drawn,

@@ -272,7 +272,7 @@ def theory_rates(run: Rollout, trajectory: Trajectory) -> ConvergenceRates | Non
     """Return the rates of the paper's observer along the record of a run; None where another one runs."""
     if run.scenario.observer.name != "riccati":
         return None
-    setups = [run.engine.world.briefing.setups[i] for i in run.vehicles]
+    setups = [run.engine.world.observer_init.setups[i] for i in run.vehicles]
     gains = setups[0].gains
     return convergence_rates(trajectory, [setup.gains.k for setup in setups], gains.q, gains.V, gains.P0)
 

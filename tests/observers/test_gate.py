@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from coopenv.observers import Recording, Setup, run
-from coopenv.observers.correction import LARGEST, Gate
+from coopenv.observers.correction import LARGEST, InnovationGate
 from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from tests.oracles.batch import small_errors
@@ -36,7 +36,7 @@ def residuals(*sizes: float) -> np.ndarray:
     return 1e-2 * np.array([[0.6 * size, -0.8 * size] for size in sizes])
 
 
-def passed(gate: Gate, time: float, *sizes: float, ahead: np.ndarray = ALL) -> list[bool]:
+def passed(gate: InnovationGate, time: float, *sizes: float, ahead: np.ndarray = ALL) -> list[bool]:
     return gate.passed(time, residuals(*sizes), np.tile(S, (len(sizes), 1, 1)), ahead[: len(sizes)]).tolist()
 
 
@@ -45,12 +45,12 @@ def test_it_refuses_one_honest_bearing_of_a_thousand() -> None:
 
 
 def test_it_refuses_what_is_far_off_and_what_is_behind() -> None:
-    assert passed(Gate(), 0.1, 0.0, 3.6, 3.8) == [True, True, False]
-    assert passed(Gate(), 0.1, 0.0, 0.0, 0.0, ahead=np.array([True, False, True])) == [True, False, True]
+    assert passed(InnovationGate(), 0.1, 0.0, 3.6, 3.8) == [True, True, False]
+    assert passed(InnovationGate(), 0.1, 0.0, 0.0, 0.0, ahead=np.array([True, False, True])) == [True, False, True]
 
 
 def test_a_covariance_that_is_none_takes_nothing() -> None:
-    gate = Gate()
+    gate = InnovationGate()
     strange = np.array([S, np.full((2, 2), np.nan), -S])
     for k in range(300):
         kept = gate.passed(k / 60, residuals(0.0, 0.0, 1.0), strange, ALL)
@@ -58,7 +58,7 @@ def test_a_covariance_that_is_none_takes_nothing() -> None:
 
 
 def test_one_liar_of_two_never_opens_it_and_a_lost_pose_does() -> None:
-    lied, lost = Gate(), Gate()
+    lied, lost = InnovationGate(), InnovationGate()
     for k in range(1200):
         assert passed(lied, k / 60, 0.0, 50.0) == [True, False]
         last = passed(lost, k / 60, 0.0, 50.0, 50.0)
@@ -70,7 +70,7 @@ def test_one_liar_of_two_never_opens_it_and_a_lost_pose_does() -> None:
 
 
 def test_a_wide_prior_has_nothing_to_refuse_with() -> None:
-    gate, wide = Gate(), np.tile(np.eye(2), (3, 1, 1))
+    gate, wide = InnovationGate(), np.tile(np.eye(2), (3, 1, 1))
     assert gate.passed(0.1, 100.0 * residuals(5.0, 5.0, 5.0), wide, np.zeros(3, bool)).all()
 
 

@@ -118,7 +118,7 @@ def test_extras_of_another_shape_end_no_run(name: str, part: str) -> None:
         def applies(self, vehicle: int, time: float) -> bool:
             return vehicle == 1
 
-        def told(self, observer: object, message: Message) -> Message:
+        def broadcast(self, observer: object, message: Message) -> Message:
             return replace(message, extra={**message.extra, part: MISSHAPEN[part]})
 
     made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), 0)

@@ -13,7 +13,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.replay import Replay
 from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
-from coopenv.observers.runner import briefing_of
+from coopenv.observers.runner import observer_init_of
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.helpers.builders import command, constant, run, same_bits, scenario, simulate, start, vehicle
@@ -85,7 +85,7 @@ def _product(a: list[float], b: list[float]) -> list[float]:
 def test_observers_know_their_own_camera_and_noise() -> None:
     own = {"camera": {"position": [0.5, 0.0, 0.3]}, "noise": {"velocity": 0.4, "gyro_bias": [0.0, 0.0, 0.02]}}
     made = scenario([vehicle(), vehicle(ASIDE, **own)], noise={"velocity": 0.1})
-    first, second = briefing_of(made, simulate(made, 1).model).setups
+    first, second = observer_init_of(made, simulate(made, 1).model).setups
     assert (first.noise.velocity, second.noise.velocity) == (0.1, 0.4)
     assert second.noise.gyro_bias == (0.0, 0.0, 0.02) and first.noise.gyro_bias == (0.0, 0.0, 0.0)
     assert first.lever_arm.tolist() == [0.0, 0.0, 0.0] and second.lever_arm.tolist() == [0.5, 0.0, 0.3]
