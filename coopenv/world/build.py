@@ -58,7 +58,7 @@ def routes_of(scenario: Scenario) -> dict[str, Any]:
 
 
 def drawn_of(scenario: Scenario) -> dict[str, Any]:
-    """Return the fields of `Drawn` by name."""
+    """Return the fields of `DrawRanges` by name."""
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     motions = [vehicle.motion for vehicle in scenario.vehicles]
     drawn, hard = scenario.randomisation, scenario.difficulty
@@ -99,7 +99,7 @@ def _groups(scenario: Scenario) -> dict[str, Any]:
 
 
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
-    """Return the values of the model's `Fault`."""
+    """Return the values of the model's `FaultValues`."""
     restart, corruption, lie = f.restart, f.corruption, f.lie
     direction = np.zeros(3) if lie.direction is None else np.array(lie.direction) / np.linalg.norm(lie.direction)
     return {
@@ -133,7 +133,7 @@ def fault_switches(scenario: Scenario) -> dict[str, int]:
 
 
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
-    """Return the values of the model's `Camera`."""
+    """Return the values of the model's `CameraValues`."""
     on = float(noise.enabled)
     same = ("position", "image_size", "focal_length", "principal_point")
     return {
@@ -153,7 +153,7 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
 
 
 def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
-    """Return the values of the model's `Noise`."""
+    """Return the values of the model's `NoiseValues`."""
     on = float(n.enabled)
     axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

@@ -89,7 +89,7 @@ def model_struct(p: Precision) -> Any:
     scalar, vec2, vec3, mat33 = p.scalar, p.vec2, p.vec3, p.mat33
 
     @wp.struct
-    class Start:
+    class StartValues:
         """How an episode begins. Angles in rad, lengths in m, map frame."""
 
         position: wp.array(dtype=vec3)  # (A,)
@@ -120,7 +120,7 @@ def model_struct(p: Precision) -> Any:
         position: wp.array(dtype=vec3)  # (S,) m
 
     @wp.struct
-    class Dynamics:
+    class DynamicsValues:
         """Kinematic bicycle and actuators of one vehicle; m, s, rad."""
 
         wheelbase: scalar
@@ -140,7 +140,7 @@ def model_struct(p: Precision) -> Any:
         pan_rate: scalar
 
     @wp.struct
-    class Scene:
+    class SceneValues:
         """Boxes that occlude and collide; half sizes of zero mean no body."""
 
         body_half: wp.array(dtype=vec3)  # (A,) m
@@ -173,7 +173,7 @@ def model_struct(p: Precision) -> Any:
         height: scalar  # m, of the ground that routes lie on, map
 
     @wp.struct
-    class Drawn:
+    class DrawRanges:
         """What else a world draws at a reset, G groups of landmarks with Y areas in all."""
 
         presence: wp.array(dtype=scalar)  # (A,) chance to be there
@@ -197,7 +197,7 @@ def model_struct(p: Precision) -> Any:
         next_choice: wp.array(dtype=wp.int32)  # ... are next_choice[next_first[i, r]] .. [next_first[i, r + 1] - 1]
 
     @wp.struct
-    class Camera:
+    class CameraValues:
         """The camera of one vehicle."""
 
         rotation: mat33  # camera to body
@@ -221,7 +221,7 @@ def model_struct(p: Precision) -> Any:
         focal_std: scalar  # of the error of `focal_length`, relative
 
     @wp.struct
-    class Noise:
+    class NoiseValues:
         """Noise of a vehicle's sensors: standard deviations per sample at this scenario's rates, and lasting errors."""
 
         velocity: scalar  # m/s
@@ -251,7 +251,7 @@ def model_struct(p: Precision) -> Any:
         staleness: wp.float64  # s
 
     @wp.struct
-    class Fault:
+    class FaultValues:
         """What goes wrong with a vehicle's computer, clock and messages."""
 
         clock: scalar  # standard deviation, s
@@ -272,7 +272,7 @@ def model_struct(p: Precision) -> Any:
         lie_std: scalar  # claimed, rad and m; 0: honest
 
     @wp.struct
-    class Observer:
+    class ObserverValues:
         """Gains of the Riccati observer."""
 
         k: wp.array(dtype=scalar)  # (N,)
@@ -323,20 +323,20 @@ def model_struct(p: Precision) -> Any:
         target_count: wp.array(dtype=wp.int32)  # (N,)
         order: wp.array(dtype=wp.int32)  # (N,) leaders first
         rank: wp.array(dtype=wp.int32)  # (N,) place in the order
-        start: Start
+        start: StartValues
         motion: Motion
-        dynamics: wp.array(dtype=Dynamics)  # (N,)
-        scene: Scene
+        dynamics: wp.array(dtype=DynamicsValues)  # (N,)
+        scene: SceneValues
         routes: Routes
-        drawn: Drawn
-        camera: wp.array(dtype=Camera)  # (N,)
-        noise: wp.array(dtype=Noise)  # (N,)
-        fault: wp.array(dtype=Fault)  # (N,)
+        drawn: DrawRanges
+        camera: wp.array(dtype=CameraValues)  # (N,)
+        noise: wp.array(dtype=NoiseValues)  # (N,)
+        fault: wp.array(dtype=FaultValues)  # (N,)
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
         radio: Radio
-        observer: Observer
+        observer: ObserverValues
         judgement: Judgement
 
     return Model

@@ -76,7 +76,7 @@ def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "
     return result
 
 
-class Part:
+class FieldPart:
     """One field of the entries of an array of structs, read and written as an array of its own."""
 
     def __init__(self, array: Any, path: tuple[str, ...]) -> None:
@@ -103,7 +103,7 @@ def parts(record: Any, struct: Any) -> dict[str, Any]:
     """Return the arrays of a record by name, and of arrays of structs every field by a name with dots."""
     arrays = {name: getattr(record, name) for name in fields(struct)}
     paths = [(name, path) for name, array in arrays.items() for path in _paths(array.numpy().dtype)]
-    return {".".join((name, *path)): Part(arrays[name], path) if path else arrays[name] for name, path in paths}
+    return {".".join((name, *path)): FieldPart(arrays[name], path) if path else arrays[name] for name, path in paths}
 
 
 def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
