@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coopenv.base import lazy_names
 from coopenv.base.errors import (
     ActionError,
     CoopenvError,
@@ -22,7 +23,6 @@ from coopenv.base.errors import (
     UnknownEnvironmentError,
 )
 from coopenv.base.installation import list_envs
-from coopenv.base.lazy import lazy_names
 from coopenv.base.seeds import EVALUATION_SEEDS, evaluation_seed
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ def main() -> int:
     except BaseException:
         if not interrupts.received():
             raise
-        status = interrupts.tell()
+        status = interrupts.report()
     if interrupts.received():
         interrupts.end(status)
     return status

@@ -106,7 +106,7 @@ def test_a_result_is_put_in_place_before_the_end(tmp_path: Path) -> None:
         "try:\n"
         "    with files.replacing_folder('result', ['a']) as new: (new / 'a').write_text('new')\n"
         "    print('not reached')\n"
-        "except KeyboardInterrupt: interrupts.end(interrupts.tell())\n",
+        "except KeyboardInterrupt: interrupts.end(interrupts.report())\n",
     )
     assert (errors, status) == ("interrupted; written: result\n", 143)
     assert (tmp_path / "result" / "a").read_text() == "new"

@@ -84,4 +84,4 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except KeyboardInterrupt:
-        interrupts.end(interrupts.tell())
+        interrupts.end(interrupts.report())

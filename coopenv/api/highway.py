@@ -1,4 +1,4 @@
-"""Any policy of highway-env on estimated kinematics: what localisation error costs it."""
+"""Any policy of highway-env on estimated kinematics, to measure the cost of localisation errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LONGEST = 3600.0  # s, of an episode
 
 
 class Kinematics(NamedTuple):
-    """Where a car is believed to be, in highway-env's frame."""
+    """Estimated pose and speed of a car, in highway-env's frame."""
 
     xy: Array  # (2,) m
     heading: float  # rad
@@ -35,16 +35,16 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
     The car of the agent and up to `connected` cars of the traffic carry the scenario's cameras, odometry, radio and
     observers, at every step of highway-env's simulation. When the observation is made,
 
-    - the agent's car is where its observer believes it to be, with the speed of its odometry;
-    - connected cars are where the agent last heard that they believe themselves to be, while that is not stale;
-    - everybody else is as seen from the agent's car: exact relative to it, and off with it.
+    - the agent's car has the pose of its estimate and the speed of its odometry;
+    - connected cars have the pose of their last received message, while that is not stale;
+    - all other cars have their true pose relative to the agent's car, and so share its error.
 
     All kinds of observation of highway-env, and all of their settings, work as they are. Rewards and ends of episodes
     stay those of the truth.
 
-    `info["localisation"]` says of the agent's car, and `info["connected"]` of the others (a tuple), `position` (2,) m
-    and `heading` rad as believed and `position_covariance` (2, 2) m^2, in highway-env's frame, `position_error` m,
-    `orientation_error` deg, and `visible` (names of targets).
+    `info["localisation"]` holds of the agent's car, and `info["connected"]` of the connected ones (a tuple), estimated
+    `position` (2,) m and `heading` rad and `position_covariance` (2, 2) m^2, in highway-env's frame,
+    `position_error` m, `orientation_error` deg, and `visible` (names of targets).
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._most = declared.most_vehicles
         self._engines: dict[tuple[int, int], Engine] = {}
         self._rng = np.random.default_rng()
-        self._cars: list[Any] = []  # connected ones, then the agent's, which hears all of them
+        self._cars: list[Any] = []  # connected ones, then the agent's, which receives from all of them
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; initial estimates are drawn about the truth as the scenario says."""
@@ -98,12 +98,12 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._board()
         self._world.present = self._poses()
         self._engine.reset([int(self._rng.integers(2**63))])
-        return self.highway.observation_type.observe(), self._told(info)
+        return self.highway.observation_type.observe(), self._with_localisation(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment; sensors and observers run along with its simulation."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, self._told(info)
+        return observation, reward, terminated, truncated, self._with_localisation(info)
 
     def _board(self) -> None:
         """Find the cars of this episode, and hook into what moves and observes them."""
@@ -127,7 +127,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._engine.step(ticks=1)
 
     def _act(self, act: Any, action: Any = None) -> None:
-        with believing({self._cars[-1]: self._believed(len(self._cars) - 1)}):
+        with moved_to({self._cars[-1]: self._estimated(len(self._cars) - 1)}):
             act(action)
 
     @property
@@ -155,10 +155,10 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         return poses_of(self._cars, self.highway.road, np.array(scenario.map.origin), scenario.highway.most_vehicles)
 
     def _observe(self, observe: Any) -> Any:
-        """Return the observation that highway-env makes when everybody is where the agent believes it to be."""
+        """Return the observation that highway-env makes when all cars have their estimated poses."""
         agent, last = self._cars[-1], len(self._cars) - 1
-        own = self._believed(last)
-        heard = {self._cars[i]: self._heard(i) for i in range(last) if self._is_fresh(i)}
+        own = self._estimated(last)
+        received = {self._cars[i]: self._received(i) for i in range(last) if self._is_fresh(i)}
         c, s = np.cos(own.heading - agent.heading), np.sin(own.heading - agent.heading)
         turn = np.array([[c, -s], [s, c]])
         seen = {
@@ -169,22 +169,22 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
             )
             for thing in (*self.highway.road.vehicles, *self.highway.road.objects)
         }
-        with believing({**seen, **heard, agent: own}):
+        with moved_to({**seen, **received, agent: own}):
             return observe()
 
-    def _believed(self, i: int) -> Kinematics:
-        """Return what a car believes of itself."""
+    def _estimated(self, i: int) -> Kinematics:
+        """Return the estimate of a car."""
         view = self._engine.view
         R = view("estimate_rotation")[0, i]
         return self._kinematics(i, R, R @ view("estimate_position")[0, i])
 
-    def _heard(self, i: int) -> Kinematics:
-        """Return what a connected car has last told the agent's."""
+    def _received(self, i: int) -> Kinematics:
+        """Return the last message of a connected car to the agent's."""
         view = self._engine.view
         return self._kinematics(i, view("inbox_rotation")[0, -1, i], view("inbox_position")[0, -1, i])
 
     def _is_fresh(self, i: int) -> bool:
-        """Return whether the agent's car has heard a connected one that is on the road, and not too long ago."""
+        """Return whether the last message of a connected car that is on the road is not stale."""
         sent, radio = int(self._engine.view("inbox_tick")[0, -1, i]), self._world.model.radio
         age = (int(self._engine.view("tick")[0]) - sent) / self._world.scenario.rates.camera
         return sent >= 0 and age <= radio.staleness and any(car is self._cars[i] for car in self.highway.road.vehicles)
@@ -197,18 +197,18 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         xy = position[:2] + self._world.scenario.map.origin[:2]
         return Kinematics(flipped(xy.astype(float)), -float(np.arctan2(R[1, 0], R[0, 0])), speed)
 
-    def _told(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the info with what observers say of themselves, and how far off they are."""
-        told = [self._told_of(i) for i in range(len(self._cars))]
-        return {**info, "localisation": told[-1], "connected": tuple(told[:-1])}
+    def _with_localisation(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Return the info with estimates and their errors."""
+        found = [self._localisation(i) for i in range(len(self._cars))]
+        return {**info, "localisation": found[-1], "connected": tuple(found[:-1])}
 
-    def _told_of(self, i: int) -> dict[str, Any]:
-        view, believed = self._engine.view, self._believed(i)
+    def _localisation(self, i: int) -> dict[str, Any]:
+        view, estimated = self._engine.view, self._estimated(i)
         state = (view(name)[0, i] for name in ("estimate_rotation", "estimate_position", "covariance"))
         mirror = np.diag([1.0, -1.0])
         return {
-            "position": believed.xy,
-            "heading": believed.heading,
+            "position": estimated.xy,
+            "heading": estimated.heading,
             "position_covariance": mirror @ position_covariance(*state)[:2, :2] @ mirror,
             "position_error": float(view("position_error")[0, i]),
             "orientation_error": float(view("orientation_error")[0, i]),
@@ -221,13 +221,13 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 @contextmanager
-def believing(beliefs: Mapping[Any, Kinematics]) -> Iterator[None]:
-    """Put things of highway-env where they are believed to be, and back."""
+def moved_to(estimates: Mapping[Any, Kinematics]) -> Iterator[None]:
+    """Move cars and objects of highway-env to estimated kinematics, and back at the end."""
     names = ("position", "heading", "speed", "lane_index", "lane")
-    truth = {thing: [getattr(thing, name) for name in names] for thing in beliefs}
+    truth = {thing: [getattr(thing, name) for name in names] for thing in estimates}
     try:
-        for thing, believed in beliefs.items():
-            thing.position, thing.heading, thing.speed = believed
+        for thing, estimate in estimates.items():
+            thing.position, thing.heading, thing.speed = estimate
             thing.lane_index = thing.road.network.get_closest_lane_index(thing.position, thing.heading)
             thing.lane = thing.road.network.get_lane(thing.lane_index)
         yield

@@ -43,29 +43,29 @@ def parallel_env(
 ) -> CooperativeLocalisationEnv:
     """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
 
-    A recording goes by as it was, whatever the actions; see docs/replay.md, and docs/bags.md for ROS bags.
+    A recording is replayed unchanged, actions are ignored; see docs/replay.md, and docs/bags.md for ROS bags.
 
     Args:
         name_or_path: for example "busy_intersection"; "mrclam_6", "drive.mcap" or "drive.bag" replay what was
             recorded. A scenario of `coopenv.load_scenario` is simulated. Where `backend` is an object, any name for
             the environment.
         render_mode: None, "rgb_array" or "human".
-        observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
-            (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
+        observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or an import path
+            (`mine.py:Mine`, `package.module:Mine`); None: that of the scenario.
         backend: where measurements come from, "simulated", "highway", "replay" or "svea", or a
-            `coopenv.backends.base.Backend`, which has its own scenario; None: as the name says.
+            `coopenv.backends.base.Backend`, which has its own scenario; None: by the name.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
-        data: folder of recorded data sets; None: what COOPENV_DATA says.
+        data: folder of recorded data sets; None: COOPENV_DATA.
         variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
-        topics: of a ROS bag: the TOML file that says what its topics are.
+        topics: of a ROS bag: the TOML file with the meaning of its topics.
         reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
             sum of the scenario's terms.
-        deployment: file that says which cars there are; for `backend="svea"`, see docs/cars.md.
-        car: the one that is estimated and driven here, the others are heard (None: all of them).
-        record: MCAP file to which all that comes from the cars and goes to them is written.
+        deployment: file with the cars; for `backend="svea"`, see docs/cars.md.
+        car: name of the car that is estimated and driven here; the other ones only send (None: all cars).
+        record: MCAP file for all messages from and to the cars.
         connect: endpoint of the cars' network in place of that of the deployment, for example "tcp/127.0.0.1:7447".
 
     Raises:
@@ -124,7 +124,7 @@ def make_vec(
         render_mode: None or "rgb_array".
         reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
             only; None: the weighted sum of the scenario's terms.
-        observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: as the scenario says.
+        observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: that of the scenario.
         observation: "flat" rows, or a "dict" of arrays (num_envs, size) by field.
 
     Raises:

@@ -40,7 +40,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     """Connected vehicles at an intersection, each estimating its own pose.
 
     Observation (per agent): a flat float32 Box whose entries `observation_layout` names, or a one-level Dict of the
-    same fields. It holds only what the vehicle itself measures, hears and estimates.
+    same fields. It holds only the vehicle's own measurements, received messages and estimates.
 
     Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left); with
     `[action.pan]` a third entry, the angle of the camera. Values beyond
@@ -198,7 +198,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     @property
     def health(self) -> Health:
-        """What has come from the backend so far, and what not."""
+        """Counts of data that the backend has delivered, and of data that is missing."""
         return self.engine.backend.health
 
     def state(self) -> np.ndarray:
@@ -225,13 +225,13 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         return {**own, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state that `get_state` returned, of this or an equal environment.
+        """Restore a state of `get_state`, of this or an equal environment.
 
-        A state is data but for plug-in observers, which are objects: one of somebody else's, kept on disk by pickle, is
-        as dangerous as any pickle.
+        A state is data except for plug-in observers, which are objects: a pickled state of unknown origin is as
+        dangerous as any pickle.
 
         Raises:
-            CoopenvError: it is of another kind of environment, or does not hold what it may; nothing has changed then.
+            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
         """
         where = f"this state does not fit {self.metadata['name']}"
         if not isinstance(state, Mapping):

@@ -1,4 +1,4 @@
-"""Observers in NumPy in place of the embedded one: the world goes tick by tick, they estimate in between."""
+"""Observers in NumPy in place of the embedded one: the world advances tick by tick, observers run in between."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,8 +18,8 @@ from coopenv.observers.registry import find
 class PlugIns:
     """A group of observers per world.
 
-    What they estimate is written into the world's state, so that observations, rewards and judgements follow from it
-    as from the embedded observer's. Where an observer states no covariance, the scenario's P(0) stands.
+    Estimates are written into the world's state, from which observations, rewards and metrics follow as for the
+    embedded observer. For an observer without covariance the scenario's P(0) is kept.
     """
 
     def __init__(self, name: str, world: SensingWorld) -> None:
@@ -106,8 +106,8 @@ class PlugIns:
                 return [answer.estimate for answer in group.update_all(sensed)]
             interference = self._interference(w, sensed.index)
             if interference is not None and interference.restarts[vehicle]:
-                for heard in ("inbox_tick", "inbox_stamp"):
-                    self._world.view(heard)[w, vehicle] = -1
+                for name in ("inbox_tick", "inbox_stamp"):
+                    self._world.view(name)[w, vehicle] = -1
             inbox_tick = self._world.view("inbox_tick")[w, vehicle]
             return [group.update(vehicle, sensed, inbox_tick, interference).estimate]
         except ObserverError as failure:

@@ -1,11 +1,11 @@
-"""A reward in Python: what a step came to, of all vehicles of all worlds at once, and a function of it."""
+"""A reward in Python: a function of the results of a step, of all vehicles of all worlds at once."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, shown, suggest, told
+from coopenv.base.errors import CoopenvError, error_text, shown, suggest
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 
@@ -25,12 +25,12 @@ FIELDS = (
     "gramian_min_eigenvalue",
     "targets_in_view",
 )
-"""What an engine holds under the same name."""
+"""Fields of an engine under the same name."""
 OTHERS = ("truth", "estimate", "reward_terms", "visible", "time")
 
 
 class Step:
-    """What a step came to: the infos of N vehicles in W worlds as arrays, read-only until the next step.
+    """Results of a step: the infos of N vehicles in W worlds as arrays, read-only until the next step.
 
     - `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `position_std` (m),
       `gramian_min_eigenvalue`, `targets_in_view`: (W, N);
@@ -96,7 +96,7 @@ def check_function(reward: object, device: str) -> None:
 
 
 def reward_of(function: RewardFunction, step: Step, earning: np.ndarray) -> np.ndarray:
-    """Return the reward (W, N) that somebody's function gives those that earn one, (W, N) bool; 0 to the others.
+    """Return the rewards (W, N) of a user's function for rows of a mask (W, N), bool; 0 elsewhere.
 
     Raises:
         CoopenvError: the function raises something, or returns another shape or what is no number.
@@ -105,7 +105,7 @@ def reward_of(function: RewardFunction, step: Step, earning: np.ndarray) -> np.n
     try:
         values = np.asarray(function(step))
     except Exception as error:  # anybody's code
-        raise CoopenvError(f"{title}: {told(error)}") from error
+        raise CoopenvError(f"{title}: {error_text(error)}") from error
     if values.shape != earning.shape or values.dtype.kind not in "biuf":
         worlds, vehicles = earning.shape
         given = f"shape {values.shape} and dtype {values.dtype}"
@@ -118,7 +118,7 @@ def reward_of(function: RewardFunction, step: Step, earning: np.ndarray) -> np.n
 
 
 def check_finite(title: str, values: np.ndarray) -> None:
-    """Make sure that somebody's term, (W, N, ...), is finite.
+    """Check that the values (W, N, ...) of a user's term are finite.
 
     Raises:
         CoopenvError: it is not.
@@ -131,7 +131,7 @@ def check_finite(title: str, values: np.ndarray) -> None:
 
 
 def _locked(values: np.ndarray) -> np.ndarray:
-    """Return a view through which nobody writes into the world."""
+    """Return a read-only view."""
     view = values.view()
     view.flags.writeable = False
     return view

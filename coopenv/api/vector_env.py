@@ -220,10 +220,10 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return {"scenario": self.scenario, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `get_state` returned; of states of others see `CooperativeLocalisationEnv.set_state`.
+        """Restore a state of `get_state`; on states of unknown origin see `CooperativeLocalisationEnv.set_state`.
 
         Raises:
-            CoopenvError: it is of another kind of environment, or does not hold what it may; nothing has changed then.
+            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
         """
         where = f"this state does not fit {self.metadata['name']}"
         if not isinstance(state, Mapping) or state.get("scenario") != self.scenario:
@@ -257,7 +257,7 @@ class TrueEnds(VectorWrapper):
 
     A vehicle that ended before its world stays parked, and its row is not `truncated` once more when the world is over:
     the time until then reads as the beginning of its next episode, with reward 0 and without effect of its actions. So
-    the returns that others sum up, such as Gymnasium's `RecordEpisodeStatistics`, are those of true episodes; their
+    returns summed by wrappers, such as Gymnasium's `RecordEpisodeStatistics`, are those of true episodes; their
     lengths contain the time parked.
     """
 
@@ -276,7 +276,7 @@ class EpisodeSums:
     """Sums over the episodes under way, one per row (world, vehicle)."""
 
     def __init__(self, rows: int, terms: tuple[str, ...]) -> None:
-        """Begin with nothing.
+        """Start from zero.
 
         Args:
             rows: number of rows.
@@ -325,7 +325,7 @@ class EpisodeSums:
 
 
 class RecordVehicleEpisodes(VectorWrapper):
-    """Adds what a vehicle's episode came to, like Gymnasium's `RecordEpisodeStatistics`, but of true episodes only.
+    """Adds return and length of vehicles' true episodes, in place of Gymnasium's `RecordEpisodeStatistics`.
 
     In a step in which episodes end, `infos["episode"]` holds `r` (undiscounted return), `l` (decisions) and
     `reward_terms` (sums by name), arrays (num_envs,), and `infos["_episode"]` the mask of the rows that they are of. A
@@ -354,7 +354,7 @@ class RecordVehicleEpisodes(VectorWrapper):
         self.length_queue: deque[int] = deque(maxlen=buffer_length)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the batch, and begin anew where it was reset."""
+        """Reset the batch, and the sums of the rows that were reset."""
         result = self.env.reset(seed=seed, options=options)
         mask = (options or {}).get("reset_mask")
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
@@ -365,7 +365,7 @@ class RecordVehicleEpisodes(VectorWrapper):
         return result
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step the batch, and tell of the episodes that have ended."""
+        """Step the batch, and report the episodes that have ended."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         step = infos.get("final_info", infos)
         acted, over = step["alive"] & ~self._waiting, terminated | truncated

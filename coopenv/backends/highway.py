@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.backends.simulated import CosimulatedWorld, Poses, Simulated
-from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
+from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
@@ -90,7 +90,7 @@ def make_environment(scenario: Scenario) -> Any:
     try:
         return creator(config=config)
     except Exception as error:  # whatever highway-env makes of it
-        raise ScenarioError(f"highway: {scenario.highway.id} cannot be made: {told(error)}") from None
+        raise ScenarioError(f"highway: {scenario.highway.id} cannot be made: {error_text(error)}") from None
 
 
 def _creator(name: str) -> Any:
@@ -233,7 +233,7 @@ class Simulation:
         try:
             getattr(self.environment, method)(*arguments, **options)
         except Exception as error:  # whatever goes wrong in there
-            raise CoopenvError(f"highway-env: {method}: {told(error)}") from error
+            raise CoopenvError(f"highway-env: {method}: {error_text(error)}") from error
 
 
 def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:

@@ -43,7 +43,7 @@ class ScenarioWarning(UserWarning):
 
 
 class DataWarning(UserWarning):
-    """A recorded or deployment file is what it claims to be, but says less than it should."""
+    """A recorded or deployment file is what it claims to be, but lacks something that it should hold."""
 
 
 def checked_seed(seed: object) -> int:
@@ -57,7 +57,7 @@ def checked_seed(seed: object) -> int:
 
 
 def check_memory(size: float, what: str, available: int | None = None) -> None:
-    """Refuse what needs more bytes than are available (None: in this machine); `what` begins the error."""
+    """Raise CoopenvError if more bytes are needed than available (None: in this machine); `what` begins the error."""
     if available is None:
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**34
     if size > available:
@@ -70,7 +70,7 @@ def printable(text: str) -> str:
 
 
 def shortened(text: str, length: int = 60) -> str:
-    """Return a text of at most that many characters, what is too much left out of its middle."""
+    """Return a text of at most that many characters; a longer one is cut in its middle."""
     half = (length - 3) // 2
     return text if len(text) <= length else f"{text[:half]}...{text[-half:]}"
 
@@ -79,16 +79,16 @@ def shown(value: object) -> str:
     """Return a value as an error quotes it: as Python writes it, but short."""
     try:
         return shortened(repr(value))
-    except Exception:  # numbers of thousands of digits, and anybody's classes
+    except Exception:  # numbers of thousands of digits, and classes of users
         return f"a {type(value).__name__}"
 
 
-def told(error: BaseException) -> str:
-    """Return the kind of anybody's error and what it says."""
+def error_text(error: BaseException) -> str:
+    """Return the type and the message of any exception."""
     try:
         text = str(error)
     except Exception as another:
-        text = f"says nothing, but raises {type(another).__name__}"
+        text = f"no message: its text raises {type(another).__name__}"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 

@@ -20,10 +20,10 @@ from coopenv.base.interrupts import NOTHING, before_a_hard_end, held, note
 
 try:
     import fcntl
-except ImportError:  # no POSIX: nobody can tell whether a hidden folder is still in use, so all of them stay
+except ImportError:  # no POSIX: whether a hidden folder is in use cannot be tested, so all of them stay
     fcntl = None  # type: ignore[assignment]
 
-PART, OLD = ".part", ".old"  # suffixes of hidden folders: what is being written, and what has made room for it
+PART, OLD = ".part", ".old"  # suffixes of hidden folders: for new results, and for replaced results
 POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
@@ -76,7 +76,7 @@ def lock(folder: Path, wait: float = 0.0) -> int | None:
 
 
 def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
-    """Put the folder `part` in its place, with what is there and not of `names`; after an OSError all is as it was."""
+    """Put the folder `part` in its place and keep entries there that are not of `names`; an OSError changes nothing."""
     if not place.exists():
         part.rename(place)
         return
@@ -92,7 +92,7 @@ def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
 
 def exchange(part: Path, place: Path, old: Path) -> None:
     """Let `part` and the folder at `place` change places; the latter is then called `old`."""
-    part.rename(old)  # from now on nobody removes it unseen
+    part.rename(old)  # from now on no other run removes it as abandoned
     rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
     paths = os.fsencode(old), os.fsencode(place)
     if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
@@ -107,18 +107,18 @@ def exchange(part: Path, place: Path, old: Path) -> None:
 
 
 def heal(place: Path, names: Collection[str]) -> None:
-    """Finish what a run that was killed had begun."""
+    """Finish a replacement that a killed run had begun."""
     for old in abandoned(place, OLD):
         if not os.path.lexists(place):
             old.rename(place)
         elif any((place / name).exists() for name in names):
             clear(old, place, names)
-        else:  # somebody has made an empty place since
+        else:  # the place was made anew, and is empty
             clear(old, place, ())
 
 
 def clear(old: Path, place: Path, names: Collection[str]) -> None:
-    """Remove an old folder but for what is not of `names`, which goes to `place` unless something else is there."""
+    """Remove an old folder; entries that are not of `names` move to `place`, unless an entry of that name is there."""
     with suppress(OSError):
         for entry in old.iterdir():
             with suppress(OSError):
@@ -131,7 +131,7 @@ def clear(old: Path, place: Path, names: Collection[str]) -> None:
 
 
 def copy_owner(old: Path, new: Path) -> None:
-    """Give what is new the mode and, where allowed, the owner of what it replaces."""
+    """Give a new file or folder the mode and, where allowed, the owner of the replaced one."""
     if os.name == "posix":
         with suppress(OSError):
             info = old.stat()
@@ -167,14 +167,14 @@ def writing(path: str | Path) -> Iterator[None]:
     except FileExistsError:  # where a folder is to be made
         raise OutputError(f"cannot write to {path}: it is not a folder") from None
     except NotADirectoryError:
-        raise OutputError(f"cannot write to {path}: what stands above it is not a folder") from None
+        raise OutputError(f"cannot write to {path}: a part of its path is not a folder") from None
     except OSError as error:
         raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
 
 
 @contextmanager
 def replacing_file(path: str | Path) -> Iterator[Path]:
-    """Yield a path to write to; what stands there at the end takes the place of the file `path`.
+    """Yield a path to write to; the file there replaces the file `path` at the end.
 
     Raises:
         OutputError: it cannot be written; the old file is untouched.
@@ -192,7 +192,11 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
 
 def replace_text(path: str | Path, text: str) -> None:
-    """Write a text that takes the place of the file `path`; an OutputError says why not, and the old one stays."""
+    """Write a text that replaces the file `path`.
+
+    Raises:
+        OutputError: it cannot be written; the old file is untouched.
+    """
     with replacing_file(path) as new:
         new.write_text(text, encoding="utf-8")
 
@@ -233,7 +237,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder and those above it, where need be; if what follows fails, those that stayed empty are none again.
+    """Make a folder and those above it, where need be; after an error in the block, empty ones are removed again.
 
     Raises:
         OutputError: it cannot be made.
@@ -251,13 +255,13 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 
 def check_file(path: str | Path) -> None:
-    """Find out before any work whether a file can be written. Raises OutputError: it cannot."""
+    """Check before any work that a file can be written. Raises OutputError: it cannot."""
     with _staging(path, _check_file):
         pass
 
 
 def _abandon() -> None:
-    """Remove what is unfinished; nothing is put in place any more."""
+    """Remove unfinished results; from now on no result is put in place."""
     if _replacing.acquire(timeout=LAST_WAIT):
         for part in list(_under_way):
             shutil.rmtree(part, ignore_errors=True)
@@ -311,7 +315,7 @@ def _check_folder(names: Collection[str], folder: str | Path, place: Path) -> No
 def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Iterator[tuple[Path, Path]]:
     """Yield the place behind `path`, its symbolic links followed, and a hidden folder beside it, removed at the end.
 
-    The folder is locked for as long as this process lives: others that nobody holds are of runs that were killed.
+    The folder is locked for as long as this process lives: unlocked ones are of runs that were killed.
     """
     with writing(path):
         place = Path(os.path.realpath(path))

@@ -1,4 +1,4 @@
-"""Numbers for people, in tables and pictures; `-` where there is none."""
+"""Numbers in tables and figures; `-` for NaN. JSON of results."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ LARGEST = 1e9
 
 NONE = "-"
 MOST_DECIMALS = 5
-FINEST_ERROR = 1e-3  # share of its number below which a standard error is no longer told by its first digit
+FINEST_ERROR = 1e-3  # share of its number below which a standard error is not given by its first digit
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from coopenv.base.errors import UnknownEnvironmentError, shortened, shown, suggest
 
 SCENES = ("lane", "roots", "tree", "random", "ring")
-"""Kinds of scenes that are made to measure, `lane:20`; see `coopenv.scenario.scenes`."""
+"""Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
 
 EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"
 BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
@@ -57,7 +57,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
         try:
             path = Path(text).expanduser()
             there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
-        except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
+        except (OSError, RuntimeError, ValueError) as error:  # too long, an unknown user's home, a null character
             reason = getattr(error, "strerror", None) or error
             raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
         if is_bag:

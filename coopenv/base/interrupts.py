@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end a command within two seconds, with one line that says what was written or kept."""
+"""SIGINT and SIGTERM end a command within two seconds, with one line on the results that were written or kept."""
 
 import atexit
 import os
@@ -50,7 +50,7 @@ def received() -> bool:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Put off the interruption of what must not be left half done."""
+    """Delay an interruption to the end of the block, which must not be left half done."""
     _holds.append(None)
     try:
         yield
@@ -61,23 +61,23 @@ def held() -> Iterator[None]:
 
 
 def note(state: str) -> None:
-    """Set what is to be told of the results if the command is interrupted from now on."""
+    """Set the line on the results that an interruption from now on prints."""
     global _state
     _state = state
 
 
 def also_kept(words: Callable[[], str]) -> None:
-    """Let what is told after an interruption end with what was kept beside the results; empty: nothing was."""
+    """Append a text on further kept files to the line of an interruption; empty: none."""
     _kept.append(words)
 
 
 def before_a_hard_end(step: Callable[[], None]) -> None:
-    """Let a step be done, in another thread, before a command is ended that does not end by itself."""
+    """Register a step that another thread takes before it ends a command that does not end by itself."""
     _last_steps.append(step)
 
 
-def tell() -> int:
-    """Print what was kept and return the exit status, 130 or 143."""
+def report() -> int:
+    """Print the line on the results and return the exit status, 130 or 143."""
     _ended.set()
     if sys.stderr is not None:
         with suppress(OSError):
@@ -94,7 +94,7 @@ def end(status: int) -> NoReturn:
 
 
 def end_with_parent() -> None:
-    """End this process, one that `multiprocessing` has started, as soon as its parent is gone, however that ended."""
+    """End this process, one that `multiprocessing` has started, as soon as its parent has ended in any way."""
     from multiprocessing import parent_process
     from multiprocessing.connection import wait
 
@@ -119,7 +119,7 @@ def _handle(number: int, _frame: object) -> None:
     _received = number
     for each in SIGNALS:
         signal.signal(each, signal.SIG_IGN)
-    sys.unraisablehook = lambda _: None  # where nobody can catch what is raised below, it says nothing; see _watch
+    sys.unraisablehook = lambda _: None  # exceptions that cannot be caught are not printed; see _watch
     if not _holds:
         raise Interrupted
 

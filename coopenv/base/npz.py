@@ -1,4 +1,4 @@
-"""Arrays of `.npz` files of others: sizes, kinds and shapes are checked before memory is taken."""
+"""Arrays of untrusted `.npz` files: sizes, kinds and shapes are checked before memory is allocated."""
 
 import math
 import zipfile
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataError, told
+from coopenv.base.errors import CoopenvError, DataError, error_text
 
 MOST_BYTES = 2**31
 """That a file may unpack to."""
@@ -55,9 +55,11 @@ def read_npz(
     except CoopenvError:
         raise
     except (zipfile.BadZipFile, EOFError, zlib.error):
-        raise DataError(f"{path}: not a readable {what}: it is cut off or damaged, or was never one") from None
-    except Exception as error:  # whatever NumPy and zipfile raise at files that make no sense
-        raise DataError(f"{path}: not a readable {what} ({getattr(error, 'strerror', None) or told(error)})") from None
+        raise DataError(f"{path}: not a readable {what}: it is cut off, damaged, or of another kind") from None
+    except Exception as error:  # any error of NumPy and zipfile for malformed files
+        raise DataError(
+            f"{path}: not a readable {what} ({getattr(error, 'strerror', None) or error_text(error)})"
+        ) from None
 
 
 def _fits(shape: tuple[int, ...], dtype: np.dtype, rule: str, possible: dict[str, Sequence[int]]) -> bool:

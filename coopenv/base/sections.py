@@ -111,7 +111,7 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
 
 
 def _kind_message(detail: Any) -> str:
-    """Say which kinds exist, for a table whose `kind` is missing, misspelt or unknown."""
+    """Return the known kinds, for a table whose `kind` is missing, misspelt or unknown."""
     context, given = detail.get("ctx", {}), detail.get("input")
     if "expected_tags" not in context:
         near = get_close_matches("kind", [str(k) for k in given], n=1) if isinstance(given, dict) else []

@@ -1,4 +1,4 @@
-"""Seeds: what a person gives, and the 64-bit keys of the random streams of worlds that follow from it.
+"""Seeds of users, and the 64-bit keys of the random streams of worlds that follow from them.
 
 World w of a batch with seed s < 2^32 has the key (w << 32) | s, so that no two seeds share a world, and world 0 of a
 batch is the single world of its seed. Seeds from 2^31 to 2^32 - 1 are reserved for evaluation: in their worlds
@@ -11,7 +11,7 @@ from hashlib import sha256
 from coopenv.base.errors import CoopenvError, checked_seed
 
 EVALUATION_SEEDS = range(2**31, 2**32)
-"""Seeds whose maps no other seed has: for measuring agents, never for training them."""
+"""Seeds whose maps no other seed has: for the evaluation of agents only, not for training."""
 
 
 def evaluation_seed(k: int) -> int:
@@ -27,7 +27,7 @@ def evaluation_seed(k: int) -> int:
 
 
 def training_seed() -> int:
-    """Return a seed that nobody has chosen, from 0 to 2^31 - 1."""
+    """Return a random seed, from 0 to 2^31 - 1."""
     return secrets.randbits(31)
 
 

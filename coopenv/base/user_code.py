@@ -1,4 +1,4 @@
-"""Classes and functions of the user's own, named by where they stand: `file.py:Name` or `package.module:Name`."""
+"""Classes and functions of the user's own, named by import path: `file.py:Name` or `package.module:Name`."""
 
 import sys
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from traceback import extract_tb
 from types import CodeType, ModuleType
 from typing import Any
 
-from coopenv.base.errors import CoopenvError, shown, suggest, told
+from coopenv.base.errors import CoopenvError, error_text, shown, suggest
 
 
 def is_reference(text: str) -> bool:
@@ -28,7 +28,7 @@ def absolute(reference: str, folder: Path | None = None) -> str:
 
 
 def load(reference: str) -> Any:
-    """Return what a reference names.
+    """Return the object of a reference.
 
     Modules are looked for in the current folder too, and those that a file imports in its own. A file is loaded once,
     and again after it has changed.
@@ -49,7 +49,7 @@ def load(reference: str) -> Any:
             with _importing_from(Path.cwd()):
                 module = import_module(place)
     except (Exception, SystemExit) as error:  # anybody's code
-        raise CoopenvError(f"'{reference}' cannot be loaded: {told(error)}") from error
+        raise CoopenvError(f"'{reference}' cannot be loaded: {error_text(error)}") from error
     if not hasattr(module, name):
         known = [known for known in vars(module) if not known.startswith("_")]
         raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
@@ -57,8 +57,8 @@ def load(reference: str) -> Any:
 
 
 @contextmanager
-def blamed(who: str) -> Iterator[None]:
-    """Turn what anybody's code raises meanwhile into a `CoopenvError` that says who, what and in which line.
+def blamed(subject: str) -> Iterator[None]:
+    """Turn exceptions of a user's code into a `CoopenvError` with the subject, the exception and the line.
 
     Raises:
         CoopenvError: it raises something; its own errors of this kind stay as they are.
@@ -70,7 +70,7 @@ def blamed(who: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         last = extract_tb(error.__traceback__)[-1]
         where = f"{Path(last.filename).name}:{last.lineno}"
-        raise CoopenvError(f"{who} failed at {where}: {told(error)}") from error
+        raise CoopenvError(f"{subject} failed at {where}: {error_text(error)}") from error
 
 
 def _file(place: str, folder: Path | None = None) -> Path:
@@ -78,7 +78,7 @@ def _file(place: str, folder: Path | None = None) -> Path:
         path = ((folder or Path()) / Path(place).expanduser()).resolve()
         path.is_file()  # raises here what it would raise later
         return path
-    except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
+    except (OSError, RuntimeError, ValueError) as error:  # too long, an unknown user's home, a null character
         raise CoopenvError(f"{shown(place)}: no such file ({getattr(error, 'strerror', None) or error})") from None
 
 

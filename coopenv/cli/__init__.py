@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BaseException as error:
         status = failure_status(error)
     if interrupts.received() or status == INTERRUPTED:
-        return interrupts.tell()
+        return interrupts.report()
     return status if isinstance(status, int) else 0
 
 

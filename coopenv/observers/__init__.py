@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from coopenv.base.lazy import lazy_names
+from coopenv.base import lazy_names
 from coopenv.observers.registry import find, observer_names, register
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, error_text
 from coopenv.estimation.outcomes import UNKNOWN
 from coopenv.estimation.poses import Array, Coordinates
 from coopenv.observers.contract import (
@@ -169,7 +169,7 @@ class Group:
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
         """Return an error that says whose observer failed, when, and how."""
         whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
-        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {told(error)}")
+        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""
@@ -180,7 +180,7 @@ class Group:
         try:
             return copy.deepcopy(state)
         except Exception as error:
-            raise CoopenvError(f"the observers' state cannot be copied: {told(error)}") from error
+            raise CoopenvError(f"the observers' state cannot be copied: {error_text(error)}") from error
 
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
         """Return a deep copy of what `get_state` of such a group returned, before or after the start of an episode.
@@ -200,7 +200,7 @@ class Group:
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             Mailbox(self.observer_init).set_state(mail)
         except Exception as error:  # of anything that is no state
-            raise CoopenvError(f"state: the observers do not fit: {told(error)}") from error
+            raise CoopenvError(f"state: the observers do not fit: {error_text(error)}") from error
         return dict(copied)
 
     def set_state(self, state: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopenv.base.errors import CoopenvError, shown, suggest, told
+from coopenv.base.errors import CoopenvError, error_text, shown, suggest
 from coopenv.base.user_code import absolute, is_reference, load
 
 if TYPE_CHECKING:
@@ -293,4 +293,4 @@ def _found(observer: str | Factory) -> Registered:
     try:
         return _row(point.load())
     except (Exception, SystemExit) as error:  # anybody's code
-        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {told(error)}") from error
+        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {error_text(error)}") from error

@@ -1,4 +1,4 @@
-"""What a policy is, and those that look at nothing: the neutral action, and random ones."""
+"""The interface of a policy, and policies without observations: the neutral action, and random ones."""
 
 from collections.abc import Callable, Mapping
 from typing import Protocol
@@ -12,8 +12,8 @@ from coopenv.base.errors import CoopenvError, shown
 class Policy(Protocol):
     """Maps what vehicles observe to their actions; a function, or an object that can be called.
 
-    It chooses for all rows of a batch at once, each from its own observation alone. One that remembers something has
-    also a method `reset(mask)`, see `restart`, and is then asked about the same rows, in the same order, every time.
+    It chooses for all rows of a batch at once, each from its own observation alone. A policy with
+    memory also has a method `reset(mask)`, see `restart`, and gets the same rows, in the same order, every time.
     """
 
     def __call__(self, observations: np.ndarray, /) -> np.ndarray:
@@ -21,7 +21,7 @@ class Policy(Protocol):
 
 
 def restart(policy: Policy, mask: np.ndarray) -> None:
-    """Tell a policy that remembers something in which rows, mask (rows,) of bool, a new episode begins."""
+    """Reset a policy with memory in rows of a mask (rows,), bool, where a new episode begins."""
     reset = getattr(policy, "reset", None)
     if callable(reset):
         with user_code.blamed("the policy's reset"):

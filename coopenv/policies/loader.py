@@ -1,4 +1,4 @@
-"""Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
+"""Find and load drivers: a folder of `agents/`, any folder, or an import path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coopenv.base import user_code
-from coopenv.base.errors import CoopenvError, suggest, told
+from coopenv.base.errors import CoopenvError, error_text, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coopenv.scenario import Scenario
 
 Kind = Literal["learned", "scripted", "reference"]
-"""Trained; written by hand; or a yardstick that says what is possible."""
+"""Trained, scripted, or a reference for what is possible."""
 AGENT_FILE = "agent.toml"
 CARD_FILES = ("card.json", "card.md")
 """What `coopenv evaluate --write-card` writes beside it."""
@@ -43,8 +43,8 @@ class NetworkColumn(BaseModel):
     center: float
     unit: str
 
-    def told(self) -> dict[str, float | str]:
-        """Return what must be the same wherever the field stands."""
+    def signature(self) -> dict[str, float | str]:
+        """Return the properties of the field that must agree between agent and environment."""
         return {"size": self.stop - self.start, **self.model_dump(exclude={"start", "stop"})}
 
 
@@ -96,13 +96,13 @@ class Agent:
     """What tables call it."""
     entry: str
     """A class, which is built with the scenario and the options, or else a policy."""
-    kind: Kind = "scripted"  # trained, written by hand, or a yardstick that says what is possible
+    kind: Kind = "scripted"  # see `Kind`
     environments: tuple[str, ...] = ()
     """Names, or paths of TOML files."""
     options: Mapping[str, Any] = field(default_factory=dict)  # that its class is built with
     description: str = ""  # what it does, in a sentence
     folder: Path | None = None
-    """Where its `agent.toml` and its card are; None for a place in code."""
+    """Where its `agent.toml` and its card are; None for an import path."""
 
     def policy(self, scenario: Scenario) -> Policy:
         """Return it as a policy for an environment's vehicles (`env.scenario`).
@@ -118,9 +118,11 @@ class Agent:
         made: Any = factory
         try:
             policy: Policy = made(scenario, **self.options)
-        except (Exception, SystemExit) as error:  # anybody's code
+        except (Exception, SystemExit) as error:  # code of a user
             plain = isinstance(error, ValueError | TypeError | KeyError)
-            raise CoopenvError(f"agent '{self.name}' cannot be built: {error if plain else told(error)}") from error
+            raise CoopenvError(
+                f"agent '{self.name}' cannot be built: {error if plain else error_text(error)}"
+            ) from error
         if not callable(policy):
             raise CoopenvError(f"agent '{self.name}': {self.entry} cannot be called with observations")
         return policy
@@ -146,13 +148,13 @@ def read_card(folder: Path) -> AgentCard:
 
 def _training_anew(folder: Path, training: Any) -> str:
     """Return the command that puts an agent in the place of one that was trained by an earlier version."""
-    told = training if isinstance(training, dict) else {}
-    name = str(told.get("environment", "ENV"))
+    known = training if isinstance(training, dict) else {}
+    name = str(known.get("environment", "ENV"))
     words = ["coopenv", "train", str(folder / name) if name.endswith(".toml") else name]
     if (folder / "train.toml").is_file():
         words += ["--settings", str(folder / "train.toml")]
-    if "seed" in told:
-        words += ["--seed", str(told["seed"])]
+    if "seed" in known:
+        words += ["--seed", str(known["seed"])]
     return shlex.join([*words, "--out", str(folder), "--force"])
 
 
@@ -183,7 +185,7 @@ def find_agent(name_or_place: str | Path) -> Agent:
 
 
 def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> None:
-    """Refuse a name behind which there is no driver, without loading any; `others` are names that are known as well.
+    """Check that a name is that of a driver, without loading any; `others` are further valid names.
 
     Raises:
         CoopenvError: there is none, which `what` was to be.
@@ -194,7 +196,7 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
 
 
 def _not_found(what: str, name: str, known: Sequence[str]) -> CoopenvError:
-    """Return the error that says what is behind a name in place of an agent, or which names there are."""
+    """Return the error for a name without an agent, with a hint or the known names."""
     if (Path(name) / CHECKPOINT_FILE).is_file():
         return CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
     if name.endswith(".py"):

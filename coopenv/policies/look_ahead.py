@@ -1,4 +1,4 @@
-"""Planning what to look at: the belief rolled forward over sampled plans. A yardstick of what is possible."""
+"""Planning of headings by predicted pose covariances over sampled plans; a reference for what is possible."""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,18 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.policies.belief import LEAST_ODDS, Belief, FieldOfView, Occluders, unhidden
+from coopenv.policies.prediction import LEAST_ODDS, FieldOfView, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 
-OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the heading from that of the way
+OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the heading from the direction of the route
 STEP, FIRST, STEPS = 0.4, 4, 10  # s; steps with the first of two offsets; steps in all
 HOLD = 2  # decisions that a plan is kept
-OUTSIDE, BACK = 5.0, 0.5  # s/s for each metre too far out; s for each metre from the way at the end of a plan
+OUTSIDE, BACK = 5.0, 0.5  # s/s for each metre too far out; s for each metre from the route at the end of a plan
 LEAST_BEARING_STD = 0.001  # rad, of a frame: where there is no noise to speak of
-BENT = 4.0  # weight of what the linearisation of a bearing leaves out
-FAR = 3.0  # m, how much farther one would drive blind after a plan
-FORESIGHT = 3.0  # s; others that look around, too, do not go straight on for longer
+BENT = 4.0  # weight of the linearisation variance of a bearing
+FAR = 3.0  # m, distance driven without bearings after a plan
+FORESIGHT = 3.0  # s; other vehicles of this kind do not drive straight on for longer
 CLOSE = 20.0  # s/s for each metre that a plan comes too close to another vehicle
 
 
@@ -29,9 +29,9 @@ class _Path(NamedTuple):
     y: np.ndarray
     heading: np.ndarray
     along: np.ndarray
-    """Way made."""
+    """Progress along the route."""
     aside: np.ndarray
-    """To the left of the way."""
+    """Distance to the left of the route."""
 
     def moved(
         self, wanted: np.ndarray, bend: np.ndarray, stride: float, most: float
@@ -50,10 +50,10 @@ class _Path(NamedTuple):
 class LookAhead(RouteFollower):
     """The route follower with the heading of the best of many plans.
 
-    A plan is two headings off the way, one after the other. Its cost in seconds is the time that it loses, what its
-    uncertainty costs (the standard deviation of the position, over the plan and a few metres beyond), and what it
-    costs to come close to others. It gives way only to those that come too close within `FORESIGHT`: of drivers that
-    turn to landmarks and back, headings tell nothing of later.
+    A plan is two headings relative to the route, one after the other. Its cost in seconds is the lost time, the cost of
+    uncertainty (the standard deviation of the position, over the plan and a few metres beyond), and the
+    cost of coming close to other vehicles. It gives way only to those that come too close within `FORESIGHT`: drivers
+    that turn to landmarks and back do not keep their headings for longer.
     """
 
     needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
@@ -72,7 +72,7 @@ class LookAhead(RouteFollower):
             scenario: of the environment.
             price: seconds that a second with a standard deviation of 1 m is worth.
             tolerated: standard deviation that costs nothing, m.
-            farthest: offset from the way that costs nothing, m.
+            farthest: offset from the route that costs nothing, m.
         """
         super().__init__(scenario)
         self.foresight = min(self.foresight, FORESIGHT)
@@ -114,45 +114,45 @@ class LookAhead(RouteFollower):
 
     def costs(self, observations: np.ndarray) -> np.ndarray:
         """Return the costs, (rows, plans) in s."""
-        way, bends = self._way(observations)
+        pieces, bends = self._route_pieces(observations)
         landmarks = self.read(observations, "map_position")[..., :2]
         boxes = self.occluders.boxes(partial(self.read, observations))
         known = self.known(observations)[:, None]
-        belief, offsets, now = self._belief(observations), self._offsets, self._start(observations)
+        covariance, offsets, now = self._covariance(observations), self._offsets, self._start(observations)
         too_close = self._too_close(observations)
         cost, stride = np.zeros_like(now.x), self.cruise * STEP
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
                 count = len(self._offsets)
-                now, belief, cost = now.repeated(count), belief.repeated(count), np.repeat(cost, count, axis=1)
+                now, covariance, cost = now.repeated(count), covariance.repeated(count), np.repeat(cost, count, axis=1)
                 offsets = np.tile(self._offsets, count)
-            bend = np.take_along_axis(way, np.searchsorted(bends, now.along, side="right") - 1, axis=1)
+            bend = np.take_along_axis(pieces, np.searchsorted(bends, now.along, side="right") - 1, axis=1)
             wanted = bend + np.where(offsets == 0.0, -np.arctan(now.aside / self.look_ahead), offsets)
             now, dx, dy = now.moved(wanted, bend, stride, self._sharpest * stride)
-            belief = belief.driven(dx, dy, self.drift * STEP, self.turn_drift * STEP)
+            covariance = covariance.driven(dx, dy, self.drift * STEP, self.turn_drift * STEP)
             place = np.stack([now.x, now.y], axis=-1)
             line = landmarks[:, None] - place[:, :, None]
-            bearing, radial, lateral = belief.along(line)
+            bearing, radial, lateral = covariance.along(line)
             odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
             camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
             odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, stride * (step + 1))
-            bend_variance = BENT * radial * lateral / np.maximum((line**2).sum(axis=-1), 0.01) ** 2
-            belief = belief.measured(line, (self.bearing + bend_variance) / (self.frames * STEP), odds)
-            cost = cost + STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
+            linearisation_variance = BENT * radial * lateral / np.maximum((line**2).sum(axis=-1), 0.01) ** 2
+            covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
+            cost = cost + STEP * self.price * np.maximum(covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
             cost = cost + STEP * CLOSE * too_close(place, STEP * (step + 1))
-        later = belief.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
+        later = covariance.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
         cost = cost + self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / self.cruise + BACK * np.abs(now.aside))
 
     def _too_close(self, observations: np.ndarray) -> Callable[[np.ndarray, float], np.ndarray]:
-        """Return what tells of places, (rows, plans, 2), how much closer they are than allowed, (rows, plans) in m.
+        """Return a function of places (rows, plans, 2) and a time (s), with the missing distance to vehicles, m.
 
-        After a time, s. Those that are heard are expected to go straight on at the speed `cruise`.
+        Vehicles with a received message are expected to drive straight on at the speed `cruise`.
         """
         if "message_mask" not in self.layout:
             return lambda place, time: np.zeros(place.shape[:2])
-        mask, others, forward = self.heard(observations)
+        mask, others, forward = self.received(observations)
         keep = np.broadcast_to(self.distance_to_keep(observations), len(observations))
 
         def too_close(place: np.ndarray, time: float) -> np.ndarray:
@@ -168,27 +168,27 @@ class LookAhead(RouteFollower):
         aside = np.repeat(self.read(observations, "route_offset"), shape[1], axis=1)
         return _Path(x, y, heading, along, aside)
 
-    def _way(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the directions of the pieces of the way, (rows, P), rad, own frame, and where they begin, (P,), m."""
-        points, distance = self.way_ahead(observations)
+    def _route_pieces(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the directions of the pieces of the route (rows, P), rad, own frame, and where they begin, (P,), m."""
+        points, distance = self.route_points(observations)
         heading = -self.read(observations, "route_heading")[:, 0]
         leg = np.diff(points[:, 1:], axis=1)
         ahead = np.arctan2(leg[..., 1], leg[..., 0])
         return np.column_stack([heading, ahead]), distance[:-1]
 
-    def _belief(self, observations: np.ndarray) -> Belief:
-        """Return the covariance as far as the observation tells of it, (rows, 1)."""
+    def _covariance(self, observations: np.ndarray) -> PlanarCovariance:
+        """Return the covariance as far as the observation holds it, (rows, 1)."""
         axes, heading = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         none = np.zeros_like(heading)
-        return Belief(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, heading**2)
+        return PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, heading**2)
 
 
 class Peek(RouteFollower):
-    """The route follower, but where its position is uncertain it turns off its way to see more landmarks of the map.
+    """The route follower, which turns off its route to see more landmarks of the map where its position is uncertain.
 
     It takes the smallest of a few headings from which most of the known landmarks would be in view a moment later, past
-    buildings and the vehicles that it hears, and none that leads farther from the way once it is too far from it. With
-    a camera that pans it turns that instead.
+    buildings and vehicles with a received message, and none that leads farther from the route once it is too far off.
+    With a camera that pans it turns that instead.
     """
 
     needs = ("position_std", "map_position", "route_heading", "route_offset")
@@ -202,7 +202,7 @@ class Peek(RouteFollower):
             scenario: of the environment.
             threshold: standard deviation of the position from which on it peeks, m.
             ahead: how far ahead the view is predicted, m; in proportion farther for a car that is longer than `SMALL`.
-            farthest: offset from the way from which on it does not lead farther away, m.
+            farthest: offset from the route from which on it does not lead farther away, m.
         """
         super().__init__(scenario)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
@@ -220,7 +220,7 @@ class Peek(RouteFollower):
         return speed, np.where(offset == 0.0, along, self.pursue(offset - heading))
 
     def offset(self, observations: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        """Return the heading, (rows,) in rad from the way's, from which most landmarks would be in view."""
+        """Return the heading, (rows,) in rad relative to the route, from which most landmarks would be in view."""
         landmarks = self.read(observations, "map_position")[..., :2]
         aside = self.read(observations, "route_offset")
         offsets = np.array([offset for offset in OFFSETS if not self.pans or abs(offset) <= self.pans])

@@ -95,7 +95,7 @@ def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str,
         before = f"it was trained with another {what}: '{name}'"
         if name not in here:
             raise CoopenvError(f"{before} is not in this environment")
-        pairs = zip(entry.told().items(), here[name].told().values(), strict=True)
+        pairs = zip(entry.signature().items(), here[name].signature().values(), strict=True)
         for (key, value), now in pairs:
             if value != now if isinstance(value, str) else not np.isclose(value, now, rtol=1e-9):
                 raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")

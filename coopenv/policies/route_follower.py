@@ -1,4 +1,4 @@
-"""The baseline: along the way at full speed, giving way to the vehicles that it hears."""
+"""The baseline: along the route at full speed, giving way to vehicles whose messages it receives."""
 
 from abc import ABC, abstractmethod
 
@@ -14,7 +14,7 @@ SMALL = (0.586, 0.25)
 """Length and width, m, of the car that distances are chosen for (SVEA); they grow with larger ones."""
 
 PURSUED = 5.0
-"""Decisions in which one gets to the point that is pursued, at least: one steers before one is past it."""
+"""Decisions, at least, until a vehicle reaches the pursued point, so that it steers before it is past it."""
 
 
 class Driver(ABC):
@@ -29,7 +29,7 @@ class Driver(ABC):
         Args:
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m (None: 1 m, or more where cars are fast).
+            look_ahead: distance of the pursued point of the route, m (None: 1 m, or more where cars are fast).
 
         Raises:
             ValueError: the observation lacks a field, or the environment does not take speeds.
@@ -37,9 +37,9 @@ class Driver(ABC):
         if scenario.action.longitudinal != "speed":
             raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
         self.layout = observation_layout(scenario)
-        known = {*self.layout, "way" if {"route_ahead", "goal"} & {*self.layout} else ""}
-        if missing := [name for name in (*self.needs, "way") if name not in known]:
-            raise ValueError(f"the observation lacks {', '.join(missing)} (way: the group route or goal)")
+        known = {*self.layout, "route" if {"route_ahead", "goal"} & {*self.layout} else ""}
+        if missing := [name for name in (*self.needs, "route") if name not in known]:
+            raise ValueError(f"the observation lacks {', '.join(missing)} (route: the group route or goal)")
         self.cruise = self.layout.action[0].high if cruise is None else cruise
         least = PURSUED * self.cruise / scenario.rates.decision
         self.look_ahead = max(1.0, least) if look_ahead is None else look_ahead
@@ -59,7 +59,7 @@ class Driver(ABC):
         actions = np.zeros((len(observations), len(self.layout.action)), dtype=np.float32)
         wanted = self.drive(np.asarray(observations, dtype=np.float32))
         for k, (field, values) in enumerate(zip(self.layout.action, wanted, strict=False)):
-            actions[:, k] = np.clip(2.0 * (values - field.low) / (field.high - field.low) - 1.0, -1.0, 1.0)
+            actions[:, k] = np.clip(field.level(values), -1.0, 1.0)
         return actions
 
     def read(self, observations: np.ndarray, name: str) -> np.ndarray:
@@ -72,10 +72,10 @@ class Driver(ABC):
             return self.read(observations, "map_mask") > 0.5
         return np.ones((len(observations), self.layout["map_position"].shape[0]), dtype=bool)
 
-    def way_ahead(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return points of the way ahead, (rows, P, 2), m, in the own frame, and how far along it they are, (P,), m.
+    def route_points(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points of the route ahead, (rows, P, 2), m, own frame, and their arc lengths from here, (P,), m.
 
-        The first is the vehicle's own place. Without the group `route` the way leads straight to the goal.
+        The first is the vehicle's own place. Without the group `route` the route leads straight to the goal.
         """
         distance = np.concatenate([[0.0], self._distances])
         if "route_ahead" in self.layout:
@@ -87,8 +87,8 @@ class Driver(ABC):
         return np.concatenate([np.zeros((len(points), 1, 2)), points], axis=1), distance
 
     def direction(self, observations: np.ndarray) -> np.ndarray:
-        """Return the direction, (rows,) in rad from straight ahead, of the point of the way that is pursued."""
-        points, distance = self.way_ahead(observations)
+        """Return the direction, (rows,) in rad from straight ahead, of the pursued point of the route."""
+        points, distance = self.route_points(observations)
         place = int(np.clip(np.searchsorted(distance, self.look_ahead), 1, len(distance) - 1))
         share = np.clip((self.look_ahead - distance[place - 1]) / (distance[place] - distance[place - 1]), 0.0, 1.0)
         point = points[:, place - 1] + share * (points[:, place] - points[:, place - 1])
@@ -124,16 +124,16 @@ GAP = 0.25
 """m, between bodies."""
 
 SOON = 1.0
-"""s; cars that stop within this drive at full speed or stand; others are on the way between the two for long."""
+"""s; cars that stop within this drive at full speed or stand; slower cars are long between the two."""
 
 REACTION = 0.5
 """s; cars that stop slowly look ahead for as long as stopping takes and this: their guesses are good for no longer."""
 
 
 class RouteFollower(Driver):
-    """Pure pursuit of the way by the vehicle's own estimate; stops where driving on would come too close to others.
+    """Pure pursuit of the route by the vehicle's own estimate; stops where driving on comes too close to vehicles.
 
-    In the leader-follower order a vehicle hears its leaders only, so giving way to whomever one hears cannot deadlock.
+    In the leader-follower order a vehicle receives from its leaders only, so giving way to senders cannot deadlock.
     """
 
     def __init__(
@@ -151,10 +151,10 @@ class RouteFollower(Driver):
         Args:
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m (None: see `Driver`).
-            clearance: distance to keep between reference points, m, where it does not know how sure it is of its own.
-            closest: distance to keep where it is sure, m; its standard deviation is added, up to `clearance`.
-                Both are at least what keeps cars `GAP` apart of which one stands across the other's way.
+            look_ahead: distance of the pursued point of the route, m (None: see `Driver`).
+            clearance: distance to keep between reference points, m, without a standard deviation of the own position.
+            closest: distance to keep at a certain position, m; its standard deviation is added, up to `clearance`.
+                Both are at least the distance of perpendicular cars `GAP` apart.
             foresight: how far ahead to look for others, s (None: 6 s, or less where cars stop slowly, see `REACTION`).
         """
         super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
@@ -169,8 +169,8 @@ class RouteFollower(Driver):
         """See `Driver.drive`."""
         return self.speed(observations), self.pursue(self.direction(observations))
 
-    def heard(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which others are heard, (rows, M), and their places and directions, (rows, M, 2), in the own frame."""
+    def received(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the senders of received messages, (rows, M), their places and directions, (rows, M, 2), own frame."""
         mask = self.read(observations, "message_mask") > 0.5
         place, forward = (self.read(observations, f"message_{name}")[..., :2] for name in ("position", "forward"))
         return mask, place, forward
@@ -182,8 +182,8 @@ class RouteFollower(Driver):
         """
         if "message_mask" not in self.layout:
             return np.full(len(observations), self.cruise)
-        mask, place, forward = self.heard(observations)
-        points, distance = self.way_ahead(observations)
+        mask, place, forward = self.received(observations)
+        points, distance = self.route_points(observations)
         velocities = [pace * self.cruise * forward for pace in self.paces]
 
         def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -195,7 +195,7 @@ class RouteFollower(Driver):
         return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
 
     def distance_to_keep(self, observations: np.ndarray) -> np.ndarray | float:
-        """Return how far from others to stay, m, one or (rows,): farther, the less sure one is of one's own place."""
+        """Return the distance to keep, m, one or (rows,): it grows with the standard deviation of the own position."""
         if "position_std" not in self.layout:
             return self.clearance
         std = 10.0 ** self.read(observations, "position_std")[:, 0]
@@ -205,14 +205,14 @@ class RouteFollower(Driver):
 def nearest(
     path: np.ndarray, times: np.ndarray, place: np.ndarray, velocity: np.ndarray, mask: np.ndarray, until: float
 ) -> np.ndarray:
-    """Return how near others come, (rows,) in m; infinite where there is nobody.
+    """Return the closest approach of other vehicles, (rows,) in m; infinite without any.
 
     Args:
-        path: (rows, P, 2), m, one's own places at these times, between which one drives straight, and on beyond.
+        path: (rows, P, 2), m, own places at these times, with straight lines between and after them.
         times: (P,), s.
         place: (rows, M, 2), m, of others now.
         velocity: (rows, M, 2), m/s, of others.
-        mask: (rows, M) who counts.
+        mask: (rows, M), which vehicles count.
         until: s.
     """
     found = np.full(len(path), np.inf)
@@ -231,10 +231,10 @@ def nearest(
 
 
 class IntelligentDriver(RouteFollower):
-    """Pure pursuit of the way, at the speed that keeps a time gap to the nearest vehicle heard on it.
+    """Pure pursuit of the route, at the speed that keeps a time gap to the nearest sender on it.
 
     Source: Treiber, Hennecke and Helbing, Congested traffic states in empirical observations and microscopic
-    simulations, Physical Review E 62, 2000. It knows of no right of way: vehicles that cross its way count once they
+    simulations, Physical Review E 62, 2000. It has no rules of priority: vehicles that cross its route count once they
     are on it.
     """
 
@@ -257,12 +257,12 @@ class IntelligentDriver(RouteFollower):
         Args:
             scenario: of the environment.
             cruise: desired speed, m/s (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m (None: see `Driver`).
+            look_ahead: distance of the pursued point of the route, m (None: see `Driver`).
             time_gap: to the vehicle ahead, s.
             standstill_gap: between bumpers, m.
             acceleration: largest, m/s^2.
             deceleration: comfortable, m/s^2.
-            half_width: distance from the way within which a vehicle is on it, m.
+            half_width: distance from the route within which a vehicle is on it, m.
         """
         super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
         self.time_gap, self.standstill_gap, self.half_width = time_gap, standstill_gap, half_width
@@ -284,9 +284,9 @@ class IntelligentDriver(RouteFollower):
         return np.asarray(np.clip(own + acceleration * self.period, 0.0, self.cruise))
 
     def _ahead(self, observations: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gap to the nearest vehicle on the way, (rows,) in m, and how fast it closes, m/s."""
-        mask, place, forward = self.heard(observations)
-        points, distance = self.way_ahead(observations)
+        """Return the gap to the nearest vehicle on the route, (rows,) in m, and how fast it closes, m/s."""
+        mask, place, forward = self.received(observations)
+        points, distance = self.route_points(observations)
         gap, closing = np.full(len(own), np.inf), np.zeros(len(own))
         for k in range(len(distance) - 1):
             leg = points[:, k + 1] - points[:, k]

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from coopenv.base.lazy import lazy_names
+from coopenv.base import lazy_names
 
 if TYPE_CHECKING:
     from coopenv.runs.recorder import record

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, error_text
 from coopenv.runs.reels import FAULTS, Reel
 from coopenv.runs.video import MAX_FPS
 from coopenv.viz.scene import Frame, Stage
@@ -169,7 +169,9 @@ class Viewer:
                 else:
                     getattr(self, f"_wish_{name}")(value)
             except Exception as error:  # a wish never ends the view
-                self._panel.set_status(f"That cannot be: {error if isinstance(error, CoopenvError) else told(error)}")
+                self._panel.set_status(
+                    f"That cannot be: {error if isinstance(error, CoopenvError) else error_text(error)}"
+                )
         return any_wish
 
     def _set_playing(self, playing: bool) -> None:

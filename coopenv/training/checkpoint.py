@@ -1,7 +1,7 @@
 """Checkpoints: all that the next update depends on, in one file without pickle. Needs the extra `train`.
 
 A safetensors file of arrays, whose header holds the plan, how far the training is, and its curve. It is replaced as a
-whole, so that whoever is killed while writing finds the one before.
+whole, so that a run that is killed while writing keeps the one before.
 """
 
 import json
@@ -92,8 +92,8 @@ def read(path: Path) -> Checkpoint:
         if header["format"] != FORMAT:
             raise CoopenvError(f"{path}: a checkpoint of format {header['format']}, expected {FORMAT}")
         plan = Plan.of_document(header["plan"])
-        told = header["progress"]
-        progress = {"steps": int(told["steps"]), **{name: float(told[name]) for name in ("seconds", "cpu_seconds")}}
+        counts = header["progress"]
+        progress = {"steps": int(counts["steps"]), **{name: float(counts[name]) for name in ("seconds", "cpu_seconds")}}
         logs = header.get("logs")  # checkpoints of before there was such an entry go on without
         outputs = Outputs(bool(header.get("onnx")), None if logs is None else Path(logs))
         return Checkpoint(path, plan, header["scenario"], progress, header["curve"], arrays, outputs)

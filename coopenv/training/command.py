@@ -22,7 +22,7 @@ from coopenv.training.settings import Plan
 from coopenv.training.trainer import DivergedError, Status, Trainer
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
-"""Of files that an agent's folder can hold; a card tells of one agent only, and goes with it."""
+"""Names of files in an agent's folder; a card belongs to a single agent, and is removed with it."""
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
@@ -30,14 +30,14 @@ WHILE_LEARNING = 2**30
 
 @dataclass(frozen=True)
 class Reports:
-    """Who is told while a training goes on."""
+    """Callbacks of a training."""
 
     status: Callable[[Status], None] = lambda status: None
     """After every update."""
     judged: Callable[[int, list[Result]], None] = lambda steps, results: None
     """After every look at held-out maps: decisions of vehicles so far, and figures."""
     cloning: Callable[[str], None] = lambda line: None
-    """Before the first update, where another driver is cloned: what is being done, and how far it is."""
+    """Before the first update, where another driver is cloned: a line on the progress."""
 
 
 def resumed_plan(out: Path) -> Plan:
@@ -55,7 +55,7 @@ def possible(plan: Plan) -> Scenario:
     """Return the scenario of a training, before anything is made.
 
     Raises:
-        CoopenvError: nobody is driven there, or the driver to begin as lacks what it needs to see.
+        CoopenvError: no vehicle is driven there, or the driver to begin as lacks what it needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not scenario.driven:
@@ -89,7 +89,7 @@ def train(
         onnx: also write an ONNX model.
         logs: folder for TensorBoard.
         force: let the new agent, once it is finished, take the place of one that is there.
-        reports: who is told.
+        reports: callbacks.
 
     Returns:
         The results on held-out maps, as in `agent.toml`.
@@ -100,7 +100,7 @@ def train(
         OutputError: there is an agent that is not to be replaced, or a `train.toml` of the user's with other settings,
             or something cannot be written; the last checkpoint stays.
     """
-    tell, path = reports or Reports(), out / CHECKPOINT_FILE
+    report, path = reports or Reports(), out / CHECKPOINT_FILE
     scenario = possible(plan)
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():
@@ -122,11 +122,11 @@ def train(
         if kept is not None:
             checkpoint.restore(kept, trainer)
         else:
-            trainer.begin(tell.cloning)
+            trainer.begin(report.cloning)
         worlds = plan.settings.evaluation.final_worlds
         with _kept_from_before(path):
-            _learn(trainer, path, curve, outputs, threads, tell)
-            results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
+            _learn(trainer, path, curve, outputs, threads, report)
+            results = _judge(trainer, held_out_seeds(0, worlds), threads, report)
         with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
             files.write(folder, out, plan, trainer.environment.name)
             export(folder, trainer, results, curve, outputs.onnx)
@@ -153,7 +153,7 @@ def _learn(
     curve: list[dict[str, float]],
     outputs: checkpoint.Outputs,
     threads: int | None,
-    tell: Reports,
+    report: Reports,
 ) -> None:
     """Update until the budget is spent; judge and write a checkpoint every so often."""
     evaluation = trainer.plan.settings.evaluation
@@ -162,10 +162,10 @@ def _learn(
     while trainer.status.share < 1.0:
         before = trainer.status.steps // evaluation.every
         status = trainer.update()
-        tell.status(status)
+        report.status(status)
         if status.steps // evaluation.every > before and status.share < 1.0:
             seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
-            means = {result.metric: result.mean for result in _judge(trainer, seeds, threads, tell)}
+            means = {result.metric: result.mean for result in _judge(trainer, seeds, threads, report)}
             trainer.record(means)
             curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
             _save(trainer, path, curve, outputs)
@@ -176,12 +176,12 @@ def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]], outputs: 
     interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
 
 
-def _judge(trainer: Trainer, seeds: list[int], threads: int | None, tell: Reports) -> list[Result]:
+def _judge(trainer: Trainer, seeds: list[int], threads: int | None, report: Reports) -> list[Result]:
     """Return how the mean action drives in held-out worlds."""
     engine = Engine(trainer.scenario, len(seeds), threads=threads)
     try:
         results = score(drive(engine, trainer.mean_action, seeds))
     finally:
         engine.close()
-    tell.judged(trainer.status.steps, results)
+    report.judged(trainer.status.steps, results)
     return results

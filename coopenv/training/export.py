@@ -84,8 +84,8 @@ def command_of(trainer: Trainer) -> str:
 def scenario_digest(scenario: Scenario) -> str:
     """Return the first 16 hexadecimal digits of SHA-256 over what a scenario sets, whatever it is called."""
     aside = {"title", "description", "source", *(["difficulty"] if scenario.difficulty.neutral else [])}
-    told = scenario.model_dump_json(exclude=aside, exclude_defaults=True)
-    return sha256(told.encode()).hexdigest()[:16]
+    text = scenario.model_dump_json(exclude=aside, exclude_defaults=True)
+    return sha256(text.encode()).hexdigest()[:16]
 
 
 def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:

@@ -73,7 +73,7 @@ def _says(path: Path, plan: Plan, environment: str) -> bool:
 
 
 def _is_the_agents(path: Path) -> bool:
-    """Return whether `coopenv train` has written a file, and nobody has changed it since."""
+    """Return whether `coopenv train` has written a file that was not changed since."""
     try:
         card: dict[str, Any] = tomllib.loads((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
         known = card["training"].get("settings")  # earlier versions noted none
@@ -83,10 +83,10 @@ def _is_the_agents(path: Path) -> bool:
 
 
 class EnvironmentFile(NamedTuple):
-    """What an agent's folder tells of its environment."""
+    """The environment as an agent's folder holds it."""
 
     title: str
-    """What people call it."""
+    """Its name in texts."""
     name: str
     """By which `agent.toml` names it: one of coopenv's, or a file beside `agent.toml`."""
     text: str | None = None

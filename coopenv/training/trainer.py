@@ -67,9 +67,9 @@ class Watch(BaseCallback):
         self._ended: deque[dict[str, Any]] = deque(maxlen=EPISODES)
 
     def _on_step(self) -> bool:
-        told = self._env.batch_infos
-        counts = self._env.acted & (told["time"] > SETTLED_FROM)
-        self._errors.append(told["position_error"][counts])
+        infos = self._env.batch_infos
+        counts = self._env.acted & (infos["time"] > SETTLED_FROM)
+        self._errors.append(infos["position_error"][counts])
         self._ended.extend(self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]))
         return True
 
@@ -137,7 +137,7 @@ class NormalisedEnv(VecEnvWrapper):
         return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
 
     def reset(self) -> np.ndarray:
-        """Start new episodes, or go on where told to."""
+        """Start new episodes, or continue with given observations."""
         if self._present is not None:
             present, self._present = self._present, None
             return present
@@ -146,7 +146,7 @@ class NormalisedEnv(VecEnvWrapper):
         return self.normalise(observations)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step, and learn the statistics of what vehicles under way see."""
+        """Step, and update the statistics of the observations of vehicles under way."""
         observations, rewards, dones, infos = self.venv.step_wait()
         if self.venv.acted.any():
             self.statistics.update(observations[self.venv.acted])
@@ -165,23 +165,23 @@ def clone(
     gamma: float,
     reward_scale: float,
     seed: int,
-    tell: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Fit the mean action to what a driver does, and the value to the discounted rewards that follow.
+    """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
-    What it saw also becomes the first of the statistics by which observations are normalised. The noise that is added
-    to its actions shows how it mends deviations (Laskey et al. 2017).
+    Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that its
+    corrections of deviations are recorded (Laskey et al. 2017).
 
     Args:
         policy: to be fitted.
         env: whose statistics are to be filled.
-        settings: whom to watch, and for how long.
+        settings: driver and number of episodes.
         gamma: discount per decision.
         reward_scale: of the rewards that the value is to predict.
         seed: of the worlds, the noise and the order of rows.
-        tell: called with what is being done, and how far it is.
+        report: called with a line on the progress.
     """
-    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed, tell)
+    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed, report)
     env.statistics.update(raw)
     observations = torch.from_numpy(env.normalise(raw))
     targets = torch.from_numpy(actions.astype(np.float32))
@@ -189,7 +189,7 @@ def clone(
     optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
     for epoch in range(settings.epochs):
-        tell(f"learning from {settings.agent}: pass {epoch + 1} of {settings.epochs}")
+        report(f"learning from {settings.agent}: pass {epoch + 1} of {settings.epochs}")
         for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
             latent_policy, latent_value = policy.mlp_extractor(observations[rows])
             action_error = policy.action_net(latent_policy) - targets[rows]
@@ -201,7 +201,7 @@ def clone(
 
 
 def watch(
-    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, tell: Callable[[str], None]
+    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, report: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
     scenario = like.scenario
@@ -214,7 +214,7 @@ def watch(
     under_way = np.ones(env.num_envs, dtype=bool)
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
-        tell(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
+        report(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
         action = decide(driver, observation, len(action_fields(scenario)))
         tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way
@@ -230,7 +230,7 @@ def watch(
 
 
 TORCH_REFUSES = "Expected parameter"
-"""So begins what torch says of a distribution whose parameters are not finite."""
+"""Beginning of torch's error for a distribution with parameters that are not finite."""
 
 
 class DivergedError(CoopenvError):
@@ -295,8 +295,8 @@ class Trainer:
         """Write for TensorBoard from now on, to a folder that is there."""
         self.model.set_logger(configure(folder, ["tensorboard"]))
 
-    def begin(self, tell: Callable[[str], None] = lambda line: None) -> None:
-        """Clone another driver, where the settings say so, and start the first episodes; `tell` hears how far it is."""
+    def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
+        """Clone another driver, if settings name one, and start the first episodes; `report` gets progress lines."""
         settings = self.plan.settings
         if settings.clone is not None:
             clone(
@@ -304,7 +304,7 @@ class Trainer:
                 gamma=settings.ppo.gamma,
                 reward_scale=settings.ppo.reward_scale,
                 seed=self.plan.seed,
-                tell=tell,
+                report=report,
             )
         self.env.start()
 
@@ -323,7 +323,7 @@ class Trainer:
         return self.status
 
     def mean_action(self, observations: np.ndarray) -> np.ndarray:
-        """Return what the policy does without exploring, (rows, A), where it observes (rows, D).
+        """Return the policy's actions without exploration, (rows, A), where it observes (rows, D).
 
         Raises:
             DivergedError: it is not finite.
@@ -333,7 +333,7 @@ class Trainer:
 
     @contextmanager
     def _finite(self) -> Iterator[None]:
-        """Say in one line that a policy is no longer finite, which torch finds out when it draws actions, or nobody."""
+        """Raise an error of one line for a policy that is not finite, which torch notices only as it draws actions."""
         try:
             yield
         except ValueError as error:
@@ -345,9 +345,9 @@ class Trainer:
 
     def _diverged(self) -> DivergedError:
         names = ("learning_rate", "initial_std", "reward_scale", "max_gradient")
-        told = [f"ppo.{name} = {getattr(self.plan.settings.ppo, name):g}" for name in names]
+        values = [f"ppo.{name} = {getattr(self.plan.settings.ppo, name):g}" for name in names]
         when = f"after {self.model.num_timesteps} steps the policy is not finite"
-        return DivergedError(f"the training diverged: {when}; look at {', '.join(told)}")
+        return DivergedError(f"the training diverged: {when}; look at {', '.join(values)}")
 
     @property
     def status(self) -> Status:

@@ -9,8 +9,8 @@ from coopenv.api.engine import Engine
 from coopenv.base.installation import list_agents
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent, restart
-from coopenv.policies.belief import Belief, FieldOfView
 from coopenv.policies.look_ahead import LookAhead, Peek
+from coopenv.policies.prediction import FieldOfView, PlanarCovariance
 from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost, nearest
 from coopenv.scenario import load_scenario
 from tests.helpers.square import GROUPS, square
@@ -170,7 +170,7 @@ def test_beliefs_are_those_of_a_kalman_filter() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
     P = root @ root.T
-    belief = Belief(*(np.array([P[i, j]]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
+    belief = PlanarCovariance(*(np.array([P[i, j]]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
     dx, dy, landmarks = 0.4, -0.3, np.array([[[2.0, 1.0], [-1.0, 3.0], [4.0, 4.0]]])
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     P = F @ P @ F.T + np.diag([0.01, 0.01, 0.002])
@@ -194,7 +194,7 @@ def test_beliefs_are_those_of_a_kalman_filter() -> None:
 
 def test_a_bearing_that_may_be_missing_counts_by_its_odds() -> None:
     none = np.zeros(1)
-    belief = Belief(np.ones(1), none, none, np.full(1, 2.0), none, np.full(1, 0.1))
+    belief = PlanarCovariance(np.ones(1), none, none, np.full(1, 2.0), none, np.full(1, 0.1))
     line, variance = np.array([[[3.0, 1.0]]]), np.full((1, 1), 0.001)
     never, maybe, surely = (belief.measured(line, variance, np.full((1, 1), odds)) for odds in (0.0, 0.3, 1.0))
     np.testing.assert_allclose(np.array(maybe), 0.7 * np.array(never) + 0.3 * np.array(surely), atol=1e-12)
@@ -223,7 +223,7 @@ def test_what_is_needed_is_named() -> None:
     with pytest.raises(ValueError, match=r"agent 'peek' cannot be built: the observation lacks map_position "):
         load_agent("peek", few)
     nowhere = square(observation={"include": ["odometry"]})
-    with pytest.raises(ValueError, match=r"the observation lacks way \(way: the group route or goal\)"):
+    with pytest.raises(ValueError, match=r"the observation lacks route \(route: the group route or goal\)"):
         load_agent("constant_speed", nowhere)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import load_agent
-from coopenv.policies.belief import Box, Occluders, unhidden
 from coopenv.policies.look_ahead import LookAhead
+from coopenv.policies.prediction import Occluder, Occluders, unhidden
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.square import GROUPS, square
 from tests.oracles.geometry import is_occluded
@@ -31,17 +31,17 @@ def test_boxes_hide_what_the_oracle_says() -> None:
     angle, center = rng.uniform(-np.pi, np.pi, rows), rng.uniform(-2.0, 2.0, (rows, 2))
     forward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     below = (top - camera_height) / (height - camera_height)
-    box = Box(center, forward, (0.8, 0.3), below, rng.uniform(size=rows) < 0.8, moves=True)
+    box = Occluder(center, forward, (0.8, 0.3), below, rng.uniform(size=rows) < 0.8, moves=True)
     camera, points = rng.uniform(-3.0, 3.0, (rows, 3, 2)), rng.uniform(-3.0, 3.0, (rows, 5, 2))
     seen = rng.uniform(size=(rows, 3, 5)) < 0.9
-    found = seen & ~unhidden([box], seen, camera, points, way=0.7)
+    found = seen & ~unhidden([box], seen, camera, points, distance=0.7)
     for r, p, k in np.ndindex(found.shape):
         place = [*(center[r] + 0.7 * forward[r]), 0.0]  # down to -0.5 m, which no line of sight reaches
         line = [*camera[r, p], camera_height], [*points[r, k], height]
         expected = is_occluded(*np.array(line), place, turn(angle[r]), np.array([0.8, 0.3, top]))
         assert found[r, p, k] == (expected and box.there[r] and seen[r, p, k])
     assert 0.1 < found.mean() < 0.6
-    assert (unhidden([], seen, camera, points, way=0.0) == seen).all()
+    assert (unhidden([], seen, camera, points, distance=0.0) == seen).all()
 
 
 def test_boxes_are_those_of_the_map_and_the_messages() -> None:

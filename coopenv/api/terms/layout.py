@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,8 +51,8 @@ class ActionField:
     low: float  # what -1 asks for
     high: float  # what 1 asks for
 
-    def level(self, value: float) -> float:
-        """Return the entry of an action that asks for a value in the field's unit; beyond [-1, 1] if out of reach."""
+    def level(self, value: Any) -> Any:
+        """Return the entry of an action for values in the unit of the field; beyond [-1, 1] if out of reach."""
         return 2.0 * (value - self.low) / (self.high - self.low) - 1.0
 
 

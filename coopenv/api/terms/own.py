@@ -146,8 +146,10 @@ class OwnTerms:
         except launch.KernelCacheError:
             raise
         except Exception as error:  # Warp raises various types
-            said = " ".join(part for part in str(error).split("\n;") if 'function "apply"' not in part)
-            raise CoopenvError(f"{term.title}: Warp cannot compile its function to return {expected}: {said}") from None
+            reason = " ".join(part for part in str(error).split("\n;") if 'function "apply"' not in part)
+            raise CoopenvError(
+                f"{term.title}: Warp cannot compile its function to return {expected}: {reason}"
+            ) from None
 
 
 @cache

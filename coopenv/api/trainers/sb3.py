@@ -46,7 +46,7 @@ class CooperativeSB3VecEnv(VecEnv):
     themselves hold the time parked too. `acted` says which rows were under way in the last step; `ActingRowsBuffer`
     lets PPO learn from these alone.
 
-    In other steps infos are empty. What the whole batch tells at every step stands in `batch_infos`, arrays by name.
+    In other steps infos are empty. Infos of the whole batch at every step are in `batch_infos`, arrays by name.
     """
 
     def __init__(self, envs: CooperativeVectorEnv) -> None:
@@ -239,13 +239,13 @@ class ActingRowsBuffer(RolloutBuffer):
         super().__init__(*arguments, **options)
 
     def reset(self) -> None:
-        """Forget what was collected."""
+        """Remove the collected steps."""
         self.generator_ready = False
         self.acted = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
         super().reset()
 
     def add(self, *step: Any, **named: Any) -> None:
-        """Take a step, and whose vehicles were under way in it."""
+        """Add a step, and which vehicles were under way in it."""
         self.acted[self.pos] = self._rows.acted
         super().add(*step, **named)
 

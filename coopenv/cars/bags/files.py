@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from coopenv.backends.mcap.format import CUT_OFF, MENDED, REPAIR, is_cut_off
-from coopenv.base.errors import CoopenvError, DataError, DataWarning, told
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
 from coopenv.cars import codec
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -110,7 +110,7 @@ class BagFile:
                 raise self._unreadable(error) from None
             read = (last - first) * 1e-9
             warnings.warn(
-                f"{self.path}: damaged after {read:.1f} s ({told(error)}); what came before it is used",
+                f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used",
                 DataWarning,
                 stacklevel=2,
             )
@@ -133,7 +133,7 @@ class BagFile:
             return DataError(f"{self.path}: {error}")
         repair = next((REPAIRS[part.suffix] for part in self._parts if part.suffix in REPAIRS), None)
         hint = f"; if its recording was cut off, `{repair}` mends it" if repair else ""
-        return DataError(f"{self.path}: cannot be read as a ROS bag ({told(error)}){hint}")
+        return DataError(f"{self.path}: cannot be read as a ROS bag ({error_text(error)}){hint}")
 
 
 def check_extra() -> None:

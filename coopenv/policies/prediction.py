@@ -1,7 +1,7 @@
-"""How certain a vehicle would be of its pose after driving somewhere: planar covariances, rolled forward.
+"""Predicted pose covariances of a vehicle along a plan, in the plane.
 
 Extended Kalman filter with bearings to known landmarks. Source: Thrun, Burgard and Fox, Probabilistic Robotics, 2005,
-3.3 and 7.5. What is measured does not matter, only from where, so the covariance of a plan is known beforehand;
+3.3 and 7.5. The covariance depends on where bearings are measured, not on their values, so it can be predicted;
 Prentice and Roy, The belief roadmap, International Journal of Robotics Research 28, 2009. Measurements that may be
 missing count by their odds; Sinopoli et al., Kalman filtering with intermittent observations, IEEE Transactions on
 Automatic Control 49, 2004.
@@ -21,7 +21,7 @@ from coopenv.scenario.sensing import Camera
 LEAST_ODDS = 0.02  # below them a bearing counts as missing
 
 
-class Belief(NamedTuple):
+class PlanarCovariance(NamedTuple):
     """Entries (...) of the covariance of x, y (m) and heading (rad), in any fixed frame."""
 
     xx: np.ndarray
@@ -31,7 +31,7 @@ class Belief(NamedTuple):
     yh: np.ndarray
     hh: np.ndarray
 
-    def driven(self, dx: np.ndarray, dy: np.ndarray, drift: float, turn_drift: float) -> "Belief":
+    def driven(self, dx: np.ndarray, dy: np.ndarray, drift: float, turn_drift: float) -> "PlanarCovariance":
         """Return the covariance after a motion by (dx, dy), m, along which the error grew.
 
         Args:
@@ -40,7 +40,7 @@ class Belief(NamedTuple):
             drift: m^2, growth of the variance per axis.
             turn_drift: rad^2, growth of the heading's variance.
         """
-        return Belief(
+        return PlanarCovariance(
             xx=self.xx - 2.0 * dy * self.xh + dy * dy * self.hh + drift,
             xy=self.xy + dx * self.xh - dy * self.yh - dx * dy * self.hh,
             xh=self.xh - dy * self.hh,
@@ -50,7 +50,7 @@ class Belief(NamedTuple):
         )
 
     def along(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return variances (..., K) of landmarks' bearing, rad^2, of their distance and of what is across it, m^2.
+        """Return variances (..., K) of landmarks' bearing, rad^2, of their distance and across it, m^2.
 
         Args:
             offset: (..., K, 2), m, from the vehicle to the landmarks.
@@ -63,7 +63,7 @@ class Belief(NamedTuple):
         bearing = lateral / distance**2 + 2.0 * (ux * yh - uy * xh) / distance + hh
         return np.maximum(bearing, 1e-8), np.maximum(radial, 1e-8), np.maximum(lateral, 1e-8)
 
-    def measured(self, offset: np.ndarray, variance: np.ndarray, odds: np.ndarray) -> "Belief":
+    def measured(self, offset: np.ndarray, variance: np.ndarray, odds: np.ndarray) -> "PlanarCovariance":
         """Return the expected covariance after bearings to landmarks, any of which may be missing.
 
         One after the other, the covariance falls by the share `odds` of what the bearing would take off it.
@@ -80,9 +80,9 @@ class Belief(NamedTuple):
         for k in range(count):
             rows = np.flatnonzero(odds[:, k] > LEAST_ODDS)
             if len(rows):
-                own = Belief(*parts[:, rows])
+                own = PlanarCovariance(*parts[:, rows])
                 parts[:, rows] = own._with_bearing(offset[rows, k], variance[rows, k], odds[rows, k])
-        return Belief(*(part.reshape(shape) for part in parts))
+        return PlanarCovariance(*(part.reshape(shape) for part in parts))
 
     def _with_bearing(self, offset: np.ndarray, variance: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, ...]:
         square = np.maximum((offset**2).sum(axis=-1), 0.01)
@@ -100,9 +100,9 @@ class Belief(NamedTuple):
             self.hh - gain * h * h,
         )
 
-    def repeated(self, count: int) -> "Belief":
+    def repeated(self, count: int) -> "PlanarCovariance":
         """Return every entry (rows, P) so many times in a row, (rows, P count)."""
-        return Belief(*(np.repeat(part, count, axis=1) for part in self))
+        return PlanarCovariance(*(np.repeat(part, count, axis=1) for part in self))
 
     @property
     def std(self) -> np.ndarray:
@@ -114,7 +114,7 @@ Read = Callable[[str], np.ndarray]
 """Returns a field of the observations in its unit, (rows, *shape)."""
 
 
-class Box(NamedTuple):
+class Occluder(NamedTuple):
     """An upright box in the own frame of every row."""
 
     center: np.ndarray
@@ -135,7 +135,7 @@ class Occluders:
     """The boxes that stand between a camera and landmarks; in the plane, with landmarks at their mean height."""
 
     def __init__(self, scenario: Scenario, layout: Mapping[str, object]) -> None:
-        """Learn sizes and the places of buildings; what the observation does not tell is left out."""
+        """Take sizes of vehicles and places of buildings, as far as the observation has the fields for them."""
         bodies = [vehicle.body for vehicle in scenario.vehicles]
         self._sizes: list[Body | None] = []
         if {"message_position", "message_forward", "message_mask"} <= {*layout}:
@@ -149,15 +149,15 @@ class Occluders:
         heights += [sum(group.height) / 2 for group in scenario.landmark_groups for _ in range(group.count)]
         self._rise = max(float(np.mean(heights)) - self._camera, 1e-6) if heights else 1e-6
 
-    def boxes(self, read: Read) -> list[Box]:
-        """Return the boxes that each row knows of."""
+    def boxes(self, read: Read) -> list[Occluder]:
+        """Return the boxes in each row's observation."""
         found = [*self._vehicles(read), *self._houses(read)]
         return [box for box in found if box.below > 0.0 and box.there.any()]
 
     def _below(self, top: float) -> float:
         return min((top - self._camera) / self._rise, 1.0)
 
-    def _vehicles(self, read: Read) -> Iterator[Box]:
+    def _vehicles(self, read: Read) -> Iterator[Occluder]:
         for slot, body in enumerate(self._sizes):
             if body is None:
                 continue
@@ -167,9 +167,9 @@ class Occluders:
             center = read("message_position")[:, slot, :2] + body.center[0] * forward + body.center[1] * left
             half = body.size[0] / 2, body.size[1] / 2
             below = self._below(body.center[2] + body.size[2] / 2)
-            yield Box(center, forward, half, below, read("message_mask")[:, slot] > 0.5, moves=True)
+            yield Occluder(center, forward, half, below, read("message_mask")[:, slot] > 0.5, moves=True)
 
-    def _houses(self, read: Read) -> Iterator[Box]:
+    def _houses(self, read: Read) -> Iterator[Occluder]:
         if not self._buildings:
             return
         place, ahead = read("estimate_position")[:, :2], read("estimate_forward")[:, :2]
@@ -180,14 +180,16 @@ class Occluders:
             forward = turn @ np.array([np.cos(house.yaw), np.sin(house.yaw)])
             half, top = (house.size[0] / 2, house.size[1] / 2), house.center[2] + house.size[2] / 2
             there = np.ones(len(place), dtype=bool)
-            yield Box(np.einsum("rij,rj->ri", turn, center), forward, half, self._below(top), there, moves=False)
+            yield Occluder(np.einsum("rij,rj->ri", turn, center), forward, half, self._below(top), there, moves=False)
 
 
 def _footprint(body: Body | None) -> float:
     return body.size[0] * body.size[1] if body else 0.0
 
 
-def unhidden(boxes: list[Box], seen: np.ndarray, camera: np.ndarray, points: np.ndarray, way: float) -> np.ndarray:
+def unhidden(
+    boxes: list[Occluder], seen: np.ndarray, camera: np.ndarray, points: np.ndarray, distance: float
+) -> np.ndarray:
     """Return which points in view no box hides, (rows, P, K) bool.
 
     Args:
@@ -195,7 +197,7 @@ def unhidden(boxes: list[Box], seen: np.ndarray, camera: np.ndarray, points: np.
         seen: (rows, P, K), which points are in view without the boxes.
         camera: (rows, P, 2), m, where the camera is.
         points: (rows, K, 2), m.
-        way: m that boxes which move have gone on.
+        distance: m that moving boxes have driven since the observation.
     """
     place = np.nonzero(seen)  # few
     row, plan, point = place
@@ -203,7 +205,7 @@ def unhidden(boxes: list[Box], seen: np.ndarray, camera: np.ndarray, points: np.
     line = points[row, point] - start
     blocked = np.zeros(len(row), dtype=bool)
     for box in boxes:
-        offset = (box.center + way * box.forward if box.moves else box.center)[row] - start
+        offset = (box.center + distance * box.forward if box.moves else box.center)[row] - start
         forward = box.forward[row]
         enter, leave = np.zeros(len(row)), np.full(len(row), box.below)
         left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
@@ -227,7 +229,7 @@ class FieldOfView:
     """The horizontal field of view of a camera that looks ahead."""
 
     def __init__(self, camera: Camera) -> None:
-        """Take over a camera; one without an image sees all around."""
+        """Take a camera; a camera without an image has a field of view of 360 degrees."""
         self.reach = SHARE * camera.range if camera.range is not None else math.inf
         self.ahead = float(camera.position[0])
         self.left, self.right = math.pi, -math.pi
