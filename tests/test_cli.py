@@ -15,8 +15,7 @@ import pytest
 import coopenv
 from coopenv.backends.mcap import write_recording
 from coopenv.base.installation import environment_id, list_agents
-from coopenv.bench.observers.fault_variants import KNOBS
-from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.faults import FAULTS, VARIANTS
 from coopenv.cli import main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
@@ -83,11 +82,11 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
         (
             "list variants",
             [
-                *FAULTS,
+                *VARIANTS,
                 "landmarks",
                 "landmarks+robots",
                 "blind",
-                *(f"{name}={knob.value}" for name, knob in KNOBS.items()),
+                *(f"{name}={kind.value}" if kind.value else name for name, kind in FAULTS.items()),
             ],
         ),
     ],

@@ -65,9 +65,9 @@ class ObserverOptions:
         list[str] | None,
         typer.Option(
             "--fault",
-            metavar="NAME=VALUE[@VEHICLE][,OPTION=VALUE]",
-            help="One more variant, with a fault that has parameters (see `coopenv list variants`): gyro_bias=0.01 "
-            "or lie=drift:0.05@vehicle_2,from=10; several vehicles with : between, several faults with +. Repeatable.",
+            metavar="[VEHICLE:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]",
+            help="One more variant with a fault (see `coopenv list variants`), times in s: gyro_bias=0.01 or "
+            "vehicle_2:lie=drift:0.05@10; commas between vehicles, / between faults. Repeatable.",
         ),
     ] = None
     policy: Annotated[

@@ -75,8 +75,8 @@ def fake(
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KIND[=VALUE][@START[+DURATION]]",
-            help="What goes wrong, from when on and for how long in s, e.g. loss=0.2@5+10. Kinds: freeze, kill, loss, "
+            metavar="NAME[=VALUE][@START[+DURATION]]",
+            help="What goes wrong, from when on and for how long in s, e.g. loss=0.2@5+10. Faults: freeze, kill, loss, "
             "delay, clock_offset, clock_drift, false_blocks, duplicate_blocks, swapped_signatures. Repeatable.",
         ),
     ] = None,
@@ -89,11 +89,11 @@ def fake(
     """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
     from coopenv.base import interrupts
     from coopenv.cars.deployment import load_deployment
-    from coopenv.cars.fake.faults import parse_fault
+    from coopenv.cars.fake.faults import fake_fault
     from coopenv.cars.fake.fleet import prepare_fake, run
     from coopenv.cars.transport.zenoh import open_transport
 
-    faults = [parse_fault(text) for text in fault or ()]
+    faults = [fake_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
     transport = open_transport(load_deployment(deployment, connect))
 

@@ -43,7 +43,7 @@ class Answer(NamedTuple):
 
 
 class Tamper(Protocol):
-    """Changes what some vehicle broadcasts (see `faults.Lie`)."""
+    """Changes what some vehicle broadcasts , as tests and attacks do."""
 
     def applies(self, vehicle: int, time: float) -> bool:
         """Return whether it changes the message of a vehicle at a time, s."""

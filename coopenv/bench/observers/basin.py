@@ -104,7 +104,7 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
 
 def draw_starts(task: BasinTask) -> list[Draw]:
     """Run every observer from every draw of a task."""
-    recording, _ = task.source.recording(task.source.usual[0], 0)
+    recording = task.source.recording(task.source.usual[0], 0)
     found = []
     for draw in task.draws:
         started = random_start(recording, draw)

@@ -172,7 +172,7 @@ def compare(
             robots none.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
         topics: TOML file that says what the topics of a ROS bag are.
-        faults: further variants with parameters, such as "lie=drift:0.05@vehicle_2,from=10", see docs/observers.md.
+        faults: further variants with parameters, such as "vehicle_2:lie=drift:0.05@10", see docs/observers.md.
         policy: agent or policy that drives in the records of an environment; None: action zero.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
             classes that a module or file holds.

@@ -207,11 +207,11 @@ class Task:
 
 def judge(task: Task) -> list[Sample]:
     """Make the record and run every observer of a task on it."""
-    recording, lie = task.source.recording(task.variant, task.seed)
+    recording = task.source.recording(task.variant, task.seed)
     steady_from = task.source.steady_from(task.steady_from, recording)
     scene = scene_of(recording, steady_from, task.edges)
     return [
-        sample_of(task.variant, name, scene, recording, run(factory, recording, lie))
+        sample_of(task.variant, name, scene, recording, run(factory, recording))
         for name, factory in task.observers.items()
     ]
 

@@ -14,16 +14,23 @@ from typing import Any, ClassVar
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import Kind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
-from coopenv.bench.observers.fault_variants import KNOBS, FaultVariant, check_recorded, variants_with, with_world
-from coopenv.bench.observers.faults import FAULTS, NOMINAL, Fault, Lie, followers
+from coopenv.bench.observers.faults import (
+    FAULTS,
+    NO_FOLLOWERS,
+    NOMINAL,
+    VARIANTS,
+    FaultVariant,
+    check_recorded,
+    followers,
+    variant_of,
+    with_world,
+)
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
 from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.starts import neighbour_sets
-
-NOBODY_FOLLOWS = "no vehicle has another one as its neighbour"
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class Source(ABC):
     """As it stands in the rows."""
     added: tuple[FaultVariant, ...] = field(default=(), kw_only=True)
     """Variants with faults that have parameters."""
-    named: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
+    named: ClassVar[Mapping[str, str]] = {name: variant.summary for name, variant in VARIANTS.items()}
     """The others, each with what it is."""
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     """Those that are run unless others are asked for."""
@@ -49,9 +56,9 @@ class Source(ABC):
         """All variants there are, each with what it is."""
         return {**self.named, **{variant.name: variant.summary for variant in self.added}}
 
-    def fault(self, variant: str) -> Fault | FaultVariant:
-        """Return what a variant does."""
-        return next((made for made in self.added if made.name == variant), None) or FAULTS[variant]
+    def fault(self, variant: str) -> FaultVariant:
+        """Return the faults of a variant."""
+        return next((made for made in self.added if made.name == variant), None) or VARIANTS[variant]
 
     @property
     def planar(self) -> bool:
@@ -59,8 +66,8 @@ class Source(ABC):
         return False
 
     @abstractmethod
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
-        """Return a record, and the lie that somebody tells on it."""
+    def recording(self, variant: str, seed: int) -> Recording:
+        """Return a record with the faults of a variant."""
 
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""
@@ -95,15 +102,14 @@ class Simulated(Source):
     """Who drives the driven vehicles, as for `coopenv.runs.recorder.record`."""
     seeded: ClassVar[bool] = True
 
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+    def recording(self, variant: str, seed: int) -> Recording:
         """Return the world of a seed with a fault."""
         fault = self.fault(variant)
-        own = fault.scenario if isinstance(fault, FaultVariant) else None
-        return fault.applied(record(own or self.scenario, seed, self.policy), seed)
+        return fault.applied(record(fault.scenario or self.scenario, seed, self.policy), seed)
 
     def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another, where that is so."""
-        return _nobody_follows(self.scenario) if self.fault(variant).lies else ""
+        """Return why no vehicle can lie to another; empty where one can."""
+        return _no_followers(self.scenario) if self.fault(variant).needs_followers else ""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
@@ -133,11 +139,11 @@ class Robots(Source):
         """Its robots drive on a plane."""
         return True
 
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+    def recording(self, variant: str, seed: int) -> Recording:
         """Return the robots' record."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # `check` has told
-            return open_recording(self.name, self.data, variant), None
+            return open_recording(self.name, self.data, variant)
 
     def check(self) -> None:
         """Read the data once."""
@@ -155,7 +161,7 @@ class LogFile(Source):
         """Whether its vehicles are robots on a plane."""
         return _is_planar(open_recording(self.path))
 
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+    def recording(self, variant: str, seed: int) -> Recording:
         """Return the file's record with a fault."""
         recording = open_recording(self.path)
         if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
@@ -166,10 +172,10 @@ class LogFile(Source):
         return self.fault(variant).applied(recording, seed)
 
     def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another, where that is so."""
+        """Return why no vehicle can lie to another; empty where one can."""
         recording = open_recording(self.path)
         followed = any(followers(recording, i) for i in recording.order)
-        return NOBODY_FOLLOWS if self.fault(variant).lies and not followed else ""
+        return NO_FOLLOWERS if self.fault(variant).needs_followers and not followed else ""
 
     def check(self) -> None:
         """Read the file once."""
@@ -186,7 +192,7 @@ class Bags(Source):
     overrides: Mapping[str, Any]
     seeded: ClassVar[bool] = True
 
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+    def recording(self, variant: str, seed: int) -> Recording:
         """Return the bag as a record, with a fault."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # `check` has told
@@ -196,8 +202,8 @@ class Bags(Source):
         return self.fault(variant).applied(recording, seed)
 
     def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another, where that is so."""
-        return "" if not self.fault(variant).lies else _nobody_follows(self._backend().scenario)
+        """Return why no vehicle can lie to another; empty where one can."""
+        return "" if not self.fault(variant).needs_followers else _no_followers(self._backend().scenario)
 
     def check(self) -> None:
         """Read the bag once."""
@@ -207,10 +213,10 @@ class Bags(Source):
         return open_backend(self.path, None, self.overrides, topics=self.topics)
 
 
-def _nobody_follows(scenario: Scenario) -> str:
+def _no_followers(scenario: Scenario) -> str:
     L = len(scenario.landmarks)
     followed = any(target >= L for targets in neighbour_sets(scenario) for target in targets)
-    return "" if followed else NOBODY_FOLLOWS
+    return "" if followed else NO_FOLLOWERS
 
 
 def _is_planar(recording: Recording) -> bool:
@@ -222,7 +228,7 @@ ALL = "all"  # asks for every variant that the source can have
 
 def variant_rows() -> list[dict[str, str]]:
     """Return what `list variants` says of every variant."""
-    faults = {f"{name}={knob.value}": knob.about for name, knob in KNOBS.items()}
+    faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
     kinds = {"environments, logs": Source.named, "recorded robots": Robots.named, "--fault": faults}
     return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
 
@@ -242,13 +248,13 @@ def find_source(
         overrides: dotted keys of its scenario.
         data: folder of recorded data sets.
         topics: what the topics of a ROS bag are.
-        faults: variants with parameters, see `coopenv.bench.observers.fault_variants`.
+        faults: variants with parameters, see `coopenv.bench.observers.faults`.
         policy: who drives in a simulated environment; None: action zero.
 
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    kind, added = kind_of(text), variants_with(faults)
+    kind, added = kind_of(text), tuple(variant_of(text) for text in dict.fromkeys(faults))
     if kind is Kind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
         scenario = load_scenario(text, overrides)
         worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from coopenv.base.format import in_parentheses, jsonable, number, with_error
 from coopenv.bench.observers.basin import Draw
-from coopenv.bench.observers.faults import FAULTS, NOMINAL
+from coopenv.bench.observers.faults import NOMINAL, VARIANTS
 from coopenv.bench.observers.judge import Sample, Window
 from coopenv.bench.observers.rows import (
     ERRORS,
@@ -266,7 +266,7 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
     `width`: characters that fit on a line.
     """
     variants = list(board.variants)
-    for variant in variants[:1] if all(name in FAULTS for name in variants) else variants:
+    for variant in variants[:1] if all(name in VARIANTS for name in variants) else variants:
         yield f"\n{board.title}, {variant}"
         yield error_table(board, variant)
         if len(board.seeds) > 1:

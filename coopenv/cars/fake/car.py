@@ -9,10 +9,11 @@ from functools import partial
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, warm_up
 from coopenv.cars.deployment import Deployment
-from coopenv.cars.fake.faults import FakeFault, Faults, Wire, end_process, fault_topic, parse_fault
+from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.messages import Act, SensorPublisher, VehicleSensorPublisher
 from coopenv.cars.fake.sensors import Pixy, Sensors, calibration_of
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
@@ -85,7 +86,7 @@ class Fake:
         transport: Transport,
         *,
         seed: int = 0,
-        faults: Iterable[FakeFault] = (),
+        faults: Iterable[Fault] = (),
         gate: bool = True,
         signer: Signer | None = None,
         verifier: Verifier | None = None,
@@ -249,6 +250,6 @@ class Fake:
     def _hear_fault(self, arrival: Arrival) -> None:
         def add() -> None:
             text = str(decode(arrival.payload, "std_msgs/msg/String").data)
-            self._faults.add(parse_fault(text), self._clock.steady())
+            self._faults.add(fake_fault(text), self._clock.steady())
 
         self._inbox.append(add)

@@ -1,87 +1,40 @@
-"""What may go wrong with a fake car, on request: `KIND[=VALUE][@START[+DURATION]]`."""
+"""What may go wrong with a fake car, on request: `NAME[=VALUE][@START[+DURATION]]`."""
 
 import heapq
 import itertools
 import os
 import random
-import re
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
+from math import isinf
 
-from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.cars.profile import PREFIX
 from coopenv.cars.transport.base import Arrival, Callback, Transport
 
-
-class FaultError(CoopenvError):
-    """A fault is not one."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What a kind of fault does, and what its value means."""
-
-    meaning: str
-    default: float | None  # None: a value is needed
-    low: float
-    high: float
-
-
-KINDS = {
-    "freeze": Kind("its computer stands still: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),
-    "kill": Kind("the process ends at once", 1.0, 1.0, 1.0),
-    "loss": Kind("share of all messages that are lost, both ways", None, 0.0, 1.0),
-    "delay": Kind("s by which all messages come later, both ways", None, 0.0, 60.0),
-    "clock_offset": Kind("s that its clock is ahead", None, -1e6, 1e6),
-    "clock_drift": Kind("s per second that its clock gains", None, -0.1, 0.1),
-    "false_blocks": Kind("per second, blocks of the camera where nothing is", None, 0.0, 1e3),
-    "duplicate_blocks": Kind("share of blocks that are reported twice", 1.0, 0.0, 1.0),
-    "swapped_signatures": Kind("blocks of a frame have each other's numbers", 1.0, 1.0, 1.0),
+_Kind = partial(FaultKind, start=True, duration=True)
+FAKE_FAULTS = {
+    "freeze": _Kind("ON", "the computer stops: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),
+    "kill": _Kind("ON", "the process ends at once", 1.0, 1.0, 1.0),
+    "loss": _Kind("SHARE", "of all messages that is lost, both ways", None, 0.0, 1.0),
+    "delay": _Kind("SECONDS", "by which all messages come later, both ways", None, 0.0, 60.0),
+    "clock_offset": _Kind("SECONDS", "that its clock is ahead", None, -1e6, 1e6),
+    "clock_drift": _Kind("RATE", "s per second that its clock gains", None, -0.1, 0.1),
+    "false_blocks": _Kind("RATE", "per second, blocks of the camera without a marker", None, 0.0, 1e3),
+    "duplicate_blocks": _Kind("SHARE", "of blocks that are reported twice", 1.0, 0.0, 1.0),
+    "swapped_signatures": _Kind("ON", "blocks of a frame exchange their numbers", 1.0, 1.0, 1.0),
 }
-FORM = re.compile(r"(?P<kind>\w+)(=(?P<value>[^@]+))?(@(?P<start>[^+]+)(\+(?P<duration>.+))?)?")
+"""By name; a start is counted from the request."""
 
 
-@dataclass(frozen=True)
-class FakeFault:
-    """One fault."""
-
-    kind: str
-    value: float
-    start: float = 0.0  # s after it is asked for
-    duration: float = float("inf")  # s
-
-
-def parse_fault(text: str) -> FakeFault:
-    """Read a fault, for example `loss=0.2@5+10`.
-
-    Raises:
-        FaultError: the kind is unknown, or a number is none or out of bounds.
-    """
-    found = FORM.fullmatch(text.strip())
-    if found is None:
-        raise FaultError(f"fault {shown(text)}: expected KIND[=VALUE][@START[+DURATION]]; kinds: {listed([*KINDS])}")
-    name = found["kind"]
-    if name not in KINDS:
-        raise FaultError(f"unknown fault {shown(name)}{suggest(name, KINDS)}; known: {listed([*KINDS])}")
-    kind = KINDS[name]
-    if found["value"] is None and kind.default is None:
-        raise FaultError(f"fault {name}: needs a value, {name}=NUMBER ({kind.meaning})")
-    value = kind.default if found["value"] is None else _number(name, "value", found["value"], kind.low, kind.high)
-    start = _number(name, "start", found["start"] or "0", 0.0, 1e6)
-    duration = float("inf") if found["duration"] is None else _number(name, "duration", found["duration"], 0.0, 1e6)
-    return FakeFault(name, float(value or 0.0), start, duration)
-
-
-def _number(name: str, what: str, text: str, low: float, high: float) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
-    if not low <= number <= high:
-        raise FaultError(f"fault {name}: {what} {shown(text)} must be a number from {low:g} to {high:g}")
-    return number
+def fake_fault(text: str) -> Fault:
+    """Read a fault of a fake car, for example `loss=0.2@5+10`. Raises FaultError: it is not valid."""
+    fault = parse_fault(text, FAKE_FAULTS)
+    if fault.is_share:
+        raise FaultError(f"fault {fault.name}: a car's run has no length, so start must be a number of seconds")
+    return fault
 
 
 def fault_topic(car: str) -> str:
@@ -98,16 +51,16 @@ class Faults:
     """The faults of a car; times in ns on one clock."""
 
     def __init__(self) -> None:
-        self._known: list[tuple[int, int | None, FakeFault]] = []
+        self._known: list[tuple[int, int | None, Fault]] = []
 
     def __bool__(self) -> bool:
         """Whether any has been asked for."""
         return bool(self._known)
 
-    def add(self, fault: FakeFault, now: int) -> None:
+    def add(self, fault: Fault, now: int) -> None:
         """Let a fault happen, its start counted from now."""
-        begin = now + round(fault.start * 1e9)
-        end = None if fault.duration == float("inf") else begin + round(fault.duration * 1e9)
+        begin = now + round(fault.start_in(0.0) * 1e9)
+        end = None if isinf(fault.duration) else begin + round(fault.duration * 1e9)
         self._known.append((begin, end, fault))
 
     def value(self, kind: str, now: int) -> float:
@@ -124,11 +77,11 @@ class Faults:
         drifted = next((f.value * (now - begin) for begin, f in self._active("clock_drift", now)), 0.0)
         return round(offset + drifted)
 
-    def _active(self, kind: str, now: int) -> list[tuple[int, FakeFault]]:
+    def _active(self, kind: str, now: int) -> list[tuple[int, Fault]]:
         return [
             (begin, fault)
             for begin, end, fault in reversed(self._known)
-            if fault.kind == kind and begin <= now and (end is None or now < end)
+            if fault.name == kind and begin <= now and (end is None or now < end)
         ]
 
 

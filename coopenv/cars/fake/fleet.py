@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.fault_text import Fault
 from coopenv.base.interrupts import before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import REAL, Fake
-from coopenv.cars.fake.faults import FakeFault
 from coopenv.cars.gate.process import GateSettings
 from coopenv.cars.transport.base import Transport
 
@@ -167,7 +167,7 @@ def open_fake(
     transport: Transport,
     *,
     seed: int = 0,
-    faults: Iterable[FakeFault] = (),
+    faults: Iterable[Fault] = (),
     gate: bool = True,
     station: str | None = None,
     complain: Callable[[str], None] = lambda _: None,

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 import coopenv
 from coopenv.bench.observers import compare
-from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.faults import VARIANTS
 from coopenv.bench.observers.tables import failures
 from coopenv.observers import registry, run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
@@ -44,9 +44,9 @@ def test_every_fault_has_its_rows() -> None:
     short = {"horizon": 2.0}
     found = compare(["mekf_covariance"], "busy_intersection", 1, variants="all", overrides=short, steady_from=1.0)
     rows = found.rows
-    assert list(dict.fromkeys(row.variant for row in rows)) == list(FAULTS)
-    rmse = {name: [row.position_rmse_m for row in rows if row.variant == name] for name in FAULTS}
-    for name in set(FAULTS) - {"nominal"}:
+    assert list(dict.fromkeys(row.variant for row in rows)) == list(VARIANTS)
+    rmse = {name: [row.position_rmse_m for row in rows if row.variant == name] for name in VARIANTS}
+    for name in set(VARIANTS) - {"nominal"}:
         assert rmse[name] != pytest.approx(rmse["nominal"], rel=1e-3)
         ratios = [row.degradation for row in rows if row.variant == name]
         assert ratios == pytest.approx(np.divide(rmse[name], rmse["nominal"]))

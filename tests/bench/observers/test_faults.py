@@ -13,9 +13,10 @@ from scipy.stats import binom
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.faults import (
-    FAULTS,
-    Lie,
-    liar,
+    DIRECTION,
+    VARIANTS,
+    usual_sender,
+    variant_of,
     with_delay,
     with_loss,
     with_wrong_association,
@@ -24,6 +25,7 @@ from coopenv.bench.observers.faults import (
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.contract import Setup
 from coopenv.observers.error_state_filters import MekfCovariance
+from coopenv.observers.interference import Interference, altered
 from coopenv.runs.recorder import record
 
 
@@ -50,10 +52,9 @@ def changed(before: Recording, after: Recording) -> set[str]:
     ],
 )
 def test_a_fault_changes_what_it_names(name: str, arrays: set[str]) -> None:
-    after, lie = FAULTS[name].applied(made(), 3)
-    again, _ = FAULTS[name].applied(made(), 3)
+    after, again = (VARIANTS[name].applied(made(), 3) for _ in range(2))
     assert changed(made(), after) == arrays and not changed(after, again)
-    assert (lie is not None) == (name == "lying_neighbour")
+    assert (after.interference is not None) == (name == "lying_neighbour")
     assert after.truth is made().truth
 
 
@@ -104,7 +105,7 @@ def test_landmarks_are_lost_for_a_while() -> None:
     assert not after.visible[during, :, :3].any() and np.isnan(after.bearings[during, :, :3]).all()
     assert_array_equal(after.visible[:, :, 3:], made().visible[:, :, 3:])
     assert_array_equal(after.visible[~during], made().visible[~during])
-    assert changed(without_landmarks(made()), made()) == {"bearings", "visible"}
+    assert changed(after, made()) == {"bearings", "visible"}
 
 
 class Listens(MekfCovariance):
@@ -122,40 +123,58 @@ class Listens(MekfCovariance):
         return super().update(tick)
 
 
-def told(lie: Lie | None) -> list[tuple[float, Message]]:
+def received(recording: Recording) -> list[tuple[float, Message]]:
     Listens.heard = []
-    run(Listens, made(), lie)
+    run(Listens, recording)
     return Listens.heard
 
 
-def test_followers_hear_the_lie_and_the_liar_does_not_change() -> None:
-    assert liar(made()) == 1
-    lie = Lie(1, 2.0)
-    for (time, honest), (_, said) in zip(told(None), told(lie), strict=True):
-        assert honest.position is not None and said.position is not None and said.covariance is not None
-        offset = np.array(lie.offset) if time >= 2.0 - 1e-9 else np.zeros(3)
-        assert_allclose(said.position - honest.position, offset, atol=1e-12)
+def test_followers_receive_the_lie_and_the_sender_does_not_change() -> None:
+    assert usual_sender(made()) == 1
+    lying = variant_of("vehicle_2:lie=jump:5@2,std=0.01").applied(made(), 0)
+    for (time, honest), (_, false) in zip(received(made()), received(lying), strict=True):
+        assert honest.position is not None and false.position is not None and false.covariance is not None
+        offset = 5.0 * DIRECTION if time >= 2.0 - 1e-9 else np.zeros(3)
+        assert_allclose(false.position - honest.position, offset, atol=1e-12)
         if time >= 2.0 - 1e-9:
-            assert_array_equal(said.covariance, lie.std**2 * np.eye(3))
-    assert np.linalg.norm(lie.offset) == pytest.approx(5.0) and lie.offset[2] == 0.0
-    honest, lied = run(MekfCovariance, made()), run(MekfCovariance, made(), lie)
+            assert_array_equal(false.covariance, 0.01**2 * np.eye(3))
+    honest, lied = run(MekfCovariance, made()), run(MekfCovariance, lying)
     assert_array_equal(lied.position[:, :2], honest.position[:, :2])
     assert (lied.position[-1, 2:] != honest.position[-1, 2:]).any(axis=-1).all()
     assert_array_equal(lied.bytes_per_second, honest.bytes_per_second)
 
 
-def test_an_observer_may_lie_in_its_own_words() -> None:
+@pytest.mark.parametrize(
+    ("word", "keys"),
+    [
+        ("jump:3", {"kind": "jump", "offset": 3.0}),
+        ("drift:0.5", {"kind": "drift", "speed": 0.5}),
+        ("replay:0.3", {"kind": "replay", "age": 0.3}),
+    ],
+)
+def test_lies_on_a_recording_are_those_of_a_scenario(word: str, keys: dict[str, float | str]) -> None:
+    lie = {**keys, "start": 0.33, "std": 0.1, "direction": list(DIRECTION)}
+    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"lie": lie}}
+    expected = record(coopenv.load_scenario("busy_intersection", overrides), 0).interference
+    found = variant_of(f"vehicle_3:lie={word}@33%,std=0.1").applied(made(horizon=1.0), 0).interference
+    for field in fields(Interference):
+        assert_allclose(getattr(found, field.name), getattr(expected, field.name), atol=1e-6, err_msg=field.name)
+
+
+def test_an_observer_adapts_its_own_entries_to_a_lie() -> None:
     class Own:
         def tampered(self, message: Message) -> Message:
             return replace(message, extra={"twice": 2.0 * message.position})
 
-    assert_array_equal(Lie(0, 0.0).broadcast(Own(), Message(position=np.ones(3))).extra["twice"], [8.0, 10.0, 2.0])
-    bare = Lie(0, 0.0).broadcast(object(), Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32)))
+    shift = np.array([3.0, 4.0, 0.0])
+    assert_array_equal(altered(Own(), Message(position=np.ones(3)), shift).extra["twice"], [8.0, 10.0, 2.0])
+    bare = Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32))
+    bare = altered(object(), bare, shift, std=0.01)
     assert bare.covariance is not None and bare.covariance.shape == (6, 6) and bare.rotation is None
     assert bare.covariance.dtype == np.float32  # a lie takes no more bytes
 
 
 def test_nobody_to_lie_to() -> None:
     lonely = replace(made(), setups=tuple(replace(s, targets=np.arange(3)) for s in made().setups))
-    with pytest.raises(CoopenvError, match="none can lie"):
-        liar(lonely)
+    with pytest.raises(CoopenvError, match="no vehicle has another one"):
+        usual_sender(lonely)

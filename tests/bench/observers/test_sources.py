@@ -11,7 +11,7 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, find_source
-from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.faults import VARIANTS
 from coopenv.bench.observers.sources import variants_of
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import run
@@ -36,7 +36,7 @@ def test_a_log_file_gives_the_rows_of_what_it_recorded(tmp_path: Path) -> None:
 
 def test_variants() -> None:
     source = find_source("overtaking")
-    assert variants_of(source, None) == ("nominal",) and variants_of(source, "all") == tuple(FAULTS)
+    assert variants_of(source, None) == ("nominal",) and variants_of(source, "all") == tuple(VARIANTS)
     assert variants_of(source, "v2x_loss, nominal,v2x_loss") == ("v2x_loss", "nominal")
     assert variants_of(find_source("mrclam_6"), None) == ("landmarks", "landmarks+robots", "blind")
     with pytest.raises(CoopenvError, match="unknown variant 'blind'"):
@@ -73,7 +73,7 @@ def test_recorded_robots_have_rows_without_a_bound(tmp_path: Path) -> None:
     assert len(rows) == 2 * 2 * 5 and all(np.isnan(row.bound_m) and not row.failure for row in rows)
     assert all(np.isfinite([row.position_rmse_m, row.orientation_rmse_deg, row.ate_m]).all() for row in rows)
     # One record, judged from the start on: nothing was averaged over seeds, and nothing left out but the start itself.
-    recording, _ = source.recording("landmarks", 0)
+    recording = source.recording("landmarks", 0)
     known = recording.truth.known & (recording.t > 0)[:, None]
     errors = run("dead_reckoning", recording).position_error
     expected = [np.sqrt(np.mean(errors[known[:, i], i] ** 2)) for i in range(5)]

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coopenv.base.fault_text import FaultError
 from coopenv.cars.codec import encode, make, stamp_of
-from coopenv.cars.fake.faults import KINDS, FakeFault, FaultError, Faults, fault_topic, parse_fault
+from coopenv.cars.fake.faults import FAKE_FAULTS, Faults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
@@ -21,8 +22,9 @@ from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 )
 def test_what_is_written_is_read(kind: str, value: float, start: float, duration: float | None) -> None:
     text = f"{kind}={value!r}@{start!r}" + ("" if duration is None else f"+{duration!r}")
-    found = parse_fault(text)
-    assert found == FakeFault(kind, value, start, float("inf") if duration is None else duration)
+    found = fake_fault(text)
+    begun = (found.name, found.value, found.start_in(0.0), found.duration)
+    assert begun == (kind, value, start, float("inf") if duration is None else duration)
 
 
 @pytest.mark.parametrize(
@@ -30,23 +32,25 @@ def test_what_is_written_is_read(kind: str, value: float, start: float, duration
     [
         ("loose=0.1", r"unknown fault 'loose' \(did you mean 'loss'\?\); known: .*swapped_signatures"),
         ("loss", r"fault loss: needs a value, loss=NUMBER"),
-        ("loss=1.5", r"fault loss: value '1.5' must be a number from 0 to 1"),
-        ("loss=nan", r"fault loss: value 'nan' must be a number"),
-        ("freeze@x", r"fault freeze: start 'x' must be a number"),
-        ("freeze@1+-2", r"fault freeze: duration '-2' must be a number"),
-        ("=3", r"fault '=3': expected KIND\[=VALUE\]\[@START\[\+DURATION\]\]"),
+        ("loss=1.5", r"fault loss: value: expected a number from 0 to 1, got '1.5'"),
+        ("loss=nan", r"fault loss: value: expected a number"),
+        ("freeze@x", r"fault freeze: start: expected a number.*'x'"),
+        ("freeze@1+-2", r"fault freeze: duration: expected a number.*'-2'"),
+        ("loss=0.1@40%", "start must be a number of seconds"),
+        ("svea7:loss=0.1", "fault loss: has no vehicles"),
+        ("=3", r"fault '=3': expected \[VEHICLE:\]NAME\[=VALUE\]\[@START"),
     ],
 )
 def test_what_is_no_fault_is_one_line(text: str, said: str) -> None:
     with pytest.raises(FaultError, match=said) as caught:
-        parse_fault(text)
+        fake_fault(text)
     assert "\n" not in str(caught.value)
 
 
 def test_a_fault_begins_and_ends() -> None:
     faults = Faults()
-    faults.add(parse_fault("delay=0.2@1+2"), 10**9)
-    faults.add(parse_fault("delay=0.5@2+0.5"), 10**9)
+    faults.add(fake_fault("delay=0.2@1+2"), 10**9)
+    faults.add(fake_fault("delay=0.5@2+0.5"), 10**9)
     times = [1.9, 2.0, 2.9, 3.1, 3.6, 3.9, 4.1]
     assert [faults.value("delay", int(t * 1e9)) for t in times] == [0.0, 0.2, 0.2, 0.5, 0.2, 0.2, 0.0]
 
@@ -136,7 +140,7 @@ def test_blocks_that_are_false_doubled_or_swapped(stage: Stage) -> None:
 
 
 def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage) -> None:
-    for name, kind in KINDS.items():
+    for name, kind in FAKE_FAULTS.items():
         ask(stage, f"{name}={kind.high:g}@1000")
     assert not stage.complaints
     ask(stage, "melt")

@@ -7,9 +7,10 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.basin import random_start
-from coopenv.bench.observers.faults import FAULTS, Lie, changed
+from coopenv.bench.observers.faults import DIRECTION, VARIANTS, changed, usual_sender
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.interference import altered
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import find
 from tests.helpers.robust_observers import OpenJoint, OpenRobust
@@ -66,9 +67,9 @@ def test_messages_are_as_small_as_promised(name, most):
     assert (result.bytes_per_second <= most * messages_per_second * 1.001).all()
 
 
-def misled(name, record, lie=None):
+def misled(name, record):
     """Return whether anybody is farther off in the end, or surer, than it should be."""
-    result = run(name, record, lie)
+    result = run(name, record)
     assert not result.failure
     return (result.position_error[-1] > [0.2, 0.2, 0.3, 0.6, 0.6]).any() or (result.anees(8.0) > 6.0).any()
 
@@ -77,7 +78,7 @@ def misled(name, record, lie=None):
 @pytest.mark.parametrize("name", ["robust", JOINT])
 def test_faults_do_not_mislead(name, fault):
     seeds = range(6 if fault == "landmarks_lost" else 3)
-    results = [run(name, *FAULTS[fault].applied(small_errors(12.0, seed), seed)) for seed in seeds]
+    results = [run(name, VARIANTS[fault].applied(small_errors(12.0, seed), seed)) for seed in seeds]
     assert not any(result.failure for result in results)
     off, limit = np.array([result.position_error[-1] for result in results]), np.array([0.1, 0.1, 0.15, 0.3, 0.5])
     assert (off.mean(axis=0) < limit).all() and (off < 2.0 * limit).all(), off
@@ -87,7 +88,7 @@ def test_faults_do_not_mislead(name, fault):
 @pytest.mark.parametrize("name", ["robust", JOINT])
 def test_wrong_associations_mislead_in_the_first_frames_only(name):
     """Uncertain by 1 m and 10 degrees, a follower cannot tell two vehicles apart, and one swap of theirs passes."""
-    wrong = [FAULTS["wrong_association"].applied(small_errors(12.0, seed), seed)[0] for seed in range(3)]
+    wrong = [VARIANTS["wrong_association"].applied(small_errors(12.0, seed), seed) for seed in range(3)]
     assert sum(misled(name, record) for record in wrong) <= 1
     right = small_errors(12.0)
     first = (right.t < 0.1)[:, None, None, None]
@@ -102,7 +103,7 @@ def test_a_joint_liar_is_as_sure_in_every_entry():
         def message(self):
             message = super().message()
             if self.setup.vehicle == 2 and message.position is not None and "factor" in message.extra:
-                lies.append(Lie(2, 0.0).broadcast(self, message))
+                lies.append(altered(self, message, 5.0 * DIRECTION, std=0.01))
             return message
 
     run(Watched, record)
@@ -117,22 +118,23 @@ def test_a_joint_liar_is_as_sure_in_every_entry():
 
 
 def test_a_liar_is_found_out_and_tracked_all_the_same():
-    record, lie = FAULTS["lying_neighbour"].applied(small_errors(12.0), 0)
+    honest = small_errors(12.0)
+    record, sender, start = VARIANTS["lying_neighbour"].applied(honest, 0), usual_sender(honest), 0.4 * honest.t[-1]
     seen = {}
 
     class Watched(OpenRobust):
         def update(self, tick):
             estimate = super().update(tick)
             seen[self.setup.vehicle] = self.trusted
-            if lie.sender in self.trusted and tick.time > lie.start:
-                p = self.members["pose"]["p"][self.member_numbers.index(lie.sender)]
-                assert np.linalg.norm(p - record.truth.position[tick.index, lie.sender]) < 1.0
+            if sender in self.trusted and tick.time > start:
+                p = self.members["pose"]["p"][self.member_numbers.index(sender)]
+                assert np.linalg.norm(p - record.truth.position[tick.index, sender]) < 1.0
             return estimate
 
-    run(Watched, record, lie)
+    run(Watched, record)
     for vehicle, contacts in seen.items():
-        assert contacts.get(lie.sender, False) is False, vehicle
-        assert all(trusted for sender, trusted in contacts.items() if sender != lie.sender)
+        assert contacts.get(sender, False) is False, vehicle
+        assert all(trusted for sender, trusted in contacts.items() if sender != sender)
 
 
 def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():

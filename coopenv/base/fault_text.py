@@ -1,0 +1,136 @@
+"""The spelling of a fault, the same in the benchmark of observers and for fake cars.
+
+    FAULT = [VEHICLE[,VEHICLE...]:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]
+
+START and DURATION are in s; START may also be a share of the run, `40%`. For example `vehicle_2:lie=drift:0.05@10`.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, nan
+
+from coopenv.base.errors import CoopenvError, listed, shown, suggest
+
+GRAMMAR = "[VEHICLE:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]"
+_FORM = re.compile(
+    r"(?:(?P<vehicles>[^:=@]+):)?(?P<name>\w+)(?:=(?P<value>[^@,]+))?"
+    r"(?:@(?P<start>[^+,]+)(?:\+(?P<duration>[^,]+))?)?(?P<options>(?:,[^,]+)*)"
+)
+
+
+class FaultError(CoopenvError):
+    """A fault is not valid."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """What a fault does, and what may stand in its text."""
+
+    value: str
+    """Placeholder of the value in capitals; empty: the fault has no value."""
+    meaning: str
+    default: float | None = None
+    """Value of a fault without one; None: the value is required."""
+    low: float = 0.0
+    high: float = inf
+    words: Mapping[str, float] = field(default_factory=dict)
+    """Words before the value, `WORD[:VALUE]`, each with its default; empty: the value is a number."""
+    start: bool = False
+    """Whether `@START` is allowed."""
+    duration: bool = False
+    options: tuple[str, ...] = ()
+    vehicles: bool = False
+    """Whether the fault is of single vehicles."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault as it is written."""
+
+    text: str
+    name: str
+    value: float = 0.0
+    word: str = ""
+    vehicles: tuple[str, ...] = ()
+    """Names; empty: the usual ones of the fault."""
+    start: float | None = None
+    """s, or a share of the run; None: not given."""
+    is_share: bool = False
+    duration: float = inf
+    """s"""
+    options: Mapping[str, float] = field(default_factory=dict)
+
+    def start_in(self, length: float) -> float:
+        """Return the start in a run of a length, both in s; 0 if it is not given."""
+        return (self.start or 0.0) * (length if self.is_share else 1.0)
+
+
+def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
+    """Read a fault.
+
+    Raises:
+        FaultError: unknown name or option, or a number that is missing or out of bounds; one line.
+    """
+    text = text.strip()
+    found = _FORM.fullmatch(text)
+    if found is None:
+        raise FaultError(f"fault {shown(text)}: expected {GRAMMAR}; faults: {listed([*kinds])}")
+    name = found["name"]
+    if name not in kinds:
+        raise FaultError(f"unknown fault {shown(name)}{suggest(name, kinds)}; known: {listed([*kinds])}")
+    kind, where = kinds[name], f"fault {name}"
+    allowed = {"vehicles": kind.vehicles, "start": kind.start, "duration": kind.duration}
+    for part in (part for part, may in allowed.items() if found[part] is not None and not may):
+        raise FaultError(f"{where}: has no {part}, got {shown(found[part])}")
+    word, value = _value(found["value"], kind, where, name)
+    options = {}
+    for option in found["options"].split(",")[1:]:
+        key, equals, given = option.partition("=")
+        if not equals:
+            raise FaultError(f"{where}: {shown(option)} is not OPTION=VALUE")
+        if key not in kind.options:
+            raise FaultError(f"{where}: no option {shown(key)}; allowed: {listed(kind.options) or 'none'}")
+        options[key] = _number(given, f"{where}: {key}")
+    start = found["start"]
+    is_share = start is not None and start.endswith("%")
+    begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", 0.0, 1e6)
+    return Fault(
+        text,
+        name,
+        value,
+        word,
+        tuple(found["vehicles"].split(",")) if found["vehicles"] else (),
+        begin / 100.0 if begin is not None and is_share else begin,
+        is_share,
+        inf if found["duration"] is None else _number(found["duration"], f"{where}: duration", 0.0, 1e6),
+        options,
+    )
+
+
+def _value(text: str | None, kind: FaultKind, where: str, name: str) -> tuple[str, float]:
+    """Return the word and the number of a value."""
+    if kind.words:
+        word, colon, number = (text or "").partition(":")
+        if word not in kind.words:
+            raise FaultError(
+                f"{where}: unknown {name} {shown(word)}{suggest(word, kind.words)}; known: {listed([*kind.words])}"
+            )
+        return word, _number(number, f"{where}: value", kind.low, kind.high) if colon else kind.words[word]
+    if text is None:
+        if kind.default is None:
+            raise FaultError(f"{where}: needs a value, {name}=NUMBER ({kind.value.lower()}: {kind.meaning})")
+        return "", kind.default
+    if not kind.value:
+        raise FaultError(f"{where}: has no value, got {shown(text)}")
+    return "", _number(text, f"{where}: value", kind.low, kind.high)
+
+
+def _number(text: str, where: str, low: float = 0.0, high: float = inf) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = nan
+    if not low <= number <= high or number == inf:
+        raise FaultError(f"{where}: expected a number from {low:g} to {high:g}, got {shown(text)}")
+    return number
