@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from coopenv.api.engine import Engine
-from coopenv.backends.base import Conversing
+from coopenv.backends.base import Broadcasting
 from coopenv.base.errors import ActionError, CoopenvError, shown, suggest
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
@@ -347,7 +347,7 @@ class InfoWriter:
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
         self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
         self._outcomes = outcome_words(scenario)
-        self._backend = engine.backend if isinstance(engine.backend, Conversing) else None
+        self._backend = engine.backend if isinstance(engine.backend, Broadcasting) else None
         lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
         self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
         self._tick_length = 1.0 / scenario.rates.camera

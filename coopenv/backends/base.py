@@ -27,9 +27,9 @@ from coopenv.world.world import World
 
 @dataclass(frozen=True)
 class Command:
-    """What N vehicles are to do until the next decision, see `coopenv.world.dynamics`; one that has ended is to stand.
+    """Command of N vehicles until the next decision, see `coopenv.world.dynamics`; a vehicle that has ended stands.
 
-    Vehicles with prescribed motion are not driven, whatever their rows say.
+    Vehicles with prescribed motion are not driven, independent of their rows.
     """
 
     speed: Array  # (N,) m/s, to reach
@@ -52,7 +52,7 @@ class Command:
 
 
 EPISODE_OVER = "the episode is over"
-"""Reason to stop a backend in real time when nobody drives any more."""
+"""Reason to stop a backend in real time after the last decision."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What one vehicle has to say after a tick."""
+class VehicleBroadcast:
+    """Estimate and message that one vehicle broadcasts after a tick."""
 
     vehicle: int  # its index
     rotation: Array  # (3, 3) body to map, estimated
@@ -105,7 +105,7 @@ class Backend(Protocol):
     """A source of ticks of one world."""
 
     scenario: Scenario
-    """Who is there, how they sense, talk and estimate."""
+    """Vehicles, sensors, radio and observers."""
     capabilities: Capabilities
     """What it can do; fixed once it is built."""
     health: Health
@@ -142,15 +142,15 @@ class Backend(Protocol):
 
 
 @runtime_checkable
-class Conversing(Protocol):
-    """A backend whose vehicles are among others that are estimated elsewhere, and which tells of its links."""
+class Broadcasting(Protocol):
+    """A backend with vehicles estimated elsewhere: it broadcasts estimates and reports its links."""
 
-    def tell(self, told: Sequence[Told]) -> None:
-        """Send what the vehicles that are estimated here have to say after the present tick, or at its start."""
+    def broadcast(self, sent: Sequence[VehicleBroadcast]) -> None:
+        """Send the broadcasts of the vehicles estimated here, after the present tick or at the start."""
         ...
 
     def notes(self, vehicle: int) -> dict[str, Any]:
-        """Return what a vehicle's info says of the machine that it is and of its links, always the same keys."""
+        """Return the entries of a vehicle's info about its machine and links, always the same keys."""
         ...
 
 
@@ -176,7 +176,7 @@ IGNORED_OPTIONS = ("options", "arm")
 
 
 class TickGenerator(ABC):
-    """A backend that is told how an episode goes, in simulated time; see `Backend` for its methods."""
+    """A backend whose episodes are generators of ticks, in simulated time; see `Backend` for its methods."""
 
     options: tuple[str, ...] = ()
     """Names of the options of a reset that `episode` reads; others are refused."""
@@ -233,7 +233,7 @@ class TickGenerator(ABC):
 
 
 class SensingWorld(World, ABC):
-    """A world that tells observers on the host what its vehicles sense."""
+    """A world whose measurements can be read on the host."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """Build the arrays; arguments and errors as for `World`."""
@@ -245,7 +245,7 @@ class SensingWorld(World, ABC):
 
     @cached_property
     def observer_init(self) -> ObserverInit:
-        """What observers are told before the first tick."""
+        """Initial information for observers."""
         return observer_init_of(self.scenario, self.model)
 
     @abstractmethod
@@ -261,7 +261,7 @@ class SensingWorld(World, ABC):
         return {}
 
     def set_source_state(self, values: Mapping[str, Any]) -> None:
-        """Restore it from the saved state; a CoopenvError says what does not fit, and nothing has changed then."""
+        """Restore it from the saved state. Raises CoopenvError: it does not fit; nothing has changed then."""
 
 
 class WorldBackend(Backend, Protocol):

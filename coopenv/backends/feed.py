@@ -52,7 +52,7 @@ def recall_truth(model: Any, state: Any, record: Any, world: int, vehicle: int, 
 
 @wp.func
 def forget_errors(state: Any, world: int, vehicle: int):
-    """Make the lasting errors of a vehicle's sensors unknown: nobody recorded them."""
+    """Make the lasting errors of a vehicle's sensors unknown: they are not recorded."""
     unknown = type(state.gyro_bias[world, vehicle])()
     for axis in range(3):
         unknown[axis] = unknown.dtype(wp.nan)
@@ -66,9 +66,9 @@ def forget_errors(state: Any, world: int, vehicle: int):
 
 @wp.func
 def explain(model: Any, state: Any, world: int, vehicle: int):
-    """Say why targets are not seen, as the simulation does, where the vehicle's pose and their place are known.
+    """Set why targets are not seen, as the simulation does, where the vehicle's pose and their place are known.
 
-    How far to the side a camera sees that is no pinhole nobody has said: what it does not see is out of view.
+    The field of view of a camera without a pinhole model is unknown: a target that it does not see is out of view.
     """
     agent = model.landmarks + vehicle
     camera = model.camera[vehicle]
@@ -120,7 +120,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
 
 @wp.func
 def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Write which messages arrive at a tick, as the source says or else as the scenario's radio lets them."""
+    """Write which messages arrive at a tick, by the source or else by the scenario's radio."""
     row = row_of(record, tick)
     if record.inbox_tick[row, 0, 0] == BY_RADIO:
         transmit(model, state, world, tick)
@@ -144,7 +144,7 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
 
 @wp.func
 def rewind(model: Any, state: Any, record: Any, world: int):
-    """Go to the start in one world: initial estimates are those of the record, or drawn as the scenario says."""
+    """Go to the start in one world: initial estimates are those of the record, or drawn by the scenario."""
     state.tick[world] = 0
     state.exhausted[world] = 0
     if record.drawn != 0:
@@ -184,7 +184,7 @@ def record_struct(p: Precision) -> Any:
         """K ticks, N vehicles, T targets, L landmarks, Q parameters; lengths in m."""
 
         last: wp.int32  # K - 1
-        drawn: wp.int32  # 1: what follows says what was drawn
+        drawn: wp.int32  # 1: the draws are those of the next fields
         key: wp.uint64
         episode: wp.uint32
         parameter: array("Q", p.scalar)
@@ -203,7 +203,7 @@ def record_struct(p: Precision) -> Any:
         true_position: array("KN", vec3)
         true_velocity: array("KN", vec3)  # body frame, m/s
         true_angular_velocity: array("KN", vec3)  # rad/s
-        start_rotation: array("N", mat33)  # initial estimates; NaN: as the scenario says
+        start_rotation: array("N", mat33)  # initial estimates; NaN: by the scenario
         start_position: array("N", vec3)  # map
 
     return Record

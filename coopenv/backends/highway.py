@@ -17,7 +17,7 @@ from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
 
 
 class FollowedWorld(CosimulatedWorld):
-    """One world whose vehicles stand where `present` says."""
+    """One world whose vehicles stand at the poses of `present`."""
 
     present: Poses
 
@@ -113,7 +113,7 @@ def _creator(name: str) -> Any:
 
 
 def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what highway-env is told: the section's own keys, checked, and what the rest of the scenario says."""
+    """Return the configuration of highway-env: the section's own keys, checked, and those of the scenario."""
     rate = int(scenario.rates.camera)
     for key, value in section.config.items():
         if key in OWNED:
@@ -225,7 +225,7 @@ class Simulation:
         return self.poses()
 
     def poses(self) -> Poses:
-        """Return where everybody is; errors as for `poses_of`."""
+        """Return the poses of all vehicles; errors as for `poses_of`."""
         assert self._scenario.highway is not None
         return poses_of(self._cars, self.environment.road, self._origin, self._scenario.highway.most_vehicles)
 

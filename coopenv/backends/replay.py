@@ -19,7 +19,7 @@ from coopenv.scenario.files import override, parse_scenario
 from coopenv.world.embedded import HOST
 
 CHANGEABLE = ("action", "description", "horizon", "observation", "observer", "reward", "termination", "title")
-"""Keys that say how a recording is used; the others say how it came about."""
+"""Keys of the use of a recording; the others describe its origin."""
 
 DECISION_RATE = 10.0  # Hz, of the replay of robots, or the next rate at which decisions fall on ticks
 
@@ -28,7 +28,7 @@ def scenario_of(recording: Recording, name: str, overrides: Mapping[str, Any]) -
     """Return the scenario of a recording, whose name is for messages, and the title where nothing else is known.
 
     Raises:
-        DataError: the recording holds what no scenario can say.
+        DataError: no scenario can describe the recording.
         CoopenvError: an override is not valid, or would change what was recorded.
     """
     if recording.ticks < 2:
@@ -131,7 +131,7 @@ class ReplayWorld(SensingWorld):
 
     @cached_property
     def observer_init(self) -> ObserverInit:
-        """What observers are told before the first tick."""
+        """Initial information for observers."""
         return self._recording.observer_init
 
     def sensed(self, world: int, k: int) -> Sensed:

@@ -63,8 +63,8 @@ class SimulatedWorld(SensingWorld):
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
         return Sensed(index=k, dt=1.0 / rates.camera, due=due, pan=pan, **arrays)
 
-    def told(self, k: int) -> Sensed:
-        """Return all that a source of ticks tells of the first world, truth and messages included."""
+    def full_tick(self, k: int) -> Sensed:
+        """Return the tick of the first world with truth and deliveries."""
         L = len(self._markers)
         taken = self._copy("odometry_samples", 0)
         now = k / self.scenario.rates.camera
@@ -112,12 +112,12 @@ class Simulated(TickGenerator):
         return self.kind(self.scenario, worlds, dtype, device, threads, observer, start)
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Simulate one world in float64, without an observer: the radio decides on messages, whatever they say."""
+        """Simulate one world in float64, without an observer: deliveries do not depend on the contents of messages."""
         if self._world is None:
             self._world = self.kind(self.scenario, 1, "float64", threads=1)
         world = self._world
         world.reset(None if seed is None else [seed])
-        command = yield world.told(0)
+        command = yield world.full_tick(0)
         for k in range(1, self.scenario.horizon_ticks + 1):
             world.view("command")[0] = command.rows
             world.fetch()
@@ -126,12 +126,12 @@ class Simulated(TickGenerator):
                 world.receive(vehicle)
                 world.broadcast(vehicle)
             world.finish()
-            command = yield world.told(k)
+            command = yield world.full_tick(k)
 
 
 @cache
 def cosimulation_struct(p: Precision) -> Any:
-    """Return the Warp struct of what a program says of the present tick, in one precision."""
+    """Return the Warp struct of the poses and twists of the present tick, in one precision."""
     scalar, vec3, mat33 = p.scalar, p.vec3, p.mat33
 
     @wp.struct
@@ -189,7 +189,7 @@ def renew_sample(model: Any, state: Any, motion: Any, world: int, vehicle: int, 
 
 @wp.func
 def judge(model: Any, state: Any, motion: Any, world: int, vehicle: int):
-    """Judge contact and arrival; whoever moves the vehicles may know of contacts that are over, and who has left."""
+    """Judge contact and arrival; the moving program may know of past contacts and departures."""
     if state.ended[world, vehicle] == UNDER_WAY:
         if motion.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
             state.ended[world, vehicle] = COLLIDED
@@ -243,8 +243,8 @@ class Poses:
     heading: Array  # (N,) rad, from x towards y
     speed: Array  # (N,) m/s
     steering: Array  # (N,) rad, positive to the left
-    crashed: Array  # (N,) bool, who has touched something
-    left: Array  # (N,) bool, who has left the road for good
+    crashed: Array  # (N,) bool, has touched something
+    left: Array  # (N,) bool, has left the road for good
     traffic_position: Array  # (Z, 3) centres of boxes, m
     traffic_heading: Array  # (Z,) rad
     traffic_half: Array  # (Z, 3) half of their edges, m; zero: absent

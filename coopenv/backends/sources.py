@@ -1,4 +1,4 @@
-"""Sources of ticks by name: the only place that knows what a name means.
+"""Sources of ticks by name.
 
 A wrong name is an error before any of the simulation is loaded.
 """
@@ -34,7 +34,7 @@ DATASETS = re.compile(r"mrclam_\d+")
 IMPORT = "coopenv import {} --map topics.toml --out FILE.mcap"
 
 
-class Kind(Enum):
+class SourceKind(Enum):
     """What a name stands for."""
 
     ENVIRONMENT = "an environment by name or TOML file"
@@ -43,13 +43,13 @@ class Kind(Enum):
     BAG = "a ROS bag, which needs a map of its topics"
 
 
-def kind_of(name: str | Path) -> Kind:
+def kind_of(name: str | Path) -> SourceKind:
     """Return what a name stands for, whether or not it exists."""
     if is_bag(name):
-        return Kind.BAG
+        return SourceKind.BAG
     if str(name).endswith(LOG_SUFFIX):
-        return Kind.LOG
-    return Kind.DATASET if DATASETS.fullmatch(str(name)) else Kind.ENVIRONMENT
+        return SourceKind.LOG
+    return SourceKind.DATASET if DATASETS.fullmatch(str(name)) else SourceKind.ENVIRONMENT
 
 
 def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
@@ -77,7 +77,7 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
 
 def is_recorded(name: str | Path) -> bool:
     """Return whether a name is that of a recording and not of an environment."""
-    return kind_of(name) is not Kind.ENVIRONMENT
+    return kind_of(name) is not SourceKind.ENVIRONMENT
 
 
 def open_recording(name: str | Path, data: str | Path | None = None, variant: str | None = None) -> Recording:
@@ -85,22 +85,22 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
 
     Args:
         name: path of an MCAP file, or `mrclam_1` .. `mrclam_9`.
-        data: folder of the data sets (None: what COOPENV_DATA says).
+        data: folder of the data sets (None: that of COOPENV_DATA).
         variant: of a data set: "landmarks", "landmarks+robots" (as recorded, the default) or "blind".
 
     Raises:
         CoopenvError: no such recording or variant, or the file is not what it should be.
     """
     kind = kind_of(name)
-    if kind is Kind.LOG:
+    if kind is SourceKind.LOG:
         if variant is not None:
             raise DataError(f"{name}: a file has no variants, got variant '{variant}'")
         from coopenv.backends.mcap import read_recording
 
         return read_recording(name)
-    if kind is Kind.BAG:
+    if kind is SourceKind.BAG:
         raise DataError(f"{name}: a ROS bag; make a recording of it with: {IMPORT.format(name)}")
-    if kind is not Kind.DATASET:
+    if kind is not SourceKind.DATASET:
         raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
     from coopenv.backends.mrclam import load_dataset, recording_of
     from coopenv.backends.mrclam.recording import check_variant
@@ -123,7 +123,7 @@ def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | Non
 
 
 def simulation_of(scenario: Scenario) -> Simulated:
-    """Return what simulates a scenario, as its key `backend` says.
+    """Return the simulation of a scenario, by its key `backend`.
 
     Raises:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
@@ -151,7 +151,7 @@ def open_backend(
 
     Args:
         name_or_path: environment, TOML file, MCAP file, ROS bag or data set.
-        backend: one of `BACKENDS`; None: as the name says; a backend itself is returned as it is.
+        backend: one of `BACKENDS`; None: by the name; a backend itself is returned as it is.
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
@@ -186,7 +186,7 @@ def open_backend(
 
     scenario = load_scenario(name_or_path, overrides)
     if backend not in (None, scenario.backend):
-        raise CoopenvError(f"backend '{backend}': {name_or_path} says backend = \"{scenario.backend}\"")
+        raise CoopenvError(f"backend '{backend}': {name_or_path} has backend = \"{scenario.backend}\"")
     return simulation_of(scenario)
 
 
@@ -208,7 +208,7 @@ def _open_recorded(
     name: str | Path, overrides: Mapping[str, Any], data: str | Path | None, variant: str | None
 ) -> Backend:
     """Return the replay of a recording, or of a drive of cars."""
-    if kind_of(name) is Kind.LOG:
+    if kind_of(name) is SourceKind.LOG:
         from coopenv.cars.backend.drive import Drive, is_drive
 
         if is_drive(name):
@@ -227,7 +227,7 @@ def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[st
             raise CoopenvError(f"{key} is for recorded data, backend='svea' has cars")
     deployment = given.get("deployment")
     if deployment is None and not str(name).endswith(".toml"):
-        raise CoopenvError(f"deployment: needed by backend='svea': the file that says which cars drive {name}")
+        raise CoopenvError(f"deployment: needed by backend='svea': the file with the cars that drive {name}")
     environment = None if deployment is None else str(name)
     options = {key: given[key] for key in ("car", "record", "connect") if key in given}
     return open_svea(deployment or name, environment, overrides, **options)

@@ -1,4 +1,4 @@
-"""A world whose ticks come from a backend, one after the other; estimators and reports run on it as on any other."""
+"""A world whose ticks come from a backend, one by one; observers and results run on it as on any other world."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,11 +9,11 @@ import numpy as np
 
 from coopenv.backends.base import (
     Backend,
+    Broadcasting,
     Command,
-    Conversing,
     Repeating,
     SensingWorld,
-    Told,
+    VehicleBroadcast,
     WorldBackend,
     is_valid_message,
 )
@@ -40,8 +40,8 @@ def open_world(backend: Backend, worlds: int, dtype: str, device: str, threads: 
 class TickWorld(SensingWorld):
     """One world that is filled with what a backend gives.
 
-    A vehicle from which nothing came goes on with the last odometry that it had, and sees nothing. Truth that the
-    backend does not know is NaN. The episode is over when the backend gives no more ticks.
+    A missing vehicle continues with its last odometry and sees nothing. Unknown truth is NaN. The episode ends with the
+    last tick of the backend.
     """
 
     source = RECORDED
@@ -58,7 +58,7 @@ class TickWorld(SensingWorld):
         self._present = _nothing(self.observer_init)
         self._ticks: Iterator[Sensed] = iter(())
         self._adopted: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        """Rotation and body-frame position by which vehicles that are estimated elsewhere believe to be."""
+        """Rotation and body-frame position of the estimates that were received of vehicles estimated elsewhere."""
         self._parts: dict[int, SimpleNamespace] = {}
 
     def sensed(self, world: int, k: int) -> Sensed:
@@ -69,7 +69,7 @@ class TickWorld(SensingWorld):
         model = super()._build_model()
         markers, centers = model.scene.marker.numpy(), model.scene.body_center.numpy()
         centers[: model.landmarks] -= markers[: model.landmarks]
-        markers[: model.landmarks] = 0.0  # a source tells the point of a landmark that is seen
+        markers[: model.landmarks] = 0.0  # a source gives the visible point of a landmark
         model.scene.marker.assign(markers)
         model.scene.body_center.assign(centers)
         return model
@@ -154,7 +154,7 @@ class TickWorld(SensingWorld):
         self.missing += now.missing
 
     def _completed(self, tick: Sensed) -> Sensed:
-        """Return a tick without gaps, which nobody can write to: who is missing goes on with the last odometry."""
+        """Return a sealed tick without gaps: a missing vehicle continues with its last odometry."""
         N, last = len(tick.rotation), self._present
         arrays: dict[str, Any] = {name: np.array(getattr(tick, name), dtype=float) for name in MEASURED}
         arrays["visible"] = tick.visible.copy()
@@ -192,7 +192,7 @@ class TickWorld(SensingWorld):
         self._present = replace(now, messages=accepted)
 
     def _end_tick(self) -> None:
-        """Take over what vehicles that are estimated elsewhere say of themselves, and let the backend send the rest."""
+        """Adopt the received estimates of vehicles estimated elsewhere; let the backend broadcast the others."""
         here = self._backend.capabilities.estimated
         for (_, sender), received in self._present.messages.items() if here is not None else ():
             R, place = received.message.rotation, received.message.position
@@ -200,16 +200,17 @@ class TickWorld(SensingWorld):
                 self._adopted[sender] = R, R.T @ place - self.observer_init.setups[sender].marker
         for sender, (R, p) in self._adopted.items():
             self.view("estimate_rotation")[0, sender], self.view("estimate_position")[0, sender] = R, p
-        if isinstance(self._backend, Conversing) and int(self.view("tick")[0]) % self.observer_init.period == 0:
-            self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
+        if isinstance(self._backend, Broadcasting) and int(self.view("tick")[0]) % self.observer_init.period == 0:
+            estimated = range(self.model.vehicles) if here is None else here
+            self._backend.broadcast([self._broadcast_of(i) for i in estimated])
 
-    def _told(self, vehicle: int) -> Told:
+    def _broadcast_of(self, vehicle: int) -> VehicleBroadcast:
         view, message = self.view, None
         if self.observer.messages is not None:
             message = self.observer.messages.write(self._parts_of(vehicle))
         R = np.array(view("estimate_rotation")[0, vehicle], dtype=float)
         position = R @ np.array(view("estimate_position")[0, vehicle], dtype=float)
-        return Told(vehicle, R, position, np.array(view("covariance")[0, vehicle], dtype=float), message)
+        return VehicleBroadcast(vehicle, R, position, np.array(view("covariance")[0, vehicle], dtype=float), message)
 
     def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""

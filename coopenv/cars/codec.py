@@ -63,7 +63,7 @@ TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""
 
 STOPPED = "coopenv_msgs/msg/Stopped"
-"""Type of the message that tells there why the watchdog stopped the cars."""
+"""Type of the message there with the reason for which the watchdog stopped the cars."""
 
 ROS_2 = {
     **CAMERA,
@@ -112,7 +112,7 @@ ackermann_msgs/AckermannDrive drive
 """,
     "coopenv_msgs/msg/RobustReport": """
 std_msgs/Header header  # frame_id: map
-bool valid  # false: the sender does not know where it is
+bool valid  # false: the sender has no position
 geometry_msgs/Pose pose  # of the body
 float64[36] covariance  # rotation (rad), then position (m); see docs/robust.md
 geometry_msgs/Pose odometry  # dead reckoning since the start
@@ -127,7 +127,7 @@ uint32 episode
     STOPPED: """
 std_msgs/Header header
 string reason
-string car  # whose fault it was; empty: nobody's
+string car  # that caused it; empty: no single car
 """,
     "coopenv_msgs/msg/Arm": """
 std_msgs/Header header

@@ -54,11 +54,11 @@ WIRES = {
     "nats": ("nats/127.0.0.1:4222", ("nats", "tcp", "tls")),
     "ros1": ("tcp/127.0.0.1:11311", ("tcp",)),
 }
-"""Kinds of networks: where they are if nothing is said, and which protocols they have."""
+"""Kinds of networks: default endpoints, and protocols."""
 
 
 def refuse_foreign(kind: str, endpoints: tuple[str, ...]) -> None:
-    """Refuse endpoints of a protocol that a kind of network does not have, with a ValueError that says which."""
+    """Refuse endpoints of a protocol that a kind of network does not have, with a ValueError that names it."""
     for endpoint in endpoints:
         if address_of(endpoint).protocol not in WIRES[kind][1]:
             raise ValueError(f"connect: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
@@ -121,7 +121,7 @@ class Remote(Section):
         return self
 
     def fault(self, pulses: tuple[int, ...], usual: Pulses = SVEA.pulses) -> str:
-        """Return why pulses, us, one per channel, tell nothing; empty where they do."""
+        """Return why pulses, us, one per channel, are no signal; empty where they are."""
         for name in ("steering", "throttle", "mode_switch"):
             channel = getattr(self, name)
             if pulses and channel > len(pulses):
@@ -177,7 +177,7 @@ class Car(Section):
 
 
 def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tuple[int, int] | None = None) -> None:
-    """Refuse a name, vehicle, landmark or marker of two, with a ValueError that says which.
+    """Refuse a name, vehicle, landmark or marker of two, with a ValueError that names it.
 
     Args:
         cars: a fleet.
@@ -325,7 +325,7 @@ class Deployment(Section):
 
     @property
     def gate_connect(self) -> tuple[str, ...]:
-        """Where the gate of a car connects to: never to what is beyond the radio, unless the file says so."""
+        """Where the gate of a car connects to: never to what is beyond the radio, unless the file does."""
         return self.gate.connect or (WIRES[self.network.kind][0],)
 
     @property
@@ -346,7 +346,7 @@ class Deployment(Section):
 
     @property
     def conditions(self) -> bool:
-        """Whether cars have to tell of remote control, autopilot and battery."""
+        """Whether cars must publish the conditions of remote control, autopilot and battery."""
         return self.network.kind == "zenoh" if self.safety.conditions is None else self.safety.conditions
 
     @property

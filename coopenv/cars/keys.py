@@ -1,10 +1,10 @@
-"""Files of keys: of each identity a private one that nobody else can read, and one of everybody's public keys.
+"""Files of keys: one private key per identity, readable by its owner alone, and one file of all public keys.
 
 A folder of keys holds NAME.pem per identity and `public.toml`. A car needs its own private file and `public.toml`, and
 a station likewise; both take the folder in which they are.
 
 They travel beside a message, as the transport's attachment, so that its payload stays what ROS 2 has under that topic.
-A signature says nothing of when: receivers look at stamps and sequence numbers, which are part of what is signed.
+A signature contains no time of its own: receivers check stamps and sequence numbers, which are part of what is signed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Signer:
 
 
 class Verifier:
-    """Knows public keys, and with them who has signed a message; keeps nothing of the messages."""
+    """Public keys of identities; finds the signer of a message."""
 
     def __init__(self, keys: Mapping[str, Ed25519PublicKey]) -> None:
         self._keys = dict(keys)
@@ -67,7 +67,7 @@ class Verifier:
         return tuple(self._keys)
 
     def signer(self, topic: str, payload: bytes, attachment: bytes) -> str | None:
-        """Return who has signed a message under this topic; None: nobody who is known. Never raises."""
+        """Return the identity that signed a message under this topic; None: no known one. Never raises."""
         try:
             name = bytes(attachment[1 : 1 + attachment[0]])
             signature = bytes(attachment[1 + len(name) :])
@@ -75,7 +75,7 @@ class Verifier:
             if len(name) != attachment[0] or len(signature) != SIGNATURE_BYTES:
                 return None
             self._keys[identity].verify(signature, _signed(name, topic, payload))
-        except Exception:  # nobody known, forged or no signature at all: whatever came, it is from a stranger
+        except Exception:  # unknown identity, forged or no signature at all
             return None
         return identity
 

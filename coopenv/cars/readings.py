@@ -13,9 +13,9 @@ from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import (
     Array,
     Calibration,
+    CarPose,
     CarStatus,
     Detections,
-    Pose,
     RobustReport,
     Twist,
     Value,
@@ -164,12 +164,12 @@ def state_of(message: Any) -> CarStatus:
 
 
 def remote_of(message: Any) -> CarStatus:
-    """Return the pulses of a car's remote control; none with a signal strength of 0, and 255 says: not known."""
+    """Return the pulses of a car's remote control; none with a signal strength of 0, and 255 means unknown."""
     return CarStatus(pulses=tuple(int(pulse) for pulse in message.channels[:MOST_CHANNELS]) if message.rssi else ())
 
 
 def battery_of(message: Any) -> CarStatus:
-    """Return the share that is left; NaN and -1 say: not known."""
+    """Return the share that is left; NaN and -1 mean unknown."""
     share = float(message.percentage)
     if np.isnan(share) or share == -1.0:
         return CarStatus()
@@ -190,7 +190,7 @@ def read(
     distorted: bool = True,
     known: Collection[int] | None = None,
 ) -> Value:
-    """Return what a message tells.
+    """Return the value of a message.
 
     Args:
         role: of its topic.
@@ -224,7 +224,7 @@ def _needed(calibration: Calibration | None) -> Calibration:
 
 
 def _twist(message: Any) -> Twist:
-    """Return the velocities of a TwistWithCovarianceStamped; a negative variance says: not measured."""
+    """Return the velocities of a TwistWithCovarianceStamped; a negative variance means not measured."""
     with_covariance = message.twist
     linear, angular = _velocities(with_covariance.twist)
     variances = np.asarray(with_covariance.covariance, dtype=np.float64).reshape(6, 6).diagonal()
@@ -245,29 +245,29 @@ def _velocities(twist: Any) -> tuple[Array, Array]:
 
 
 def _turning(message: Any) -> Twist:
-    """Return the turn rate of an Imu; -1 as first covariance says: not measured."""
+    """Return the turn rate of an Imu; -1 as first covariance means not measured."""
     if float(message.angular_velocity_covariance[0]) == -1.0:
         return Twist(None, None)
     return Twist(None, vector(message.angular_velocity, "angular_velocity", SPINNING))
 
 
-def _pose(message: Any) -> Pose:
+def _pose(message: Any) -> CarPose:
     return _placed(message.pose)
 
 
-def _pose_with_covariance(message: Any) -> Pose:
-    """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros says: not known."""
+def _pose_with_covariance(message: Any) -> CarPose:
+    """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros means unknown."""
     pose = _placed(message.pose.pose)
     covariance = covariance_of(message.pose.covariance, "pose.covariance")
-    return Pose(pose.position, pose.rotation, covariance if covariance.any() else None)
+    return CarPose(pose.position, pose.rotation, covariance if covariance.any() else None)
 
 
-def _placed(pose: Any) -> Pose:
-    return Pose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
+def _placed(pose: Any) -> CarPose:
+    return CarPose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
-def _point(message: Any) -> Pose:
-    return Pose(vector(message.point, "point", FARTHEST))
+def _point(message: Any) -> CarPose:
+    return CarPose(vector(message.point, "point", FARTHEST))
 
 
 def _report(message: Any) -> RobustReport:

@@ -1,8 +1,8 @@
-"""What messages of cars tell, checked and in this project's conventions, whatever network or bag they came from."""
+"""Values of messages of cars, checked and in this project's conventions, from any network or bag."""
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ class Twist:
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class CarPose:
     """A pose of base_link in the map."""
 
     position: Array  # (3,) m
@@ -41,9 +41,9 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class RobustReport:
-    """What `robust` sends, see `coopenv.observers.robust.messages`."""
+    """Report of the observer `robust`, see `coopenv.observers.robust.messages`."""
 
-    position: Array | None  # None: the sender does not know where it is
+    position: Array | None  # None: the sender has no position
     rotation: Array | None
     covariance: Array | None
     extra: dict[str, NDArray[np.float64] | NDArray[np.uint64]]
@@ -58,10 +58,15 @@ class Calibration:
     principal_point: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
 
+    @classmethod
+    def of(cls, camera: Any) -> Self:
+        """Return the intrinsics of a camera of the scenario."""
+        return cls(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
+
 
 @dataclass(frozen=True, slots=True)
 class CarStatus:
-    """What a car says of itself."""
+    """Condition of a car."""
 
     armed: bool | None = None
     mode: str | None = None  # of the autopilot
@@ -69,12 +74,12 @@ class CarStatus:
     battery: float | None = None  # share that is left
 
 
-Value = Detections | Twist | Pose | RobustReport | Calibration | CarStatus
+Value = Detections | Twist | CarPose | RobustReport | Calibration | CarStatus
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What one message told."""
+    """Value of one message."""
 
     car: str
     role: Role

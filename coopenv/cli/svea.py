@@ -147,7 +147,7 @@ def gate(
     """
     from coopenv.base import interrupts
     from coopenv.cars.gate.core import Gate
-    from coopenv.cars.gate.process import CLOCK, GateSettings, Link, run
+    from coopenv.cars.gate.process import CLOCK, GateConnection, GateSettings, run
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     given = GateSettings.of(car, deployment).changed(
@@ -163,7 +163,7 @@ def gate(
     transport = given.open()
     try:
         decides = Gate(car, given.limits, CLOCK, verifier, given.station, given.profile)
-        link = Link(decides, car, transport, signer, given.profile)
+        link = GateConnection(decides, car, transport, signer, given.profile)
         interrupts.note(f"{car} is in neutral")
         if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -297,7 +297,7 @@ class RunOptions:
         False
     )
     release: Annotated[
-        bool, typer.Option("--release", help="With --arm: also cars that somebody has stopped. Know why, first.")
+        bool, typer.Option("--release", help="With --arm: also cars that were stopped elsewhere. Know why, first.")
     ] = False
     policy: options.PolicyName = "zero"
     seed: options.Seed = 0
@@ -320,7 +320,7 @@ class RunOptions:
 def run(given: RunOptions) -> None:
     """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
 
-    Without --arm no command is sent: run it beside the car that somebody else drives.
+    Without --arm no command is sent: run it beside a car with another driver.
     """
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.backend import open_svea
@@ -331,6 +331,8 @@ def run(given: RunOptions) -> None:
     changes, log = options.parse_overrides(given.overrides), options.console(stderr=True)
     with options.warned():
         backend = open_svea(given.config, None, changes, given.car, given.record, connect=given.connect)
+    if given.arm and backend.deployment.security.keys is None and not backend.deployment.fakes:
+        print("warning: without security.keys any station on the network can drive these cars", file=sys.stderr)
     also_kept(partial(kept_drive, given.record, backend))
     try:
         wishes = {"arm": given.arm, "release": given.release}

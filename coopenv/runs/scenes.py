@@ -14,7 +14,7 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.sources import Kind, kind_of, open_backend
+from coopenv.backends.sources import SourceKind, kind_of, open_backend
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import list_agents, list_envs
 from coopenv.observers import run
@@ -197,7 +197,7 @@ def scene_of_recording(
 def title_of(name: str) -> str:
     """Return what a source is called in headings."""
     path = Path(name)
-    return path.name if kind_of(name) in (Kind.LOG, Kind.BAG) else path.stem
+    return path.name if kind_of(name) in (SourceKind.LOG, SourceKind.BAG) else path.stem
 
 
 def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.backends.base import Told
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.observers import Message, Received, register, run
 from coopenv.observers.recording import Sensed, check_recording
 from coopenv.observers.single_frame import DeadReckoning
@@ -302,14 +302,14 @@ def test_messages_may_come_from_elsewhere(observer: str, extra: dict[str, np.nda
 
 
 class Talkative(Fleet):
-    """Takes what vehicles have to say."""
+    """Takes the broadcasts of vehicles."""
 
     def __init__(self, observer: str) -> None:
         super().__init__(observer)
-        self.told: list[Told] = []
+        self.told: list[VehicleBroadcast] = []
 
-    def tell(self, told: Sequence[Told]) -> None:
-        self.told.extend(told)
+    def broadcast(self, sent: Sequence[VehicleBroadcast]) -> None:
+        self.told.extend(sent)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         return {}
@@ -385,7 +385,7 @@ def test_what_it_cannot_do_is_said() -> None:
     with pytest.raises(CoopenvError, match=r"observer\.name: Fleet has its scenario already"):
         make(Fleet(), observer="mekf")
     for backend, why in (
-        ("svea", "deployment: needed by backend='svea': the file that says which cars drive"),
+        ("svea", "deployment: needed by backend='svea': the file with the cars that drive"),
         (5, "unknown backend '5'"),
     ):
         with pytest.raises(CoopenvError, match=why):

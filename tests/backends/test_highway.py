@@ -269,7 +269,7 @@ def test_other_environments_know_no_traffic() -> None:
     ):
         with pytest.raises(CoopenvError, match=why):
             coopenv.load_scenario("busy_intersection", overrides)
-    with pytest.raises(CoopenvError, match="backend 'simulated': highway_roundabout says backend = \"highway\""):
+    with pytest.raises(CoopenvError, match="backend 'simulated': highway_roundabout has backend = \"highway\""):
         coopenv.parallel_env(ROUNDABOUT, backend="simulated")
 
 

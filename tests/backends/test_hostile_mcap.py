@@ -300,7 +300,7 @@ def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path, monkeypa
 def test_a_chunk_that_is_not_what_it_says(written: Path, tmp_path: Path) -> None:
     path = tmp_path / "hostile.mcap"
     bomb(written, path, 2**20, claimed=2**20 + 1)
-    refused(path, "a chunk unpacks to 1048576 bytes, not to 1048577 as it says")
+    refused(path, "a chunk unpacks to 1048576 bytes, not to the stated 1048577")
 
 
 def test_a_record_that_goes_on_beyond_the_end(written: Path, tmp_path: Path) -> None:

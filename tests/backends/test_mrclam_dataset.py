@@ -104,5 +104,5 @@ def test_what_is_of_no_use_is_told(tmp_path):
     np.savetxt(path, table)
     with pytest.warns(DataWarning) as caught:
         load_dataset("mrclam_6", folder)
-    said = f"{own - 1} of {seen} detections left out, nobody carries their barcode"
+    said = f"{own - 1} of {seen} detections left out: no robot carries their barcode"
     assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]

@@ -17,7 +17,7 @@ from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock
-from coopenv.cars.gate.process import Link
+from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, USUAL, CarProfile, Drive, Role, load_profile
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
@@ -63,13 +63,13 @@ def test_its_gate_sends_its_own_command_message(rover: CarProfile) -> None:
     hub, sent, now = Hub(), list[Arrival](), [time.time_ns()]
     hub.connect().subscribe("robots/svea7/drive", sent.append)
     clock = GateClock(lambda: now[0], lambda: now[0])
-    link = Link(Gate("svea7", USUAL, clock, profile=rover), "svea7", hub.connect(), None, rover)
+    link = GateConnection(Gate("svea7", USUAL, clock, profile=rover), "svea7", hub.connect(), None, rover)
     now[0] += PERIOD
     link.tick()
     message = decode(sent[0].payload, "ackermann_msgs/msg/AckermannDriveStamped").drive
     assert (message.steering_angle, message.speed, message.acceleration) == (0.0, 0.0, 1.0)
     gates = Gates(hub.connect(), ("svea7",), USUAL, None, None, rover)
-    link.tell()
+    link.publish_status()
     assert gates.states["svea7"].state == "disarmed"
     values = rover.command.values(Drive(0.1, 0.5))
     assert values["steering_angle"] == pytest.approx(-5.7295780) and values["speed"] == 0.5

@@ -44,7 +44,7 @@ class Allowance:
         Args:
             compression: "zstd", "lz4", "bz2", or "" or "none" for none.
             data: the chunk.
-            claimed: bytes that it says to unpack to (0: unknown); a chunk that claims too much is not touched.
+            claimed: stated size after unpacking, bytes (0: unknown); a chunk that claims too much is not touched.
 
         Raises:
             TooLargeError: it unpacks to more than `AT_ONCE`, or than is left for the file.
@@ -52,7 +52,7 @@ class Allowance:
         """
         limit = min(AT_ONCE, self.left)
         size = claimed
-        if compression == "zstd":  # whose frames have a say of their own; -1 if not
+        if compression == "zstd":  # whose frames may state their size; -1 if not
             size = max(claimed, zstandard.frame_content_size(data))
         if size <= limit:
             unpacked = _first(compression, data, (claimed or limit) + 1)
@@ -77,7 +77,7 @@ def _first(compression: str, data: bytes, most: int) -> bytes:
 
 
 class Container:
-    """An MCAP file, read from begin to end; the index behind its data says nothing that its records do not."""
+    """An MCAP file, read from begin to end; the index behind its data is not needed."""
 
     def __init__(self, path: Path, forgiving: bool = False) -> None:
         """Read a file; if `forgiving`, of one that is cut off what is whole.
@@ -106,7 +106,7 @@ class Container:
     def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
         """Yield all messages in the order of the file, each with its channel and the schema of that.
 
-        A ValueError says that a chunk would unpack to too much or a message has no channel; others are the library's.
+        Raises ValueError: a chunk would unpack to too much, or a message has no channel. Others are the library's.
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
@@ -137,7 +137,7 @@ class Container:
                 data = allowance.unpack(record.compression, record.data, record.uncompressed_size)
                 if len(data) != record.uncompressed_size:
                     raise ValueError(
-                        f"a chunk unpacks to {len(data)} bytes, not to {record.uncompressed_size} as it says"
+                        f"a chunk unpacks to {len(data)} bytes, not to the stated {record.uncompressed_size}"
                     )
                 yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:

@@ -46,7 +46,7 @@ float64[] vectors  # x, y, z per target: unit vector camera -> target, body fram
 """,
     "coopenv_msgs/msg/Inbox": """
 std_msgs/Header header
-int64[] tick_sent  # per sender: when the last message heard was sent; -1: none
+int64[] tick_sent  # per sender: when the last received message was sent; -1: none
 """,
     "coopenv_msgs/msg/Pan": """
 std_msgs/Header header
@@ -305,7 +305,7 @@ class View(NamedTuple):
     """(tick, contents), in the order of ticks."""
 
 
-class Clock(NamedTuple):
+class LogClock(NamedTuple):
     """When ticks were."""
 
     dt: float

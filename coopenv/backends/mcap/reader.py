@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class TickArrays:
-    """K ticks of N vehicles and T targets, of which the first L are landmarks; `pan` says whether cameras turn."""
+    """K ticks of N vehicles and T targets, of which the first L are landmarks; `pan`: whether cameras turn."""
 
     def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int, pan: bool) -> None:
         """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
@@ -55,7 +55,7 @@ class TickArrays:
         self._seen = {name: np.zeros(ticks, dtype=bool) for name in self._places}
 
     def put(self, name: str, k: int, message: Any) -> None:
-        """Take the message of a topic at a tick; a ValueError says why it does not fit."""
+        """Take the message of a topic at a tick. Raises ValueError: it does not fit."""
         if k >= self._ticks:
             raise ValueError(f"the recording ends at tick {self._ticks - 1}")
         if self._seen[name][k] if name in self._seen else k in self._landmarks:

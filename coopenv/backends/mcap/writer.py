@@ -19,7 +19,7 @@ from coopenv.backends.mcap.format import (
     LANDMARKS_TYPE,
     PAN,
     SHOWN,
-    Clock,
+    LogClock,
     View,
     codec,
     header_of,
@@ -39,17 +39,17 @@ def write_recording(recording: Recording, path: str | Path, *, views: Sequence[V
         recording: what is read back.
         path: of the file.
         views: further topics for viewers, such as `coopenv.viz.foxglove.views` makes.
-        start: s since 1970, when tick 0 was; only the stamps tell.
+        start: s since 1970, time of tick 0, for the stamps alone.
 
     Raises:
         CoopenvError: the extra `log` is not installed.
-        DataError: it is a recording that nobody could read back.
+        DataError: it could not be read back.
         OutputError: the file cannot be written; an older one is untouched.
     """
     codec()  # before the file is touched
     check_recording(recording, "recording")
     with replacing_file(path) as new, new.open("wb") as stream:
-        _Log(stream, recording, Clock(recording.dt, start)).write(views)
+        _Log(stream, recording, LogClock(recording.dt, start)).write(views)
 
 
 def check_target(path: str | Path) -> None:
@@ -63,7 +63,7 @@ def check_target(path: str | Path) -> None:
 class _Log:
     """One file under way."""
 
-    def __init__(self, stream: Any, recording: Recording, clock: Clock) -> None:
+    def __init__(self, stream: Any, recording: Recording, clock: LogClock) -> None:
         from mcap.writer import Writer
 
         self.recording, self.clock, self.codec = recording, clock, codec()

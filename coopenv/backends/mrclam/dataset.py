@@ -25,10 +25,10 @@ MAX_DISORDER_S = 1.0  # by which a row may be late, as some are that were publis
 
 
 def find_folder(name: str, data: str | Path | None = None) -> Path:
-    """Return the folder of a sub-dataset: `data` or a folder in it, by default what COOPENV_DATA says.
+    """Return the folder of a sub-dataset: `data` or a folder in it, by default that of COOPENV_DATA.
 
     Raises:
-        DataError: unknown name, nothing said where the data are, or they are not there.
+        DataError: unknown name, no folder given, or they are not there.
     """
     if name not in NAMES:
         raise DataError(f"unknown data set {name!r}{suggest(str(name), NAMES)}; there are {NAMES[0]} .. {NAMES[-1]}")
@@ -196,7 +196,7 @@ class Robot:
     """(n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from the heading;
     those of one time are one camera frame."""
     truth: Truth  # for judging, and for starting where an observer is given its start
-    skipped: int  # detections left out because nobody carries their barcode (misread by the camera)
+    skipped: int  # detections left out because no robot carries their barcode (misread by the camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,10 +214,10 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
 
     Args:
         name: `mrclam_1` .. `mrclam_9`.
-        data: the sub-dataset's folder or its parent; by default what COOPENV_DATA says.
+        data: the sub-dataset's folder or its parent; by default that of COOPENV_DATA.
 
     Raises:
-        DataError: a folder, file or line is not what the format says; the message names file and line.
+        DataError: a folder, file or line does not have the format; the message names file and line.
     """
     folder = find_folder(name, data)
     barcodes = _barcodes(Table(folder / "Barcodes.dat", 2, least=len(ROBOTS) + 1))
@@ -244,7 +244,7 @@ def _remarks_on(dataset: Dataset) -> list[str]:
     blind = [str(robot.subject) for robot in dataset.robots if not len(robot.detections)]
     remarks = [f"no detections of robot {', '.join(blind)}"] if blind else []
     if skipped:
-        remarks.append(f"{skipped} of {skipped + used} detections left out, nobody carries their barcode")
+        remarks.append(f"{skipped} of {skipped + used} detections left out: no robot carries their barcode")
     return remarks
 
 

@@ -1,9 +1,8 @@
 """A sub-dataset as a `Recording`: recorded robots on regular ticks, in the form that every observer runs on.
 
 Five planar vehicles (z = 0, yaw only) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
-of any robot. A camera frame counts at the next tick; its bearings are turned by what the odometry turned in between, so
-that they are what the camera would have seen at the tick. Everybody hears everybody: at tick k the last message of
-tick k - 1 or before.
+of any robot. A camera frame counts at the next tick; its bearings are turned by the odometry's rotation in between.
+All robots receive from all others: at tick k the last message of tick k - 1 or before.
 """
 
 import math
@@ -44,7 +43,7 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     """Put a sub-dataset on ticks.
 
     Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
-    later starts where dead reckoning, back from there, says. In the variant `landmarks` no robot sees another, in
+    later starts at the pose of backward dead reckoning from there. In the variant `landmarks` no robot sees another, in
     `landmarks+robots` everything counts, and in `blind` robots 3 to 5 see robots only.
 
     Raises:
@@ -117,7 +116,7 @@ def _setups(subjects: list[int], landmarks: int) -> tuple[Setup, ...]:
 
 
 def _inbox(ticks: int, vehicles: int) -> NDArray[np.int64]:
-    """Return (K, N, N) the tick of the last message heard: sent one tick ago or more."""
+    """Return (K, N, N) the tick of the last received message: sent one tick ago or more."""
     before = np.maximum(np.arange(ticks) - 1, 0)
     last = before - before % MESSAGE_PERIOD_TICKS
     inbox = np.repeat(last, vehicles * vehicles).reshape(ticks, vehicles, vehicles)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from coopenv.backends.base import Backend
-from coopenv.backends.sources import Kind, is_bag, kind_of, open_backend, open_recording
+from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.bench.observers.faults import (
     FAULTS,
@@ -255,13 +255,13 @@ def find_source(
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
     kind, added = kind_of(text), tuple(variant_of(text) for text in dict.fromkeys(faults))
-    if kind is Kind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
+    if kind is SourceKind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
         scenario = load_scenario(text, overrides)
         worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
         return Simulated(Path(text).stem, scenario, _checked_policy(policy, scenario), added=worlds)
     if policy is not None:
         raise CoopenvError(f"--policy {policy}: {text} is recorded, nobody can drive in it")
-    if faults and kind is Kind.DATASET:
+    if faults and kind is SourceKind.DATASET:
         raise CoopenvError(
             f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"
         )
@@ -278,9 +278,9 @@ def _checked_policy(policy: str | None, scenario: Scenario) -> str:
 
 
 def _recorded(
-    text: str, kind: Kind, overrides: Mapping[str, Any] | None, data: Path | None, topics: Path | None
+    text: str, kind: SourceKind, overrides: Mapping[str, Any] | None, data: Path | None, topics: Path | None
 ) -> Source:
-    if data is not None and kind is not Kind.DATASET:
+    if data is not None and kind is not SourceKind.DATASET:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
     if is_bag(text, topics):
         return Bags(Path(text).stem, Path(text), topics, dict(overrides or {}))
@@ -288,7 +288,7 @@ def _recorded(
         raise CoopenvError(f"--map {topics}: is for ROS bags, {text} is none")
     if overrides:
         raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
-    if kind is Kind.LOG:
+    if kind is SourceKind.LOG:
         if not Path(text).is_file():
             raise CoopenvError(f"no such log file: {text}")
         return LogFile(Path(text).stem, Path(text))

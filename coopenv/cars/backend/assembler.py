@@ -1,15 +1,15 @@
 """From samples of all cars to ticks.
 
-A tick has a row per car. What it says holds for one moment of that car, its *moment*: when the camera frame of the tick
-was exposed. Odometry is integrated over the real time from one moment to the next, so that a late frame corrects the
-pose that the car had when it was exposed, and not the one that it has when the frame arrives. Without a new frame the
-moment goes on with the clock, as far behind it as the last frame was, and nothing is in view. Estimates and truth of a
-tick are those of the moment as well; how long ago it was is the tick's `bearing_age`.
+A tick has a row per car. A row holds for one time of that car, its *moment*: the exposure of the camera frame of the
+tick. Odometry is integrated over the real time from one moment to the next. So a late frame corrects the pose at its
+exposure, and not the pose at its arrival. Without a new frame the moment goes on with the clock, as far behind it as
+the last frame was, and nothing is in view. Estimates and truth of a tick hold for the moment, too; its age is the
+tick's `bearing_age`.
 """
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +22,17 @@ from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, Detections, Pose, RobustReport, Sample, Twist
+from coopenv.cars.samples import Calibration, CarPose, Detections, RobustReport, Sample, Twist
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.poses import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
-from coopenv.scenario.sensing import Camera
 
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9
 
 
 class _Car:
-    """What has come from one car."""
+    """The samples of one car."""
 
     def __init__(self) -> None:
         self.odometer, self.frames, self.track = Odometer(), Frames(), PoseTrack()
@@ -43,13 +42,13 @@ class _Car:
 
 
 class Assembler:
-    """Keeps what has come and makes ticks of it; what it gives follows from the order of calls alone."""
+    """Makes ticks of samples; the result depends on the order of calls alone."""
 
     def __init__(self, binding: Binding, offsets: Mapping[str, int] | None = None) -> None:
         """Begin with nothing.
 
         Args:
-            binding: who is who.
+            binding: vehicles and markers of the cars.
             offsets: ns to add to a car's stamps to have them on the receiver's clock (none: they are on it).
         """
         self.binding = binding
@@ -71,7 +70,7 @@ class Assembler:
         if stamp > sample.received + FUTURE:
             self.refused["stamp in the future"] += 1
         elif sample.car in self.binding.leaders:
-            if isinstance(value, Pose) and sample.role in (Role.ESTIMATE, Role.POINT):
+            if isinstance(value, CarPose) and sample.role in (Role.ESTIMATE, Role.POINT):
                 landmark = self.binding.leaders[sample.car]
                 self._inbox.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
         elif sample.car not in self.binding.cars:
@@ -86,14 +85,14 @@ class Assembler:
         elif isinstance(value, Detections):
             self.refused["detections left out"] += value.dropped
             car.frames.put(stamp, value)
-        elif role is Role.TRUTH and isinstance(value, Pose):
+        elif role is Role.TRUTH and isinstance(value, CarPose):
             if not car.track.put(stamp, self._inbox.on_map(value)):
                 self.refused["motion capture out of order"] += 1
-        elif isinstance(value, Pose | RobustReport) and vehicle not in self.binding.local:
+        elif isinstance(value, CarPose | RobustReport) and vehicle not in self.binding.local:
             self._inbox.put_vehicle(vehicle, role, stamp, value)
 
     def _count(self) -> None:
-        """Count what odometers and queues of frames have left out since the last call."""
+        """Count the samples that odometers and frame queues have dropped since the last call."""
         for car in self._cars:
             odometer, frames = car.odometer, car.frames
             counts = {
@@ -105,12 +104,12 @@ class Assembler:
             self.refused.update({why: count for why, count in counts.items() if count})
 
     def begin(self, now: int) -> Sensed:
-        """Return tick 0 at a time in ns; what came before says where the cars are now."""
+        """Return tick 0 at a time in ns; earlier samples give the present state of the cars."""
         self._begin = now
         for car in self._cars:
             while car.frames.take(-1, now) is not None:
                 pass
-            car.frames.skipped = 0  # nobody has asked for frames since the last episode
+            car.frames.skipped = 0  # no tick took frames since the last episode
             car.moment, car.lag, car.exposed = now - self._period, 0, None
             car.odometer.increment(now - self._period, now - self._period)
         self._inbox.forget()
@@ -208,30 +207,25 @@ class Assembler:
 
 WINDOW = 2_000_000_000  # ns over which the least delay is looked for
 
-SPOKEN = (Role.ESTIMATE, Role.POINT, Role.REPORT)
-"""What cars tell each other."""
+BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
+"""Messages between cars."""
 
 VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "wheel": (Role.WHEEL,), "odometry": (Role.ODOMETRY,)}
 
 
 def roles_of(sensors: Sensors, local: bool) -> tuple[Role, ...]:
-    """Return what is read of a car that is estimated here, or of one that is not."""
-    heard: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
+    """Return the roles that are read of a car, estimated here (`local`) or elsewhere."""
+    truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
     if not local:
-        return (*heard, *SPOKEN)
-    return (*VELOCITY[sensors.odometry], Role(sensors.detections), *heard)
+        return (*truth, *BROADCAST)
+    return (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
 
 
 @dataclass
 class ClockOffset:
-    """How much later than they were stamped a car's messages come, at least; times in ns."""
+    """Least delay of a car's messages between stamp and reception; times in ns."""
 
-    _least: deque[tuple[int, int]]  # when it was received, delay; increasing delays
-
-    @classmethod
-    def unknown(cls) -> "ClockOffset":
-        """Return one that has seen no message."""
-        return cls(deque())
+    _least: deque[tuple[int, int]] = field(default_factory=deque)  # time of reception, delay; increasing delays
 
     def put(self, stamp: int, received: int) -> None:
         """Take a message."""
@@ -244,7 +238,7 @@ class ClockOffset:
 
     @property
     def seconds(self) -> float | None:
-        """Offset of the car's clock behind the receiver's, the network's delay included, s; None: nothing has come."""
+        """Offset of the car's clock behind the receiver's, network delay included, s; None: no message yet."""
         return self._least[0][1] * 1e-9 if self._least else None
 
 
@@ -252,13 +246,13 @@ class Intake:
     """Reads the messages of all cars."""
 
     def __init__(self, binding: Binding, sensors: Sensors) -> None:
-        """Say which topics are read."""
+        """Collect the topics that are read."""
         self._topics: dict[str, tuple[str, Role, Calibration | None]] = {}
         self._sensors, self._profile = sensors, binding.profile
-        self.offsets = {name: ClockOffset.unknown() for name in binding.cars}
+        self.offsets = {name: ClockOffset() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
-        self.calibrations = {name: _calibration(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
+        self.calibrations = {name: Calibration.of(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
         """Of the environment, by car."""
         for name, vehicle in binding.cars.items():
             for role in roles_of(sensors, vehicle in binding.local):
@@ -273,7 +267,7 @@ class Intake:
         return tuple(self._topics)
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
-        """Yield what a message tells: one sample, or none where it is not what it should be."""
+        """Yield the sample of a message, or none if the message is malformed."""
         found = self._topics.get(arrival.topic)
         if found is None:
             return
@@ -290,7 +284,3 @@ class Intake:
         if car in self.offsets and role is not Role.TRUTH:
             self.offsets[car].put(stamp, arrival.received)
         yield Sample(car, role, stamp, arrival.received, value)
-
-
-def _calibration(camera: Camera) -> Calibration:
-    return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, Told
+from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
-from coopenv.cars.backend.assembler import SPOKEN, VELOCITY, Assembler, Intake
+from coopenv.cars.backend.assembler import BROADCAST, VELOCITY, Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind, reset_options
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
-from coopenv.cars.backend.neighbours import checked, estimate_message, report_message
+from coopenv.cars.backend.neighbours import estimate_message, is_finite, report_message
 from coopenv.cars.backend.start import ROLES, Fleet, Start, StatusBoard
 from coopenv.cars.backend.station import Gates, Pacer, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog
@@ -46,7 +46,7 @@ class Svea:
     """Cars as a source of ticks.
 
     `reset(options={"arm": True})` lets them drive; without it everything happens but that commands are sent. An episode
-    ends early when the watchdog stops the cars; `notes` say why.
+    ends early when the watchdog stops the cars; `notes` give the reason.
     """
 
     def __init__(
@@ -62,9 +62,9 @@ class Svea:
 
         Args:
             deployment: the fleet.
-            binding: who is who in it.
-            transport: how it is reached; closed with the backend.
-            signer: signs what is sent (None: nothing is signed).
+            binding: vehicles and markers of its cars.
+            transport: the network; closed with the backend.
+            signer: signs sent messages (None: they are not signed).
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
         """
@@ -85,9 +85,9 @@ class Svea:
         self.health: Health = self.link
         self.intake = Intake(binding, deployment.sensors)
         own = deployment.security.identity
-        heard = (*binding.cars, *binding.leaders)
-        said = {binding.profile.topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
-        self.station = Station(transport, self.intake.topics, verifier, said)
+        fleet_names = (*binding.cars, *binding.leaders)
+        signers = {binding.profile.topic_of(name, role): (name, own) for name in fleet_names for role in BROADCAST}
+        self.station = Station(transport, self.intake.topics, verifier, signers)
         self.gates = Gates(transport, tuple(self._local), deployment.limits, signer, verifier, binding.profile)
         self.board = StatusBoard(
             transport, tuple(self._local), deployment.remote, deployment.conditions, binding.profile
@@ -98,7 +98,7 @@ class Svea:
         self._origin = np.array(self.scenario.map.origin)
         safety, self.monitor = deployment.safety, LinkMonitor(deployment.safety.judge)
         self._odometry = VELOCITY[deployment.sensors.odometry]
-        self._others = tuple(name for name in heard if name not in self._local)
+        self._others = tuple(name for name in fleet_names if name not in self._local)
         self.watchdog = Watchdog(
             safety,
             self.station,
@@ -137,16 +137,16 @@ class Svea:
         """Begin an episode; cars move only with the option `arm`.
 
         Raises:
-            CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
+            CoopenvError: an option is not known, or a condition of arming does not hold.
         """
         self._stop("reset")
-        wishes = reset_options(options)
+        given = reset_options(options)
         self._start.prepare(0 if seed is None else seed)
         self.monitor.begin(self._pacer.now())
-        self._start.listen(wishes.arm)
+        self._start.listen(given.arm)
         self.station.dropped.clear()
-        if wishes.arm:
-            self._start.arm(wishes.release)
+        if given.arm:
+            self._start.arm(given.release)
             self._armed = True
         self._drain()
         self._began, self._index = self._pacer.start(), 0
@@ -203,11 +203,11 @@ class Svea:
         self.link.refused, self.health.rejected = dict(refused), sum(refused.values())
         return tick
 
-    def tell(self, told: Sequence[Told]) -> None:
-        """Send what the vehicles estimated here have to say, as they believe to be at the present tick."""
-        for each in told:
+    def broadcast(self, sent: Sequence[VehicleBroadcast]) -> None:
+        """Send the estimates of the vehicles estimated here at the present tick."""
+        for each in sent:
             name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
-            if not checked(each):
+            if not is_finite(each):
                 continue
             if self.deployment.safety.judge == "estimate":
                 self.monitor.place(name, each.position + self._origin, moment)
@@ -222,7 +222,7 @@ class Svea:
         self._transport.publish(topic, payload, signature)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
-        """Return what a vehicle's info tells of its car and of the network."""
+        """Return the entries of a vehicle's info about its car and the network."""
         name = self.binding.names[vehicle]
         gate, trip = self.gates.states.get(name), self.watchdog.trip
         offset = self.intake.offsets[name].seconds
@@ -293,12 +293,12 @@ def open_svea(
         path: the file.
         environment: name or path in place of the file's own.
         overrides: dotted keys of the environment, after the file's.
-        car: estimate and drive this one alone, the others are heard (None: all of them, as an edge server does).
+        car: estimate and drive this car alone, receive from the others (None: estimate all, as an edge server does).
         record: MCAP file to write what comes and goes to.
-        transport: a network that is open already (None: as the file says).
+        transport: a network that is open already (None: that of the file).
         connect: endpoint in place of the file's.
 
-    A `DataWarning` tells of landmarks and vehicles that no camera can tell.
+    A `DataWarning` names landmarks and vehicles that cameras cannot identify.
 
     Raises:
         CoopenvError: one line that names the file and the field, or what cannot be reached.
@@ -307,7 +307,7 @@ def open_svea(
     scenario = scenario_of(deployment, environment, overrides or {})
     binding = bind(scenario, deployment.cars, deployment.markers, Path(path).name, car, deployment.profile)
     if binding.unmarked:
-        remark = f"{Path(path).name}: no markers, so that no camera can tell them: {listed(binding.unmarked)}"
+        remark = f"{Path(path).name}: no markers, so cameras cannot identify them: {listed(binding.unmarked)}"
         warnings.warn(DataWarning(remark), stacklevel=2)
     signer, verifier = _keys(deployment, binding, car)
     link = open_transport(deployment) if transport is None else transport
@@ -349,7 +349,7 @@ def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapp
 
 
 def _of_the_file(deployment: Deployment, environment: str) -> CoopenvError | None:
-    """Return what is wrong with a deployment's own overrides; None: nothing."""
+    """Return the error of a deployment's own overrides; None: they are valid."""
     try:
         load_scenario(environment, deployment.overrides)
     except ScenarioError as error:

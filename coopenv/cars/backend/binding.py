@@ -31,7 +31,7 @@ class Binding:
 
     @property
     def unmarked(self) -> tuple[str, ...]:
-        """Names of landmarks and vehicles without a marker, which no camera can tell; one vehicle alone needs none."""
+        """Names of landmarks and vehicles that cameras cannot identify: no marker. A single vehicle needs none."""
         names = self.scenario.target_names
         count = len(names) if len(self.cars) > 1 else len(self.scenario.landmarks)
         return tuple(name for target, name in enumerate(names[:count]) if target not in self.targets.values())
@@ -56,7 +56,7 @@ def bind(
         scenario: what the cars are vehicles of.
         cars: the fleet.
         markers: numbers of the markers of landmarks, by name.
-        where: the file that says so.
+        where: name of the file, for errors.
         only: the car whose vehicle alone is estimated here; None: all are.
         profile: make of the cars.
 
@@ -87,7 +87,7 @@ def bind(
     for i, camera in enumerate(scenario.cameras):
         if camera.model != "pinhole":
             raise CoopenvError(
-                f"{where}: the camera of {vehicles[i]} has no calibration: [camera] of the environment must say "
+                f"{where}: the camera of {vehicles[i]} has no calibration: [camera] of the environment needs "
                 'model = "pinhole", image_size, focal_length, principal_point and distortion'
             )
     if only is not None and only not in chosen:

@@ -1,9 +1,8 @@
 """A recorded drive of cars in their place: the same messages, the same ticks.
 
 The file is a ROS 2 bag that other tools read: every message stands under its own topic and type. What goes beyond that
-is the topic `coopenv/tick` and an attachment that says which fleet and environment it was; with both, a replay makes
-the same ticks again, bit for bit (`coopenv.cars.backend.drive`). `coopenv/stopped` tells why the watchdog stopped the
-cars.
+is the topic `coopenv/tick` and an attachment with the fleet and the environment. With both, a replay makes the
+same ticks again, bit for bit. `coopenv/stopped` gives the reason for which the watchdog stopped the cars.
 """
 
 import json
@@ -50,7 +49,7 @@ class DriveRecorder:
 
         Args:
             path: of the file, which must not be there.
-            head: what the replay has to know.
+            head: fleet and environment, for the replay.
             types: type of every topic.
 
         Raises:
@@ -103,7 +102,7 @@ class DriveRecorder:
             self._queue.put((topic, payload, now))
 
     def stopped(self, reason: str, car: str, now: int) -> None:
-        """Write why the watchdog stopped the cars at a time in ns, and whose fault it was; that cannot get lost."""
+        """Write the reason and the car for which the watchdog stopped the cars at a time in ns, and flush."""
         self._queue.put((STOPPED_TOPIC, _stopped(reason, car, now), now))
 
     def close(self) -> None:
@@ -215,7 +214,7 @@ class Drive(TickGenerator):
             DataError: it is none, or is damaged.
             CoopenvError: an override is not valid, or the extra is missing.
         """
-        codec()  # says which extra is missing
+        codec()  # whose error names the missing extra
         from coopenv.backends.mcap.container import Container
 
         self._where = str(path)
@@ -264,11 +263,11 @@ class Drive(TickGenerator):
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
 
     def _warn(self) -> None:
-        """Say from where on the file is missing."""
+        """Warn of the time at which the file breaks off."""
         times = [message.received if isinstance(message, Arrival) else message.time for message in self._messages]
         seconds = (max(times) - min(times)) * 1e-9
         warnings.warn(
-            f"{self._where}: {CUT_OFF}: of what came after {seconds:.1f} s nothing is replayed",
+            f"{self._where}: {CUT_OFF}: nothing after {seconds:.1f} s is replayed",
             DataWarning,
             stacklevel=3,
         )
@@ -291,7 +290,7 @@ class Drive(TickGenerator):
             raise DataError(f"{self._where}: damaged MCAP file ({type(error).__name__})") from None
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Go through the messages from the begin, giving the ticks of one episode; `arm` moves nobody."""
+        """Go through the messages from the begin, yielding the ticks of one episode; `arm` has no effect."""
         reset_options(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes
         intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
@@ -345,7 +344,7 @@ class RecordedTransport:
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
-        """Send, see `Transport`, and write down."""
+        """Send, see `Transport`, and record the message."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
         self._recorder.write(topic, payload, time.time_ns())
 
@@ -359,7 +358,7 @@ class RecordedTransport:
         self._transport.subscribe(pattern, take if pattern in self._aside else callback)
 
     def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`, and write down who comes and goes."""
+        """Watch, see `Transport`, and record the changes."""
 
         def change(name: str, there: bool) -> None:
             self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())

@@ -7,12 +7,12 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.base import Told
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make
 from coopenv.cars.profile import Role
-from coopenv.cars.samples import Pose, RobustReport
+from coopenv.cars.samples import CarPose, RobustReport
 from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six
@@ -20,8 +20,8 @@ from coopenv.scenario.base import rotation_of
 from coopenv.scenario.starts import neighbour_sets
 
 
-def message_of(value: Pose | RobustReport, marker: Array) -> Message:
-    """Return what an observer reads of a sender whose marker is at `marker` (3,) in its body, m.
+def message_of(value: CarPose | RobustReport, marker: Array) -> Message:
+    """Return the message of a sender for an observer; its marker is at `marker` (3,) in the body frame, m.
 
     A position without an orientation gives the marker's height alone.
     """
@@ -37,15 +37,15 @@ def message_of(value: Pose | RobustReport, marker: Array) -> Message:
     return Message(value.position + arm, value.rotation, covariance)
 
 
-def estimate_message(told: Told, stamp: int, origin: Array) -> Any:
+def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
     """Return the PoseWithCovarianceStamped of an estimate; rotations of its covariance are about the map's axes.
 
     `origin` (3,) is that of the map in the coordinates of the scenario's file, which are those on the wire.
     """
-    P = left_covariance(told.rotation.T @ told.position, told.covariance)
+    P = left_covariance(sent.rotation.T @ sent.position, sent.covariance)
     turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = told.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    pose, covariance = _pose(told.rotation, told.position + origin), (turn @ P @ turn.T).ravel()
+    turn[:3, 3:] = turn[3:, :3] = sent.rotation  # (theta, rho) in the body to (position, rotation) in the map
+    pose, covariance = _pose(sent.rotation, sent.position + origin), (turn @ P @ turn.T).ravel()
     return make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=header(stamp, "map"),
@@ -53,12 +53,12 @@ def estimate_message(told: Told, stamp: int, origin: Array) -> Any:
     )
 
 
-def report_message(told: Told, stamp: int, origin: Array) -> Any | None:
-    """Return the RobustReport of a vehicle, `origin` as for `estimate_message`; None: its observer has no such ones.
+def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | None:
+    """Return the RobustReport of a vehicle, `origin` as for `estimate_message`; None: its observer has no such report.
 
-    Its dead reckoning is from where it began, and knows no map.
+    Its dead reckoning starts at the identity, in no map frame.
     """
-    m = told.message
+    m = sent.message
     if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
         return None
     valid = m.position is not None and m.rotation is not None and m.covariance is not None
@@ -86,15 +86,15 @@ def _pose(R: Array, p: Array) -> Any:
     )
 
 
-def checked(told: Told) -> bool:
-    """Return whether an estimate is one that others can read."""
-    numbers = np.concatenate([told.rotation.ravel(), told.position, told.covariance.ravel()])
+def is_finite(sent: VehicleBroadcast) -> bool:
+    """Return whether an estimate is finite."""
+    numbers = np.concatenate([sent.rotation.ravel(), sent.position, sent.covariance.ravel()])
     return bool(np.isfinite(numbers).all())
 
 
 NS = 1e-9
 
-Placed = TypeVar("Placed", bound=Pose | RobustReport)
+Placed = TypeVar("Placed", bound=CarPose | RobustReport)
 
 
 class NeighbourInbox:
@@ -113,40 +113,40 @@ class NeighbourInbox:
         places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
         self._landmarks = np.array(places).reshape(-1, 3) - self._origin
         self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
-        self._hears = neighbour_sets(scenario)  # targets by vehicle
+        self._receives_from = neighbour_sets(scenario)  # targets by vehicle
         markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]
         self._markers = [np.array(marker) for marker in markers]
-        self._heard: dict[int, dict[Role, tuple[int, Pose | RobustReport]]] = {}  # since the last tick
-        self._said: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
+        self._received: dict[int, dict[Role, tuple[int, CarPose | RobustReport]]] = {}  # since the last tick
+        self._stamps: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
 
-    def on_map(self, told: Placed) -> Placed:
-        """Return what holds in the coordinates of the scenario's file as on its map."""
-        return told if told.position is None else replace(told, position=told.position - self._origin)
+    def on_map(self, value: Placed) -> Placed:
+        """Return a value in the coordinates of the scenario's file in those of its map."""
+        return value if value.position is None else replace(value, position=value.position - self._origin)
 
-    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: Pose) -> None:
+    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: CarPose) -> None:
         """Take a message of a moving landmark; `age` is its age at reception, ns."""
         position = message_of(self.on_map(pose), self._markers[landmark]).position
         if age > self._max_age:
             self._refused["stale message"] += 1
         elif position is not None and self._is_new(landmark, role, stamp):
-            self._led[landmark].put(stamp, position)  # unless it has said so in another role
+            self._led[landmark].put(stamp, position)  # older than the same position in another role: not kept
 
-    def put_vehicle(self, vehicle: int, role: Role, stamp: int, told: Pose | RobustReport) -> None:
+    def put_vehicle(self, vehicle: int, role: Role, stamp: int, value: CarPose | RobustReport) -> None:
         """Take a message of a vehicle that is estimated elsewhere."""
         if self._is_new(len(self._landmarks) + vehicle, role, stamp):
-            self._heard.setdefault(vehicle, {})[role] = stamp, self.on_map(told)
+            self._received.setdefault(vehicle, {})[role] = stamp, self.on_map(value)
 
     def _is_new(self, target: int, role: Role, stamp: int) -> bool:
         """Return whether a message is newer than the last one of a target; count it where it is older, or replayed."""
-        if stamp <= self._said.get((target, role), 0):
+        if stamp <= self._stamps.get((target, role), 0):
             self._refused["message out of order"] += 1
             return False
-        self._said[target, role] = stamp
+        self._stamps[target, role] = stamp
         return True
 
     def forget(self) -> None:
         """Drop all messages of vehicles."""
-        self._heard.clear()
+        self._received.clear()
 
     def is_lost(self, target: int, now: int) -> bool:
         """Return whether a target is a moving landmark of unknown position."""
@@ -166,16 +166,16 @@ class NeighbourInbox:
         The neighbours are those of the environment. Its delays and losses do not apply, as the radio is real.
         """
         found, L = {}, len(self._landmarks)
-        for sender, by_role in self._heard.items():
-            receivers = [i for i in self._binding.local if L + sender in self._hears[i]]
+        for sender, by_role in self._received.items():
+            receivers = [i for i in self._binding.local if L + sender in self._receives_from[i]]
             newest = by_role.get(Role.REPORT) or by_role.get(Role.ESTIMATE) or by_role.get(Role.POINT)
             if newest is None or not receivers:
                 continue
-            stamp, told = newest
+            stamp, value = newest
             if now - stamp > self._max_age:
                 self._refused["stale message"] += 1
                 continue
-            message = message_of(told, self._markers[L + sender])
+            message = message_of(value, self._markers[L + sender])
             found.update({(i, sender): Received(message, max(0, now - stamp) * NS) for i in receivers})
-        self._heard.clear()
+        self._received.clear()
         return found

@@ -26,9 +26,9 @@ ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
 class Condition:
     """Last condition of a car."""
 
-    said: CarStatus = field(default_factory=CarStatus)
+    status: CarStatus = field(default_factory=CarStatus)
     stamps: dict[Role, int] = field(default_factory=dict)  # ns, clock of the car
-    since: dict[Role, float] = field(default_factory=dict)  # s, monotonic: when what was said held
+    since: dict[Role, float] = field(default_factory=dict)  # s, monotonic: when the condition held
 
     def age(self, role: Role) -> float:
         """Return the age of the last message of a role, s; inf: none was received."""
@@ -64,7 +64,7 @@ class StatusBoard:
     def battery(self, car: str) -> float | None:
         """Return the share of a car's battery that is left; None: it is not known."""
         with self._lock:
-            return self._conditions[car].said.battery
+            return self._conditions[car].status.battery
 
     def calibration(self, car: str) -> Calibration | None:
         """Return the calibration that a car publishes; None: none was received."""
@@ -83,12 +83,12 @@ class StatusBoard:
         for role in self._conditions_needed:
             if why := self._silent(now, car, role):
                 return why
-        if self._remote.drives(now.said.pulses or (), self._profile.pulses):
+        if self._remote.drives(now.status.pulses or (), self._profile.pulses):
             return "is driven by remote control"
-        fault = self._remote.fault(now.said.pulses or (), self._profile.pulses)
+        fault = self._remote.fault(now.status.pulses or (), self._profile.pulses)
         if fault and Role.REMOTE in self._conditions_needed:
             return fault
-        return "its autopilot is not armed" if Role.STATE in self._conditions_needed and not now.said.armed else ""
+        return "its autopilot is not armed" if Role.STATE in self._conditions_needed and not now.status.armed else ""
 
     def happened(self, car: str) -> str:
         """Return the reason to stop an armed car by its conditions since arming; empty: none."""
@@ -111,9 +111,9 @@ class StatusBoard:
                 before = self._conditions[car]
                 if stamp > before.stamps.get(role, -1):
                     since = {**before.since, role: time.monotonic() - max(delay, 0.0)}
-                    now = Condition(_joined(before.said, value, role), {**before.stamps, role: stamp}, since)
+                    now = Condition(_joined(before.status, value, role), {**before.stamps, role: stamp}, since)
                     self._conditions[car] = now
-                    if car in self._begun and (why := self._changed(self._begun[car].said, now.said)):
+                    if car in self._begun and (why := self._changed(self._begun[car].status, now.status)):
                         self._happened.setdefault(car, why)
 
     def _changed(self, then: CarStatus, now: CarStatus) -> str:
@@ -134,7 +134,7 @@ class StatusBoard:
         age, topic = condition.age(role), self._profile.topic_of(car, role)
         if age <= (self._profile.topics[role].max_age or 0.0):
             return ""
-        return f"nothing of use has {'ever come' if age == float('inf') else f'come for {age:.2f} s'} on {topic}"
+        return f"no usable message {'was received' if age == float('inf') else f'for {age:.2f} s'} on {topic}"
 
 
 def _joined(before: CarStatus, value: CarStatus, role: Role) -> CarStatus:
@@ -165,21 +165,21 @@ class Fleet:
 
 
 def problems_of(fleet: Fleet) -> Iterator[str]:
-    """Yield what is not as it has to be, the first that one would look at first."""
+    """Yield the violated conditions of arming, the most basic ones first."""
     safety, sensors = fleet.deployment.safety, fleet.deployment.sensors
     for car in fleet.calibrations:
-        yield from _its_clock(fleet, car)  # by which all else is judged
+        yield from _its_clock(fleet, car)  # other ages depend on it
         for role in VELOCITY[sensors.odometry]:
             topic = fleet.deployment.profile.topic_of(car, role)
             if (age := fleet.station.silence(topic)) > safety.odometry_age:
                 yield f"{car}: no odometry on {topic} {_since(age)}"
             if (age := fleet.monitor.age(car, role)) > safety.odometry_age:
-                yield f"{car}: nothing new that could be used on {topic} {_since(age)}"
+                yield f"{car}: no usable new message on {topic} {_since(age)}"
         camera = fleet.deployment.profile.topic_of(car, Role(sensors.detections))
         if (age := fleet.station.silence(camera)) > safety.odometry_age:
             yield f"{car}: no camera frames on {camera} {_since(age)}"
         yield from _about_itself(fleet, car)
-    if safety.judge == "truth":  # what cars believe is not known before they drive
+    if safety.judge == "truth":  # estimates are not known before cars drive
         for car, wrong in misplaced(safety, fleet.monitor, fleet.calibrations, fleet.others):
             yield f"{car}: {wrong}"
 
@@ -200,33 +200,33 @@ def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
     battery = fleet.board.battery(car)
     needed = fleet.deployment.conditions and "battery" in fleet.deployment.profile.conditions
     if battery is None and needed and safety.min_battery > 0.0:
-        yield f"{car}: its battery does not tell how much is left (safety.min_battery = 0 does without)"
+        yield f"{car}: its battery publishes no charge (safety.min_battery = 0 needs none)"
     if battery is not None and battery < safety.min_battery:
         yield f"{car}: its battery is at {100 * battery:.0f} %, {100 * safety.min_battery:.0f} % are needed"
-    told, used = fleet.board.calibration(car), fleet.calibrations[car]
-    if told is not None and (difference := _difference(told, used)):
-        yield f"{car}: its camera says {difference}"
+    published, used = fleet.board.calibration(car), fleet.calibrations[car]
+    if published is not None and (difference := _difference(published, used)):
+        yield f"{car}: its camera publishes {difference}"
 
 
-def _difference(told: Calibration, used: Calibration) -> str:
+def _difference(published: Calibration, used: Calibration) -> str:
     """Return in which entry two calibrations differ, empty where they agree."""
     for name, tolerance in (("image_size", 0.5), ("focal_length", PIXELS), ("principal_point", PIXELS)):
-        a, b = getattr(told, name), getattr(used, name)
+        a, b = getattr(published, name), getattr(used, name)
         if (np.abs(np.subtract(a, b)) > tolerance).any():
-            return f"{name} = {list(a)}, the environment says {list(b)}"
-    if (np.abs(np.subtract(told.distortion, used.distortion)) > DISTORTION).any():
-        return f"distortion = {list(told.distortion)}, the environment says {list(used.distortion)}"
+            return f"{name} = {list(a)}, the environment has {list(b)}"
+    if (np.abs(np.subtract(published.distortion, used.distortion)) > DISTORTION).any():
+        return f"distortion = {list(published.distortion)}, the environment has {list(used.distortion)}"
     return ""
 
 
 def _since(age: float) -> str:
-    return "(nothing has ever come)" if np.isinf(age) else f"for {age:.2f} s"
+    return "(none was received)" if np.isinf(age) else f"for {age:.2f} s"
 
 
-FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
-CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
-READY_WORD = 2.0  # s in which all has to be at once as arming wants it; cars tell of themselves once a second
-SETTLE = 0.5  # s that fakes have to stand where they were put
+FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
+CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
+READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second
+SETTLE = 0.5  # s for fakes to settle at their start
 
 
 class Start:
@@ -254,7 +254,7 @@ class Start:
         self._fleet, self._transport, self._gates, self._watchdog = fleet, transport, gates, watchdog
         topic_of = fleet.deployment.profile.topic_of
         self._topics = [topic_of(name, role) for name in fleet.calibrations for role in odometry]
-        self._drain, self._heard_once = drain, False
+        self._drain, self._received_once = drain, False
 
     def prepare(self, seed: int) -> None:
         """Free memory now, as that would take longer than a decision may, and put fakes at the start of a seed."""
@@ -267,24 +267,29 @@ class Start:
             time.sleep(SETTLE)
 
     def listen(self, arm: bool) -> None:
-        """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
+        """Wait a limited time for messages of the cars: only driving needs them."""
         silence, board = self._fleet.station.silence, self._fleet.board
-        _wait(lambda: all(silence(topic) < 1.0 for topic in self._topics), 0 if self._heard_once else FIRST_WORD)
+        _wait(
+            lambda: all(silence(topic) < 1.0 for topic in self._topics),
+            0 if self._received_once else FIRST_MESSAGES_TIME,
+        )
         if arm:
-            _wait(lambda: all(board.calibration(name) is not None for name in self._fleet.calibrations), CAMERA_WORD)
-        self._heard_once = True
+            _wait(
+                lambda: all(board.calibration(name) is not None for name in self._fleet.calibrations), CAMERA_INFO_TIME
+            )
+        self._received_once = True
         self._drain()
 
     def arm(self, release: bool) -> None:
         """Open the gates and look after the cars.
 
         Args:
-            release: whether cars, too, that somebody else has stopped.
+            release: whether to arm cars that another station has stopped as well.
 
         Raises:
-            CoopenvError: something is not as it has to be before wheels turn.
+            CoopenvError: a condition of arming does not hold.
         """
-        _wait(lambda: self._problem() is None, READY_WORD)
+        _wait(lambda: self._problem() is None, READY_TIME)
         if found := self._problem():
             raise CoopenvError(f"not armed: {found}")
         self._watchdog.forget()

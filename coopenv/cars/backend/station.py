@@ -36,14 +36,14 @@ class Station:
             transport: the network.
             topics: what to subscribe to.
             verifier: checks signatures; None: nothing is signed.
-            signers: topic to who may have signed it, for those that others could forge.
+            signers: identities that may sign a topic, for topics that could be forged.
         """
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in topics}
         self._last: dict[str, float] = {}
         self._verifier, self._signers = verifier, signers
         self.dropped: Counter[str] = Counter()
-        """Messages by why they were dropped before anybody looked at them: overflow, signature, too long."""
+        """Messages dropped before they were decoded, by reason: overflow, signature, too long."""
         for topic in self._waiting:
             transport.subscribe(topic, self._keep)
 
@@ -74,7 +74,7 @@ class Station:
         return self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in expected
 
     def drain(self) -> list[Arrival]:
-        """Return what has come since the last call, in the order in which it was received."""
+        """Return the messages since the last call, in the order of reception."""
         with self._lock:
             taken = [arrival for waiting in self._waiting.values() for arrival in waiting]
             for waiting in self._waiting.values():
@@ -142,7 +142,7 @@ class Pacer:
         return now
 
     def _leave_out(self) -> bool:
-        """Leave out the decisions whose time is over, and say whether there were any."""
+        """Skip decisions whose time is over; return whether there were any."""
         over = (self.now() - self._due) // self._decision
         if over <= 0:
             return False
@@ -155,32 +155,34 @@ class Pacer:
         return float(np.quantile(self.lateness, share)) if self.lateness else 0.0
 
 
-PATIENCE = 1.0  # s in which a gate has to answer
-WORD = 0.5  # s in which every gate has spoken once more
+PATIENCE = 1.0  # s for a gate to answer
+STATUS_TIME = 0.5  # s for a new status of every gate
 LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
-OLD = 1.0  # s after which a gate that says nothing counts as gone
+OLD = 1.0  # s without a status after which a gate counts as gone
 POLL = 0.01  # s
+OPEN = ("armed", "timed_out")
+"""States of a gate that takes commands: after a time-out the car stands until the next one."""
 
 
 @dataclass
 class GateState:
-    """What a gate has said last."""
+    """Last status of a gate."""
 
     state: str = "unknown"
     session: str = ""
     nonce: str = ""
     accepted: int = 0
     rejections: dict[str, int] = field(default_factory=dict)
-    heard: float = float("-inf")  # by the monotonic clock, s
+    received: float = float("-inf")  # by the monotonic clock, s
 
     @property
     def age(self) -> float:
-        """How long ago it spoke, s."""
-        return time.monotonic() - self.heard
+        """Age of the status, s."""
+        return time.monotonic() - self.received
 
 
 class Gates:
-    """The gates of some cars."""
+    """Sessions with the gates of some cars."""
 
     def __init__(
         self,
@@ -200,31 +202,31 @@ class Gates:
         self._stamps = dict.fromkeys(cars, 0)
         self._stopping = False
         self.stopped_by_others: set[str] = set()
-        """Cars that somebody else has stopped, since their last arming."""
+        """Cars stopped by another station, or on the spot, since their last arming."""
         self.dropped = {car: Counter[str]() for car in cars}
-        """What gates seem to have said and was not believed, by car and reason."""
+        """Status messages that were dropped, by car and reason."""
         self.session = ""
         self._sequence = 0
         for topic in self._cars:
-            transport.subscribe(topic, self._hear)
+            transport.subscribe(topic, self._receive)
 
     @property
     def states(self) -> dict[str, GateState]:
-        """What each gate has said last."""
+        """Last status of each gate."""
         with self._lock:
             return dict(self._states)
 
     def refused(self, car: str) -> dict[str, int]:
-        """Return what a gate has refused since it was armed for this session, or since it was first heard, by reason.
+        """Return the refusals of a gate by reason, since it was armed for this session or since its first status.
 
-        It counts since it was started itself.
+        The gate itself counts since its start.
         """
         with self._lock:
             counts, before = self._states[car].rejections, self._before.get(car, {})
         since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
         return dict(counts) if any(count < 0 for count in since.values()) else since  # the gate was started anew
 
-    def _hear(self, arrival: Arrival) -> None:
+    def _receive(self, arrival: Arrival) -> None:
         car, v = self._cars[arrival.topic], self._verifier
         if len(arrival.payload) > MOST_BYTES:
             self.dropped[car]["too long"] += 1
@@ -253,10 +255,10 @@ class Gates:
             self._before.setdefault(car, counts)
 
     def begin(self, release: bool = False) -> None:
-        """Arm all gates for a new session; those that somebody else has stopped only with `release`.
+        """Arm all gates for a new session; those stopped by another station only with `release`.
 
         Raises:
-            CoopenvError: a gate is not there, does not open, or is stopped meanwhile; all are closed again then.
+            CoopenvError: a gate is absent, does not open, or is stopped meanwhile; all are closed again then.
         """
         self.session, self._sequence = secrets.token_hex(8), 0
         before = self._fresh_states()
@@ -264,7 +266,7 @@ class Gates:
             stopped = sorted(car for car in self.stopped_by_others if before[car].state == "stopped")
         if stopped and not release:
             raise CoopenvError(
-                f"not armed: {stopped[0]}: somebody has stopped it; once you know why, release it "
+                f"not armed: {stopped[0]}: it was stopped elsewhere; once you know why, release it "
                 '(`coopenv svea run --release`, options={"arm": True, "release": True})'
             )
         until = time.monotonic() + PATIENCE
@@ -279,7 +281,7 @@ class Gates:
                 self.end()
                 raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
-                self._arm(car, True, states[car].nonce)  # as looked at: a stop that comes now makes it worthless
+                self._arm(car, True, states[car].nonce)  # of that status: a later stop invalidates it
             time.sleep(5 * POLL)
         with self._lock:
             self._stopping = False
@@ -287,18 +289,18 @@ class Gates:
             self._before = {car: state.rejections for car, state in self._states.items()}
 
     def _fresh_states(self) -> dict[str, GateState]:
-        """Return what each gate says now, not what it said before the last stop. Raises CoopenvError: one is silent."""
+        """Return a status of each gate that was sent after this call. Raises CoopenvError: a gate is silent."""
         asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
-        while any(state.heard < asked for state in self.states.values()) and time.monotonic() < asked + WORD:
+        while any(state.received < asked for state in self.states.values()) and time.monotonic() < asked + STATUS_TIME:
             time.sleep(POLL)
         for car, state in self.states.items():
             if state.age <= OLD:
                 continue
             if dropped := self.dropped[car] - known[car]:
                 why = ", ".join(f"{reason} {count}" for reason, count in dropped.items())
-                raise CoopenvError(f"{car}: what its gate says is not believed ({why}): are keys and clocks the same?")
+                raise CoopenvError(f"{car}: the status of its gate is dropped ({why}): are keys and clocks the same?")
             topic = self._profile.topic_of(car, Role.GATE)
-            raise CoopenvError(f"{car}: no gate has spoken on {topic}: is `coopenv svea gate` running there?")
+            raise CoopenvError(f"{car}: no gate status on {topic}: is `coopenv svea gate` running there?")
         return self.states
 
     def end(self) -> None:
@@ -314,7 +316,7 @@ class Gates:
         self._send(car, Role.ARM, message)
 
     def stop(self) -> None:
-        """Tell every gate to stop at once and to stay so."""
+        """Stop every gate at once, until the next arming."""
         with self._lock:
             self._stopping = True
         for car in self._states:
@@ -352,8 +354,10 @@ def _why_closed(before: GateState, now: GateState) -> str:
     news = {r: n - before.rejections.get(r, 0) for r, n in now.rejections.items() if n > before.rejections.get(r, 0)}
     if "signature" in news:
         return (
-            "its gate refuses this end's signature: is it told to trust this one (--station), "
+            "its gate refuses this end's signature: does it trust this station (--station), "
             "and is its public.toml that of this end's key?"
         )
-    why = ", ".join(f"{reason} {count}" for reason, count in news.items()) or "no reason told"
+    why = ", ".join(f"{reason} {count}" for reason, count in news.items()) or "no reason given"
+    if now.state in OPEN:
+        return f"the gate did not open: another station drives the car ({why})"
     return f"the gate did not open, it is {now.state} ({why})"

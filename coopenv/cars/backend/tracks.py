@@ -6,11 +6,11 @@ from itertools import islice
 
 import numpy as np
 
-from coopenv.cars.samples import Detections, Pose, Twist
+from coopenv.cars.samples import CarPose, Detections, Twist
 from coopenv.estimation.poses import Array, exp_so3, log_so3, rigid_exp
 
 MOST_SAMPLES = 512
-"""Of which the car has been told no time yet: five seconds of an IMU."""
+"""Samples that wait for a tick: five seconds of an IMU."""
 
 
 class Odometer:
@@ -99,7 +99,7 @@ class PoseTrack:
         """When the last one was taken; None: there is none."""
         return self._poses[-1][0] if self._poses else None
 
-    def put(self, stamp: int, pose: Pose) -> bool:
+    def put(self, stamp: int, pose: CarPose) -> bool:
         """Take a pose; return False where it is older than one before, or has no rotation."""
         if pose.rotation is None or (self._poses and stamp <= self._poses[-1][0]):
             return False
@@ -142,12 +142,12 @@ class PlaceTrack:
 
     @property
     def stamp(self) -> int:
-        """When it was at the last one; -1: it has told none."""
+        """Time of the last position; -1: none was received."""
         return self._places[-1][0] if self._places else -1
 
     @property
     def last(self) -> Array:
-        """(3,) where it has told last to be."""
+        """(3,) the last received position."""
         return self._places[-1][1]
 
     def put(self, stamp: int, position: Array) -> bool:

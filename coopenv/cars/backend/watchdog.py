@@ -1,4 +1,4 @@
-"""What stops the cars whatever the program that drives them does: a thread of its own."""
+"""The watchdog: a thread of its own that stops the cars whatever the driving program does."""
 
 import threading
 import time
@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.station import OLD, Gates, Station
+from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.profile import SVEA, CarProfile, Role, inside
-from coopenv.cars.samples import Pose, RobustReport, Sample
+from coopenv.cars.samples import CarPose, RobustReport, Sample
 from coopenv.estimation.poses import Array
 
 AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
@@ -29,14 +29,14 @@ class Place:
 class LinkMonitor:
     """Kept by the step loop, read by the watchdog's thread; times are in ns on the receiver's clock.
 
-    Bytes that come are no sign of life: what counts is a message that can be read, with a stamp newer than all before.
+    Received bytes alone do not count: a message must be readable, with a stamp newer than all before.
     """
 
     def __init__(self, judge: Literal["truth", "estimate"]) -> None:
-        """Say by what places are judged: motion capture, or what the cars believe."""
+        """Choose the source of the judged positions: motion capture, or the cars' estimates."""
         self._judge = judge
         self._stamps: dict[tuple[str, Role], int] = {}
-        self._told: dict[tuple[str, Role], int] = {}
+        self._known_at: dict[tuple[str, Role], int] = {}
         self.places: Mapping[str, Place] = {}
         """Replaced as a whole whenever one changes."""
         self.looked = 0
@@ -53,28 +53,28 @@ class LinkMonitor:
         if sample.stamp > sample.received + AHEAD or sample.stamp <= self._stamps.get(key, -1):
             return
         self._stamps[key] = sample.stamp
-        # Motion capture has a clock of its own, of which nobody knows how late it is.
-        self._told[key] = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
+        # Motion capture has a clock of its own with an unknown delay.
+        self._known_at[key] = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
         judging = (Role.TRUTH,) if self._judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
         if (
             sample.role in judging
-            and isinstance(sample.value, Pose | RobustReport)
+            and isinstance(sample.value, CarPose | RobustReport)
             and sample.value.position is not None
         ):
-            self.place(sample.car, sample.value.position, self._told[key])
+            self.place(sample.car, sample.value.position, self._known_at[key])
 
     def place(self, car: str, position: Array, time: int) -> None:
-        """Say where a car is, m, and when that was known."""
+        """Set the position of a car, m, and the time at which it was known, ns."""
         if np.isfinite(position).all():
             self.places = {**self.places, car: Place(position, time)}
 
     def age(self, car: str, role: Role) -> float:
-        """Return how old a sensor's last word was when messages were looked at last, s; inf: it has never spoken."""
-        told = self._told.get((car, role))
-        return float("inf") if told is None else max(self.looked - told, 0) * 1e-9
+        """Return the age of a sensor's last message when messages were looked at last, s; inf: none was received."""
+        known_at = self._known_at.get((car, role))
+        return float("inf") if known_at is None else max(self.looked - known_at, 0) * 1e-9
 
     def lost(self, car: str) -> float:
-        """Return for how long nobody had known where a car was when messages were looked at last, s."""
+        """Return for how long a car's position had been unknown when messages were looked at last, s."""
         place = self.places.get(car)
         return max(self.looked - (self._begun if place is None else place.time), 0) * 1e-9
 
@@ -82,7 +82,7 @@ class LinkMonitor:
 def misplaced(
     safety: Safety, monitor: LinkMonitor, cars: Collection[str], others: Collection[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the car and what is wrong with where it is, in words.
+    """Yield cars with a position that violates a rule, and the violation in words.
 
     Args:
         safety: fence, separation, and how old a place may be.
@@ -121,9 +121,7 @@ def _too_close(least: float, places: dict[str, Array], cars: Collection[str]) ->
 
 PERIOD = 0.01  # s between looks
 REPEAT = 0.2  # s between emergency stops that are sent again
-STALL = 0.05  # s by which a look may come late: beyond that messages wait to be received, and silence says nothing yet
-OPEN = ("armed", "timed_out")
-"""States of a gate that takes commands: one that has timed out lets the car stand until the next one."""
+STALL = 0.05  # s by which a look may come late: messages may still wait to be received then
 
 
 @dataclass(frozen=True)
@@ -131,12 +129,12 @@ class Trip:
     """Why the cars were stopped."""
 
     reason: str
-    car: str | None = None  # whose fault it was; None: nobody's
+    car: str | None = None  # that caused it; None: no single car
     time: float = 0.0  # monotonic, s
 
 
 class Watchdog:
-    """Looks after cars while they are armed; once it has stopped them they stay so until it is armed again."""
+    """Watches armed cars. Once it has stopped them, they stand until it is armed again."""
 
     def __init__(
         self,
@@ -156,7 +154,7 @@ class Watchdog:
             safety: what is allowed.
             station: where messages come.
             gates: of the cars.
-            monitor: what the messages have told.
+            monitor: ages of messages and positions of cars.
             cars: those that are driven here.
             others: the other ones of the fleet.
             odometry: what each car has to measure.
@@ -174,33 +172,33 @@ class Watchdog:
         self._missed = 0
         self._present: dict[str, bool] = {}
         self.happened: Callable[[str], str] = lambda car: ""
-        """Returns why a car is to be stopped by what it says of itself; empty: for nothing."""
+        """Returns the reason to stop a car by its own conditions; empty: none."""
         self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
         self._thread.start()
 
     def forget(self) -> None:
-        """Stop the cars no longer for what was before, so that they can be armed."""
+        """Clear the last stop, so that cars can be armed."""
         with self._lock:
             self.trip = None
 
     def arm(self) -> None:
-        """Look after the cars from now on. Raises CoopenvError: nobody would."""
+        """Watch the cars from now on. Raises CoopenvError: the watchdog's thread has ended."""
         if not self._thread.is_alive():
             raise CoopenvError("not armed: the watchdog has ended")
         with self._lock:
             self._armed, self._beat, self._missed = True, None, 0
 
     def disarm(self) -> None:
-        """Look no longer: the cars stand."""
+        """Stop watching: the cars stand."""
         with self._lock:
             self._armed = False
 
     def beat(self, missed: int) -> None:
-        """Say that a decision has been made, after `missed` in a row that came late."""
+        """Note a decision, after `missed` late ones in a row."""
         self._beat, self._missed = time.monotonic(), missed
 
     def set_present(self, car: str, there: bool) -> None:
-        """Say that a car's token has come or gone."""
+        """Note that a car's token has appeared or disappeared."""
         self._present[car] = there
 
     def stop(self, reason: str, car: str | None = None) -> None:
@@ -226,7 +224,7 @@ class Watchdog:
         while not self._closed.wait(PERIOD):
             before, looked = looked, time.monotonic()
             stalled = not stalled and looked - before > PERIOD + STALL
-            if stalled:  # once: the next look tells, and comes so soon that no car gets further for it
+            if stalled:  # once: the next look follows at once
                 continue
             try:
                 if self._armed:
@@ -234,7 +232,7 @@ class Watchdog:
                 elif self.trip is not None and looked - repeated > REPEAT:
                     repeated = looked
                     self._gates.stop()
-            except Exception:  # of the network, while it is told to stop: it is told again
+            except Exception:  # of the network, during a stop: it is repeated
                 continue
 
     def _look(self) -> None:
@@ -251,8 +249,10 @@ class Watchdog:
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
                 yield Trip(f"{car}: its gate is silent for {gate.age:.2f} s", car)
-            elif gate.state not in OPEN or gate.session != self._gates.session:
+            elif gate.state not in OPEN:
                 yield Trip(f"{car}: its gate is {gate.state}", car)
+            elif gate.session != self._gates.session:
+                yield Trip(f"{car}: another station has armed its gate", car)
         missed, beat = self._safety.missed_deadlines, self._beat
         if self._missed >= missed:
             yield Trip(f"{self._missed} decisions in a row came too late")
@@ -271,7 +271,7 @@ class Watchdog:
                 yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
             # Only the step loop reads messages, so that this means nothing before the first step.
             if self._beat is not None and (age := self._monitor.age(car, role)) > longest:
-                yield Trip(f"{car}: nothing new that could be used on {topic} for {age:.2f} s", car)
+                yield Trip(f"{car}: no usable new message on {topic} for {age:.2f} s", car)
         if self._present.get(car) is False:
             yield Trip(f"{car}: is gone", car)
         if why := self.happened(car):

@@ -1,4 +1,4 @@
-"""ROS bags of any laboratory as a backend: a map says which topic tells what of which car."""
+"""ROS bags of any laboratory as a backend: a map gives car and content of each topic."""
 
 from coopenv.cars.bags.backend import Bag
 

@@ -10,7 +10,7 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWa
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.bags.files import check_extra
-from coopenv.cars.bags.log import NS, Log, read_log
+from coopenv.cars.bags.log import NS, BagLog, read_log
 from coopenv.cars.bags.topic_map import TopicMap, load_map
 from coopenv.cars.profile import Role
 from coopenv.cars.samples import Sample
@@ -20,7 +20,7 @@ AHEAD = 100_000_000
 """ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""
 
 OFF = 0.1
-"""Share by which the rate of a camera may differ from the environment's before somebody is told."""
+"""Share by which the rate of a camera may differ from the environment's without a warning."""
 
 
 class Bag(TickGenerator):
@@ -56,7 +56,7 @@ class Bag(TickGenerator):
         changes = {**self.map.overrides, **(overrides or {})}
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ScenarioWarning)  # told below
+            warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
             self.binding = self._bind(load_scenario(self.map.environment_path, changes))
         self.log = read_log([Path(path) for path in paths], self.map, self.binding)
         self._begin, ticks = self._ticks()
@@ -102,13 +102,13 @@ class Bag(TickGenerator):
     def _odd_rates(self) -> Iterator[str]:
         for row in self.log.rows:
             if row.role in (Role.DETECTIONS, Role.BEARINGS) and row.rate and abs(row.rate / self._rate - 1.0) > OFF:
-                hint = f'say overrides = {{ "rates.camera" = {row.rate:.0f}.0 }} in the map'
+                hint = f'set overrides = {{ "rates.camera" = {row.rate:.0f}.0 }} in the map'
                 yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Go through the bags tick by tick; the option `arm` moves nobody."""
+        """Go through the bags tick by tick; the option `arm` has no effect."""
         reset_options(options)
-        assembler, feed = Assembler(self.binding), _Feed(self.log)
+        assembler, feed = Assembler(self.binding), _SampleQueue(self.log)
         for k in range(self.scenario.horizon_ticks + 1):
             now = self._begin + round(k * NS / self._rate)
             for sample in feed.until(now):
@@ -116,10 +116,10 @@ class Bag(TickGenerator):
             yield assembler.begin(now) if k == 0 else assembler.tick(k, now)
 
 
-class _Feed:
+class _SampleQueue:
     """Samples in the order in which they are used."""
 
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: BagLog) -> None:
         self._samples = sorted(log.samples, key=_used)
         self._next = 0
 

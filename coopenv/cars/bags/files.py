@@ -90,7 +90,7 @@ class BagFile:
         """Yield the messages of some topics in the order of their reception.
 
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
-        DataWarning says so.
+        DataWarning is given.
         """
         from coopenv.backends.mcap.container import Allowance
         from coopenv.cars.bags.limits import each_limited, is_too_large

@@ -40,7 +40,7 @@ def each_limited(messages: Iterator[Any], allowance: Allowance) -> Iterator[Any]
 
 
 def is_too_large(error: Exception) -> bool:
-    """Return whether an error says that something of a bag is larger than it may be."""
+    """Return whether an error is about a part of a bag that is too large."""
     import apsw
 
     return isinstance(error, TooLargeError | apsw.TooBigError)

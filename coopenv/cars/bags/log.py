@@ -7,7 +7,7 @@ recorded it. A *source* is whose clock makes the stamps: a car, or motion captur
   time that a message was on its way included. By no more than the tolerance, stamps stay what they are.
 - Files of different recorders are brought together by what they have in common. A source that stands in both, motion
   capture above all, is behind one recorder by d1 and behind the other by d2, so that the clocks of the recorders differ
-  by d1 - d2. Files without anything in common with the others are merged by their stamps: these are believed.
+  by d1 - d2. Files without anything in common with the others are merged by their stamps.
 """
 
 from collections import Counter
@@ -26,7 +26,7 @@ from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, Pose, Sample, Twist, Value
+from coopenv.cars.samples import Calibration, CarPose, Sample, Twist, Value
 from coopenv.scenario.base import rotation_of
 
 Delays = Mapping[str, int]
@@ -39,7 +39,7 @@ class Shift:
 
     offset: int  # ns by which its clock is behind that of the first recorder, as far as is known
     added: int  # ns that are added to its stamps
-    linked: bool = True  # whether it is known; False: stamps are believed
+    linked: bool = True  # whether it is known; False: stamps are used unchanged
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, in
     Args:
         files: delays of the sources of each file.
         tolerance: ns up to which clocks count as the same.
-        stated: ns to add to the stamps of sources of which somebody knows better.
+        stated: ns to add to the stamps of sources, by the map.
     """
     behind = recorders(files)
     found: dict[str, Shift] = {}
@@ -75,7 +75,7 @@ def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, in
 
 
 def recorders(files: Sequence[Delays]) -> list[int | None]:
-    """Return by how many ns the recorder of each file is behind that of the first one; None: nobody knows."""
+    """Return by how many ns the recorder of each file is behind that of the first one; None: not known."""
     behind: list[int | None] = [0, *(None for _ in files[1:])]
     known = [0]
     while known:
@@ -89,45 +89,40 @@ def recorders(files: Sequence[Delays]) -> list[int | None]:
     return behind
 
 
-class Values:
-    """Reads messages as the map says."""
+class ValueReader:
+    """Reads messages by the map."""
 
     def __init__(
-        self, given: TopicMap, binding: Binding, told: Mapping[str, Calibration], chosen: Collection[Chosen]
+        self, given: TopicMap, binding: Binding, published: Mapping[str, Calibration], chosen: Collection[Chosen]
     ) -> None:
         """Prepare.
 
         Args:
             given: the map.
             binding: the cars and their vehicles, whose cameras are those of the environment.
-            told: calibrations that cars tell themselves, which count first.
+            published: calibrations that cars publish, which count first.
             chosen: the topics that are read.
         """
         self._calibrations = {
-            name: told.get(name) or calibration_of(binding, vehicle) for name, vehicle in binding.cars.items()
+            name: published.get(name) or Calibration.of(binding.scenario.cameras[vehicle])
+            for name, vehicle in binding.cars.items()
         }
         self._distorted, self._known = given.distorted, frozenset(binding.targets)
         self._frames = {role: given.frames.map for role in Role} | {Role.TRUTH: given.frames.truth or given.frames.map}
         self._turning = {entry.car for entry in chosen if entry.role is Role.IMU}
 
     def read(self, chosen: Chosen, message: Any) -> Value:
-        """Return what a message tells. Raises CoopenvError: it makes no sense."""
+        """Return the value of a message. Raises CoopenvError: it is malformed."""
         calibration = self._calibrations.get(chosen.car)
         value = read(chosen.role, message, calibration, distorted=self._distorted, known=self._known)
-        if isinstance(value, Pose):
+        if isinstance(value, CarPose):
             return in_frame(value, self._frames[chosen.role])
         if isinstance(value, Twist) and chosen.role is Role.WHEEL and chosen.car in self._turning:
             return Twist(value.linear, None)  # the IMU knows better
         return value
 
 
-def calibration_of(binding: Binding, vehicle: int) -> Calibration:
-    """Return the calibration of a vehicle's camera in the environment."""
-    camera = binding.scenario.cameras[vehicle]
-    return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
-
-
-def in_frame(pose: Pose, frame: MapFrame) -> Pose:
+def in_frame(pose: CarPose, frame: MapFrame) -> CarPose:
     """Return a pose of a frame in the environment's coordinates."""
     if frame == MapFrame():
         return pose
@@ -168,7 +163,7 @@ class Track:
         return [entry.received - entry.stamp for entry in self.entries if entry.stamp]
 
 
-def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: Values, stamped: bool) -> dict[str, Track]:
+def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: ValueReader, stamped: bool) -> dict[str, Track]:
     """Return what a file has on the chosen topics, by topic; `stamped`: whether stamps count."""
     wanted = {name for name, entry in chosen.items() if entry.role is not Role.CAMERA_INFO and name in file.topics}
     tracks = {name: Track(chosen[name]) for name in sorted(wanted)}
@@ -246,7 +241,7 @@ def rows_of(
         if entry is None or clocks is None:
             rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
-        stamps = np.array(times.get((entry.car, entry.told_as), []), dtype=np.int64)
+        stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
         shift = clocks.shifts.get(entry.source)
         offset = None if shift is None or not shift.linked else shift.offset * 1e-9
         rate, gap, gaps = regularity(stamps)
@@ -266,7 +261,7 @@ NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Log:
+class BagLog:
     """What was read."""
 
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
@@ -279,12 +274,12 @@ class Log:
         return stamps[0], stamps[-1]
 
 
-def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> Log:
+def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
     """Read bags.
 
     Args:
         paths: of one recording, for example one per car.
-        given: which topic tells what.
+        given: the map of topics.
         binding: the cars and their vehicles.
 
     Raises:
@@ -295,17 +290,17 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> Log:
         files = [stack.enter_context(BagFile(path)) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = {entry.topic: entry for entry in select(given, topics, where)}
-        values = Values(given, binding, _calibrations(files, chosen), chosen.values())
+        values = ValueReader(given, binding, _calibrations(files, chosen), chosen.values())
         tracks = [tracks_of(file, chosen, values, given.clocks.mode != "received") for file in files]
     _check(tracks, chosen, where)
     clocks = _clocks(tracks, given)
     samples = _samples(tracks, clocks)
     notes = (*_refusals(tracks), *_offsets(clocks, given), *_unstamped(tracks, given))
-    return Log(samples, rows_of(files, chosen, samples, clocks), notes)
+    return BagLog(samples, rows_of(files, chosen, samples, clocks), notes)
 
 
 def _calibrations(files: Sequence[BagFile], chosen: Mapping[str, Chosen]) -> dict[str, Calibration]:
-    """Return the first calibration of each car that tells one."""
+    """Return the first calibration of each car that publishes one."""
     found: dict[str, Calibration] = {}
     for file in files:
         for name in [n for n, entry in chosen.items() if entry.role is Role.CAMERA_INFO and n in file.topics]:
@@ -321,7 +316,7 @@ def _calibrations(files: Sequence[BagFile], chosen: Mapping[str, Chosen]) -> dic
 
 
 def _check(tracks: Sequence[Mapping[str, Track]], chosen: Mapping[str, Chosen], where: str) -> None:
-    """Refuse bags in which a topic that is needed has nothing of use."""
+    """Refuse bags with a needed topic that has no usable message."""
     for name, entry in chosen.items():
         parts = [file[name] for file in tracks if name in file]
         if not entry.needed or any(part.entries for part in parts):
@@ -349,7 +344,7 @@ def _samples(tracks: Sequence[Mapping[str, Track]], clocks: Clocks) -> tuple[Sam
             for entry in track.entries:
                 added = clocks.shifts[chosen.source].added if entry.stamp else recorder
                 time = (entry.stamp or entry.received) + added
-                found.setdefault((name, time), Sample(chosen.car, chosen.told_as, time, time, entry.value))
+                found.setdefault((name, time), Sample(chosen.car, chosen.sample_role, time, time, entry.value))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
@@ -367,7 +362,7 @@ def _offsets(clocks: Clocks, given: TopicMap) -> Iterator[str]:
         if shift.added and source not in given.clocks.offsets:
             yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
         elif not shift.linked:
-            yield f"clock of {source}: nothing ties its file to the first one; its stamps are believed"
+            yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
 
 
 def _unstamped(tracks: Sequence[Mapping[str, Track]], given: TopicMap) -> Iterator[str]:

@@ -49,7 +49,7 @@ TopicName = Annotated[str, Field(max_length=256, pattern=r"^/[A-Za-z0-9_/~]+$")]
 
 
 class TopicMapError(CoopenvError):
-    """A file does not say what is in a bag."""
+    """A file is no valid map of a bag."""
 
 
 class Topics(Section):
@@ -205,8 +205,8 @@ class Chosen:
     leads: bool = False  # whether the car is a moving landmark
 
     @property
-    def told_as(self) -> Role:
-        """As what ticks are told it: motion capture of a moving landmark is where that says it is."""
+    def sample_role(self) -> Role:
+        """Role of its samples: motion capture of a moving landmark counts as its estimate."""
         return Role.ESTIMATE if self.leads and self.role is Role.TRUTH else self.role
 
     @property
@@ -229,7 +229,7 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
         where: names the bag in errors.
 
     Raises:
-        DataError: one that is needed is not there, or holds messages that cannot be read as what the map says.
+        DataError: one that is needed is not there, or holds messages that cannot be read in the role of the map.
     """
     chosen = []
     for car in given.cars:
@@ -251,7 +251,8 @@ def _there(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) 
                 break
     for role, name in car.topics.given.items():
         if name not in topics:
-            raise DataError(f"{given.path.name}: cars.{car.name}.topics.{role}: {_absent(name, topics, where)}")
+            hint = "; without this key the environment's calibration counts" if role is Role.CAMERA_INFO else ""
+            raise DataError(f"{given.path.name}: cars.{car.name}.topics.{role}: {_absent(name, topics, where)}{hint}")
     for role, name in found.items():
         if topics[name] not in READERS[role]:
             kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
@@ -288,7 +289,7 @@ def _needed(
 def _place(
     car: BagCar, there: Mapping[Role, str], given: TopicMap, topics: Mapping[str, str], where: str
 ) -> list[Role]:
-    """Return the role that tells where a moving landmark is; motion capture stands in where it does not say itself."""
+    """Return the role with the position of a moving landmark; motion capture if there is no other."""
     for role in (*PLACE, Role.TRUTH):
         if role in there:
             return [role]

@@ -15,13 +15,14 @@ from coopenv.cars.codec import decode, warm_up
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.messages import Act, SensorPublisher, VehicleSensorPublisher
-from coopenv.cars.fake.sensors import Pixy, Sensors, calibration_of
+from coopenv.cars.fake.sensors import CarSensors, Pixy
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.codec import Malformed, read_drive
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock
-from coopenv.cars.gate.process import Link
+from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
+from coopenv.cars.samples import Calibration
 from coopenv.cars.transport.base import Arrival, Transport
 
 JITTER = 0.05  # of a period, largest deviation to either side of a regular time
@@ -94,21 +95,21 @@ class Fake:
         die: Callable[[], None] = end_process,
         complain: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Put the car at the start of a seed and let others see that it is there.
+        """Put the car at the start of a seed and announce it.
 
         Args:
             deployment: the fleet.
-            binding: who is who in it.
+            binding: vehicles and markers of its cars.
             name: of the car.
             transport: the network; stays the caller's.
             seed: of where it starts and of its errors, which are those of the simulation with that key.
             faults: that it has, by times from now on.
             gate: whether commands come through a gate of its own; else it obeys ManualControl on the network.
-            signer: signs what the gate says, as the car (None: nothing is signed).
+            signer: signs the gate's status, as the car (None: it is not signed).
             verifier: knows the station's key, for the gate (None: signatures do not count).
             clock: wall and steady; the wall clock is that of motion capture.
             die: what the fault `kill` does.
-            complain: told in one line of messages to the fake that make no sense.
+            complain: called with one line about a malformed message.
         """
         self.name, self._clock, self._faults = name, clock, Faults()
         self._die, self._complain = die, complain
@@ -121,39 +122,41 @@ class Fake:
         self._inbox: deque[Callable[[], None]] = deque()
         self._others = Neighbours(self.world, binding, name, transport)
         self._acts: dict[str, Act] = {}
-        self._link: Link | None = None
+        self._link: GateConnection | None = None
         self._build(binding, transport, deployment.sensors.odometry)
         self.begin(seed)
         self._warm_up()
-        transport.subscribe(RESET_TOPIC, self._hear_reset)
-        transport.subscribe(fault_topic(name), self._hear_fault)
+        transport.subscribe(RESET_TOPIC, self._receive_reset)
+        transport.subscribe(fault_topic(name), self._receive_fault)
         rates = {name: rate for name, (rate, _) in self._publisher.acts.items()}
         self._acts = {name: act for name, (_, act) in self._publisher.acts.items()}
         if self._drives and gate:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
             identity = deployment.security.identity
             decides = Gate(name, deployment.limits, car_clock, verifier, identity, self._profile)
-            self._link = Link(decides, name, self._wire, signer, self._profile)  # which lets others see the car
+            self._link = GateConnection(
+                decides, name, self._wire, signer, self._profile
+            )  # which lets others see the car
             rates["gate"], self._acts["gate"] = 1e9 / PERIOD, self._tick_gate
         else:
             if self._drives:
-                self._wire.subscribe(self._profile.topic_of(name, Role.MANUAL), self._hear_manual)
+                self._wire.subscribe(self._profile.topic_of(name, Role.MANUAL), self._receive_manual)
             transport.announce(presence_of(name))
         self._schedule = Schedule(rates, clock.steady(), self._rng)
         for fault in faults:
             self._faults.add(fault, clock.steady())
 
     def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
-        """Put sensors and wheels on the car; the wheels tell a turn rate only where there is no other one."""
+        """Put sensors and wheels on the car; the wheels measure a turn rate only where no other sensor does."""
         whose = (self.name, self.world, self._wire, self._stamp, transport, self._profile)
         self._publisher = SensorPublisher(*whose)
         if self._drives:
             vehicle, scenario = self.world.vehicle, self.world.scenario
             carriers = {target: marker for marker, target in binding.targets.items()}
             self._pixy = Pixy(
-                self.world, calibration_of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
+                self.world, Calibration.of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
             )
-            self._sensors = Sensors(self.world, differential=odometry == "wheel")
+            self._sensors = CarSensors(self.world, differential=odometry == "wheel")
             self._wheels = Actuators(scenario.limits[vehicle].latency, binding.profile.command.timeout)
             publisher = VehicleSensorPublisher(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
             publisher.before_frame = self._others.place
@@ -196,7 +199,7 @@ class Fake:
             self._move(due)
             self._acts[name](due, self._stamp(due) + self._faults.clock_error(due))
         if self._link is not None and self._link.news.is_set():
-            self._link.tell()
+            self._link.publish_status()
 
     def _take_inbox(self) -> None:
         while self._inbox:
@@ -225,7 +228,7 @@ class Fake:
             self._moved = to
 
     def _tick_gate(self, due: int, _stamp: int) -> None:
-        """Let the gate say what the wheels are to do; a computer that stands still says nothing."""
+        """Obey the gate's command; a frozen computer sends none."""
         if self._link is not None and not self._faults.value("freeze", due):
             # The dead time of the scenario is that from a command to its effect, the gate's turn in it.
             self._obey(self._link.tick(), max(self._link.commanded, due - PERIOD))
@@ -238,16 +241,16 @@ class Fake:
 
     # Called in threads of the transport: they only keep what has come.
 
-    def _hear_manual(self, arrival: Arrival) -> None:
+    def _receive_manual(self, arrival: Arrival) -> None:
         self._inbox.append(partial(self._obey, arrival.payload, self._clock.steady()))
 
-    def _hear_reset(self, arrival: Arrival) -> None:
+    def _receive_reset(self, arrival: Arrival) -> None:
         def begin() -> None:
             self.begin(int(decode(arrival.payload, "std_msgs/msg/Int64").data))
 
         self._inbox.append(begin)
 
-    def _hear_fault(self, arrival: Arrival) -> None:
+    def _receive_fault(self, arrival: Arrival) -> None:
         def add() -> None:
             text = str(decode(arrival.payload, "std_msgs/msg/String").data)
             self._faults.add(fake_fault(text), self._clock.steady())

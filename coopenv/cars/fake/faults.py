@@ -38,7 +38,7 @@ def fake_fault(text: str) -> Fault:
 
 
 def fault_topic(car: str) -> str:
-    """Return where a fake car hears of faults that it is to have, std_msgs/msg/String."""
+    """Return the topic on which a fake car receives faults, std_msgs/msg/String."""
     return f"{PREFIX}/{car}/coopenv/fault"
 
 
@@ -86,7 +86,7 @@ class Faults:
 
 
 class Wire:
-    """A transport on which messages get lost, come late, or stop, both ways; whoever holds it calls `flush`."""
+    """A transport on which messages get lost, come late, or stop, both ways; its owner calls `flush`."""
 
     def __init__(self, transport: Transport, faults: Faults, steady: Callable[[], int], seed: int) -> None:
         """Lay it.

@@ -45,11 +45,11 @@ class Process:
         Args:
             name: in errors.
             command: arguments of `coopenv`.
-            folder: where what it prints is kept.
+            folder: of its output.
         """
         self.name = name
-        self._said = folder / f"{name}.out", folder / f"{name}.err"
-        with held(), self._said[0].open("w") as out, self._said[1].open("w") as errors:
+        self._logs = folder / f"{name}.out", folder / f"{name}.err"
+        with held(), self._logs[0].open("w") as out, self._logs[1].open("w") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "coopenv", *command],
                 stdin=subprocess.DEVNULL,
@@ -60,22 +60,24 @@ class Process:
             _running.append(self)
 
     def wait_until_ready(self, until: float) -> None:
-        """Wait for the line that says so, at most until a time of the monotonic clock.
+        """Wait for its line `ready`, at most until a time of the monotonic clock.
 
         Raises:
             FakesError: it has ended, or the time is over; the line quotes its last error.
         """
-        while "ready" not in self._said[0].read_text(encoding="utf-8", errors="replace"):
+        while "ready" not in self._logs[0].read_text(encoding="utf-8", errors="replace"):
             status = self._process.poll()
             if status is not None:
-                raise FakesError(f"{self.name} has ended with status {status}: {self._last_words()}")
+                raise FakesError(f"{self.name} has ended with status {status}: {self._last_error()}")
             if time.monotonic() > until:
-                raise FakesError(f"{self.name} is not ready in time: {self._last_words()}")
+                raise FakesError(f"{self.name} is not ready in time: {self._last_error()}")
             time.sleep(POLL)
 
-    def _last_words(self) -> str:
-        lines = self._said[1].read_text(encoding="utf-8", errors="replace").split("\n")
-        return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), "it has said nothing")
+    def _last_error(self) -> str:
+        lines = self._logs[1].read_text(encoding="utf-8", errors="replace").split("\n")
+        return next(
+            (line.removeprefix("error: ") for line in reversed(lines) if line.strip()), "it has printed nothing"
+        )
 
     def send(self, number: int) -> None:
         """Send a signal to the process and to all that it has started."""
@@ -143,7 +145,7 @@ def _end(started: list[Process]) -> None:
 
 
 def free_port() -> int:
-    """Return a port of this computer that nobody listens at."""
+    """Return a free port of this computer."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
@@ -202,7 +204,7 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
 
 
 def run(fake: Fake, stop: threading.Event) -> None:
-    """Let a car live in real time until it is told to stop, or an exception such as a signal's ends it."""
+    """Run a car in real time until `stop` is set, or an exception such as a signal's ends it."""
     try:
         while not stop.is_set():
             fake.advance()

@@ -1,4 +1,4 @@
-"""What a fake car measures, as the messages of the real ones; stamps in ns."""
+"""Measurements of a fake car as the messages of real ones; stamps in ns."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, Pixy, Sensors, bearings_of
+from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, CarSensors, Pixy, bearings_of
 from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import Calibration
@@ -119,7 +119,7 @@ def state(stamp: int, armed: bool) -> Any:
 
 
 def remote(stamp: int) -> Any:
-    """Return the RCIn of sticks that nobody moves."""
+    """Return the RCIn of sticks at rest."""
     channels = np.full(8, 1500, dtype=np.uint16)
     return make("mavros_msgs/msg/RCIn", header=header(stamp), rssi=200, channels=channels)
 
@@ -230,7 +230,9 @@ class SensorPublisher:
 class VehicleSensorPublisher(SensorPublisher):
     """Publishes the messages of a car that is a vehicle."""
 
-    def __init__(self, *arguments: Any, pixy: Pixy, sensors: Sensors, rng: Callable[[], np.random.Generator]) -> None:
+    def __init__(
+        self, *arguments: Any, pixy: Pixy, sensors: CarSensors, rng: Callable[[], np.random.Generator]
+    ) -> None:
         """Add camera and sensors; `rng` returns the generator of the episode's noise."""
         super().__init__(*arguments)
         self._pixy, self._sensors, self._rng = pixy, sensors, rng

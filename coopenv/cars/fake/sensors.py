@@ -1,4 +1,4 @@
-"""What wheels, gyro and the car's own filter read: the truth with the scenario's noise and lasting errors."""
+"""Readings of wheels, gyro and the car's own filter: the truth with the scenario's noise and lasting errors."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,18 +10,18 @@ from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.samples import Calibration
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import Array
-from coopenv.scenario.sensing import Camera, Noise
+from coopenv.scenario.sensing import Noise
 from coopenv.world.random import ODOMETRY_NOISE
 
 WHEEL_RATE, IMU_RATE, FILTER_RATE = 50.0, 100.0, 20.0
 """Hz"""
 
 
-class Sensors:
+class CarSensors:
     """The odometry of one car. Lasting errors are those that the world has drawn."""
 
     def __init__(self, world: CarWorld, *, differential: bool = True) -> None:
-        """Put them on the car of a world; `differential`: the wheels tell a turn rate, else 0."""
+        """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
         self._differential = differential
         self._world, self._noise = world, world.scenario.noises[world.vehicle]
         self.wheel_std = deviation(self._noise.velocity, self._noise, WHEEL_RATE)
@@ -84,7 +84,7 @@ OLDEST = 255  # frames that the camera counts
 
 @dataclass(frozen=True)
 class Block:
-    """What the camera says of one marker, pixels."""
+    """Block of one marker in the camera's image, pixels."""
 
     signature: int
     x: int
@@ -162,11 +162,6 @@ class Pixy:
                 x, y = int(rng.integers(width)), int(rng.integers(height))
                 blocks = [*blocks, Block(int(rng.choice(self._numbers)), x, y, 2, 2)]
         return blocks
-
-
-def calibration_of(camera: Camera) -> Calibration:
-    """Return the intrinsics of a camera of the scenario."""
-    return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
 
 
 def bearings_of(blocks: list[Block], calibration: Calibration) -> Array:

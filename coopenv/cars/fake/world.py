@@ -61,7 +61,7 @@ class CarWorld(World):
         self._time_value, self._frame_value = self._time.numpy(), self._frame.numpy()
 
     def _build_model(self) -> Any:
-        """Build the model; cameras see whoever carries a marker, and measure before pixels are rounded."""
+        """Build the model; cameras see all carriers of markers, and measure before pixels are rounded."""
         model = super()._build_model()
         camera = model.camera.numpy()  # on the CPU this and the others are views
         camera["quantise"], camera["undistort"] = 0, 1
@@ -130,7 +130,7 @@ class Neighbours:
 
         Args:
             world: where they are put.
-            binding: who is who.
+            binding: vehicles and markers of the cars.
             name: of the own car.
             transport: the network.
         """
@@ -139,31 +139,31 @@ class Neighbours:
         self._world, self._origin = world, np.array(world.scenario.map.origin)
         self._truth_type, topic_of = binding.profile.topics[Role.TRUTH].type, binding.profile.topic_of
         self._agents = {topic_of(car, Role.TRUTH): agent for car, agent in agents.items() if car != name}
-        self._heard: dict[str, bytes] = {}
+        self._received: dict[str, bytes] = {}
         self._moving = np.flatnonzero(world.model.motion.kind.numpy()[:L] == int(PRESCRIBED))
-        transport.subscribe(topic_of("*", Role.TRUTH), self._hear)  # one, as every subscription costs a thread
+        transport.subscribe(topic_of("*", Role.TRUTH), self._receive)  # one, as every subscription costs a thread
 
-    def _hear(self, arrival: Arrival) -> None:
+    def _receive(self, arrival: Arrival) -> None:
         if arrival.topic in self._agents:
-            self._heard[arrival.topic] = arrival.payload  # read when the camera looks: many are never looked at
+            self._received[arrival.topic] = arrival.payload  # read when the camera looks: many are never looked at
 
     def begin(self) -> None:
         """Drop their poses. A moving landmark is a car as well, and absent without it."""
-        self._heard.clear()
+        self._received.clear()
         for landmark in self._moving:
             if landmark != self._world.agent:
                 self._world.view("present")[0, landmark] = 0
 
     def place(self) -> None:
         """Put them at their last poses."""
-        while self._heard:
+        while self._received:
             try:
-                topic, payload = self._heard.popitem()
+                topic, payload = self._received.popitem()
                 message = decode(payload, self._truth_type)
                 place = message.pose.pose.position
                 R = rotation_of(message.pose.pose.orientation, "orientation")
             except CoopenvError:
-                continue  # whatever somebody else has sent
+                continue  # malformed
             self._world.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
 
 

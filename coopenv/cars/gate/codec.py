@@ -190,7 +190,7 @@ def read_drive(payload: bytes, message: CommandMessage) -> Drive:
 
 
 def write_status(status: GateStatus) -> bytes:
-    """Return the bytes of what the gate says of itself."""
+    """Return the bytes of a gate's status."""
     writer = Writer()
     writer.header(status.stamp)
     for text in (status.session, status.nonce, status.state):

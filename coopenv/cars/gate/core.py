@@ -1,7 +1,7 @@
-"""What the gate decides, without threads, clocks or a network of its own.
+"""The decisions of the gate, without threads, clocks or a network of its own.
 
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
-new one after every start, arming, disarming and stop, so that an arming counts once and only if whoever sent it knew of
+new one after every start, arming, disarming and stop, so that an arming counts once, and only if its sender knew of
 the latest stop. A disarming needs no nonce. Armed, the gate lets commands of that session through, each newer than all
 before it, not older than 0.15 s, finite, and inside the limits. Until the first one the car stands.
 
@@ -9,7 +9,7 @@ Without another one for 0.2 s the car gets neutral: the gate has timed out. Newe
 from there: what a stalled link delivers late is older than 0.15 s and moves nothing, and what has just been sent is
 what the station wants now. The car then starts from a stand, at the limited acceleration.
 
-A stop stays until the next arming. It needs no signature: whoever asks for it gets it, as the worst that can come of it
+A stop stays until the next arming. It needs no signature: its worst result
 is a car that stands. Its `false` does nothing.
 """
 
@@ -99,8 +99,8 @@ class Gate:
             car: its name, as in its topics.
             limits: of commands.
             clock: clocks.
-            verifier: knows the station's public key; None: nothing is signed, and anybody can drive the car.
-            station: who may arm and command.
+            verifier: knows the station's public key; None: nothing is signed, and any station can drive the car.
+            station: identity that may arm and command.
             profile: make of the car.
         """
         self._car, self._limits, self._clock = car, limits, clock

@@ -28,8 +28,8 @@ TICKS_PER_STATUS = 4  # 5 Hz
 LAST_NEUTRALS = 5  # that the car gets before the gate goes
 
 
-class Link:
-    """A gate and its connection; whoever holds it calls `tick` every 50 ms, from one thread."""
+class GateConnection:
+    """A gate and its connection; its owner calls `tick` every 50 ms, from one thread."""
 
     def __init__(
         self, gate: Gate, car: str, transport: Transport, signer: Signer | None = None, profile: CarProfile = SVEA
@@ -37,9 +37,9 @@ class Link:
         """Listen, and announce the car.
 
         Args:
-            gate: decides; from now on nobody else is to call it.
+            gate: decides; used by this connection alone from now on.
             car: its name.
-            transport: stays the caller's, who closes it.
+            transport: the caller's, which closes it.
             signer: signs the status, as the car; None: it is not signed.
             profile: make of the car.
         """
@@ -50,7 +50,7 @@ class Link:
         self._ticks = 0
         self._own = secrets.token_bytes(16)  # marks what comes back to us: it must not stop a car that is armed again
         self.news = threading.Event()
-        """Set when the state or the nonce has changed: `tell` then says so at once."""
+        """Set when the state or the nonce has changed, so that the status is published at once."""
         for role in (Role.COMMAND, Role.ARM, Role.STOP):
             transport.subscribe(self._topics[role], partial(self._arrive, role))
         transport.announce(presence_of(car))
@@ -61,7 +61,7 @@ class Link:
             payload = self._gate.tick()
         self._send(Role.MANUAL, payload)
         if self._ticks % TICKS_PER_STATUS == 0:
-            self.tell()
+            self.publish_status()
         self._ticks += 1
         return payload
 
@@ -71,7 +71,7 @@ class Link:
         with self._lock:
             return self._gate.commanded
 
-    def tell(self) -> None:
+    def publish_status(self) -> None:
         """Send the status, and that the car has been stopped if it has."""
         self.news.clear()
         with self._lock:
@@ -103,14 +103,14 @@ class Link:
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
-def run(link: Link) -> None:
+def run(link: GateConnection) -> None:
     """Tick until an exception, such as that of a signal, ends it; the car then gets neutral before that goes on."""
     due = time.monotonic_ns()
     try:
         while True:
             wait = (due - time.monotonic_ns()) / 1e9
             if wait > 0.0 and link.news.wait(wait):
-                link.tell()
+                link.publish_status()
             elif wait <= 0.0 or time.monotonic_ns() >= due:
                 link.tick()
                 missed = max(time.monotonic_ns() - due, 0) // PERIOD

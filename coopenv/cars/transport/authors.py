@@ -1,7 +1,7 @@
-"""The authors' names and types on the wire, those of the profile for whoever uses it.
+"""The authors' names and types on the wire, those of the profile for all users.
 
 What has a counterpart goes out under the authors' name as a ROS 1 message. If that loses something (an estimate becomes
-a position alone) or there is none, it goes out under our own name as well, as CDR, to be heard by other coopenv ends.
+a position alone) or there is none, it goes out under our own name as well, as CDR, for other ends of coopenv.
 """
 
 import math
@@ -79,7 +79,7 @@ def low_level(drive: Drive, command: CommandMessage) -> Any:
 
 @dataclass(frozen=True)
 class Counterpart:
-    """A topic of the authors' that tells what one of ours does."""
+    """The authors' topic with the content of one of ours."""
 
     name: str  # with {agent}, the agent's number, or {car}, the car's name
     type: str  # of ROS 1

@@ -39,7 +39,7 @@ class Transport(Protocol):
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
-        """Send a message to whoever has subscribed; what cannot be sent is lost, nothing is raised."""
+        """Send a message to its subscribers; a message that cannot be sent is lost, nothing is raised."""
         ...
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
@@ -47,7 +47,7 @@ class Transport(Protocol):
         ...
 
     def announce(self, name: str) -> None:
-        """Let others see that `name` is there, until this connection ends."""
+        """Announce the presence of `name` until this connection ends."""
         ...
 
     def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
@@ -60,7 +60,7 @@ class Transport(Protocol):
 
 
 def matcher(pattern: str) -> Callable[[str], bool]:
-    """Return what tells whether a topic matches: `*` stands for one part of it, `**` for any number, none included."""
+    """Return the test whether a topic matches: `*` stands for one part of it, `**` for any number, none included."""
     parts = ("(?:[^/]+/)*" if part == "**" else _part(part) + "/" for part in pattern.split("/"))
     expression = re.compile("".join(parts))
     return lambda topic: expression.fullmatch(f"{topic}/") is not None
@@ -82,12 +82,12 @@ class Hub:
         self._watchers: list[tuple[Matcher, Callable[[str, bool], None], object]] = []
         self._present: list[tuple[str, object]] = []
 
-    def connect(self) -> "Local":
+    def connect(self) -> "HubTransport":
         """Return a connection."""
-        return Local(self)
+        return HubTransport(self)
 
 
-class Local:
+class HubTransport:
     """A connection to a hub; messages are delivered in the sender's thread."""
 
     def __init__(self, hub: Hub) -> None:
@@ -115,7 +115,7 @@ class Local:
             new = all(name != known for known, _ in self._hub._present)
             self._hub._present.append((name, self))
         if new:
-            self._tell(name, True)
+            self._notify(name, True)
 
     def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
         """Watch, see `Transport`."""
@@ -137,9 +137,9 @@ class Local:
             hub._present = [entry for entry in hub._present if entry[1] is not self]
             gone = before - {name for name, _ in hub._present}
         for name in sorted(gone):
-            self._tell(name, False)
+            self._notify(name, False)
 
-    def _tell(self, name: str, there: bool) -> None:
+    def _notify(self, name: str, there: bool) -> None:
         with self._hub._lock:
             called = [callback for matches, callback, _ in self._hub._watchers if matches(name)]
         for callback in called:
@@ -185,7 +185,7 @@ def address_of(endpoint: str) -> Address:
 
 
 def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float) -> str | None:
-    """Try a connection by hand, because libraries often only say that it did not work.
+    """Try a connection: the errors of libraries often lack the reason.
 
     Args:
         address: where to.
@@ -210,7 +210,7 @@ def _tls_trouble(plain: socket.socket, host: str, context: ssl.SSLContext) -> st
     try:
         with context.wrap_socket(plain, server_hostname=host) as secured:
             secured.settimeout(0.2)
-            secured.recv(1)  # who wants a certificate of ours, or refuses it, says so only now
+            secured.recv(1)  # a peer asks for our certificate, or refuses it, only now
     except ssl.SSLCertVerificationError as error:
         return f"its certificate is refused: {error.verify_message}"
     except ssl.SSLError as error:
@@ -225,9 +225,9 @@ FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO
 
 @dataclass(frozen=True, slots=True)
 class Certificates:
-    """Files in PEM. Whoever listens with a certificate asks for one of those who connect (mutual TLS)."""
+    """Files in PEM. A listener with a certificate asks clients for theirs (mutual TLS)."""
 
-    root_ca: Path  # who signs the others' certificates
+    root_ca: Path  # authority of the others' certificates
     certificate: Path | None = None  # own one
     key: Path | None = None  # private key of it
 

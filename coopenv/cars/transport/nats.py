@@ -65,17 +65,17 @@ def attachment_of(headers: dict[str, str] | None) -> bytes:
 
 
 PERIOD = 0.25  # s between two times
-LEASE = 1.0  # s of silence after which somebody counts as gone
+LEASE = 1.0  # s of silence after which a name counts as gone
 
 Change = Callable[[str, bool], None]
 
 
 class Presence:
-    """Names that this end announces, and those of others that it has heard."""
+    """Names announced by this end and by others, by heartbeats."""
 
-    def __init__(self, say: Callable[[str, bytes], None]) -> None:
+    def __init__(self, send: Callable[[str, bytes], None]) -> None:
         """Take what sends a heartbeat: (name, payload)."""
-        self._say = say
+        self._send = send
         self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
         self._own: list[str] = []
         self._last: dict[tuple[str, bytes], float] = {}
@@ -83,10 +83,10 @@ class Presence:
         self._lock = threading.RLock()
 
     def announce(self, name: str) -> None:
-        """Begin to say that `name` is there."""
+        """Announce `name` from now on."""
         with self._lock:
             self._own.append(name)
-        self._say(name, b"+" + self._self)
+        self._send(name, b"+" + self._self)
 
     def watch(self, pattern: str, callback: Change) -> None:
         """Call back for every name that matches, now and when it comes or goes."""
@@ -96,7 +96,7 @@ class Presence:
             for name in sorted({name for name, _ in self._last if matches(name)}):
                 callback(name, True)
 
-    def hear(self, name: str, payload: bytes) -> None:
+    def receive(self, name: str, payload: bytes) -> None:
         """Take a heartbeat."""
         who = name, payload[1:]
         with self._lock:
@@ -104,40 +104,40 @@ class Presence:
                 new = all(known != name for known, _ in self._last)
                 self._last[who] = time.monotonic()
                 if new:
-                    self._tell(name, True)
+                    self._notify(name, True)
             elif self._last.pop(who, None) is not None:
-                self._tell_if_gone(name)
+                self._notify_if_gone(name)
 
     def beat(self) -> None:
-        """Say what is to be said and see who has fallen silent; to be called every `PERIOD`."""
+        """Send the heartbeats and find silent names; to be called every `PERIOD`."""
         with self._lock:
             own, late = list(self._own), time.monotonic() - LEASE
             for who in [who for who, last in self._last.items() if last < late]:
                 del self._last[who]
-                self._tell_if_gone(who[0])
+                self._notify_if_gone(who[0])
         for name in own:
-            self._say(name, b"+" + self._self)
+            self._send(name, b"+" + self._self)
 
     def leave(self) -> None:
-        """Say that this end goes."""
+        """Send that this end leaves."""
         with self._lock:
             own, self._own = self._own, []
             self._watchers.clear()
         for name in own:
-            self._say(name, b"-" + self._self)
+            self._send(name, b"-" + self._self)
 
-    def _tell_if_gone(self, name: str) -> None:
+    def _notify_if_gone(self, name: str) -> None:
         if all(known != name for known, _ in self._last):
-            self._tell(name, False)
+            self._notify(name, False)
 
-    def _tell(self, name: str, there: bool) -> None:
+    def _notify(self, name: str, there: bool) -> None:
         for matches, callback in self._watchers:
             if matches(name):
                 callback(name, there)
 
 
-class Letter(NamedTuple):
-    """A message that waits."""
+class QueuedMessage(NamedTuple):
+    """A message in the outbox."""
 
     topic: str
     payload: bytes
@@ -155,11 +155,11 @@ class Outbox:
             patience: s that the sender of a reliable message waits before that.
         """
         self._most, self._patience = most, patience
-        self._urgent: deque[Letter] = deque()
-        self._other: deque[Letter] = deque()
+        self._urgent: deque[QueuedMessage] = deque()
+        self._other: deque[QueuedMessage] = deque()
         self._changed = threading.Condition()
 
-    def put(self, letter: Letter, *, urgent: bool, patient: bool) -> None:
+    def put(self, letter: QueuedMessage, *, urgent: bool, patient: bool) -> None:
         """Add a message; if there is no room, a patient sender waits for some, and then the oldest goes."""
         queue = self._urgent if urgent else self._other
         with self._changed:
@@ -169,7 +169,7 @@ class Outbox:
                 queue.popleft()
             queue.append(letter)
 
-    def take(self) -> Letter | None:
+    def take(self) -> QueuedMessage | None:
         """Return the next message; None: there is none."""
         with self._changed:
             queue = self._urgent or self._other
@@ -180,7 +180,7 @@ class Outbox:
 
 
 HEARTBEATS = "presence/"
-"""Where announced names are said; no topic of anybody."""
+"""Topics of heartbeats; no topic of a car."""
 
 MOST_WAITING = 1024  # messages to send, and received ones per subscription; then the oldest, or the new ones, are lost
 PATIENCE = 1.0  # s
@@ -224,7 +224,7 @@ class Nats:
         if self._closed:
             return
         patient = reliable and threading.current_thread() is not self._thread
-        self._outbox.put(Letter(topic, payload, attachment), urgent=urgent or reliable, patient=patient)
+        self._outbox.put(QueuedMessage(topic, payload, attachment), urgent=urgent or reliable, patient=patient)
         with suppress(RuntimeError):  # closed meanwhile
             self._loop.call_soon_threadsafe(self._wake.set)
 
@@ -233,10 +233,10 @@ class Nats:
             await self._wake.wait()
             self._wake.clear()
             while (letter := self._outbox.take()) is not None:
-                if self._client.is_connected:  # else it is lost: nobody wants it later
+                if self._client.is_connected:  # else it is lost: it would be too old later
                     await self._post(letter)
 
-    async def _post(self, letter: Letter) -> None:
+    async def _post(self, letter: QueuedMessage) -> None:
         headers = headers_of(letter.attachment)
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
             await self._client.publish(subject_of(letter.topic), letter.payload, headers=headers)
@@ -267,10 +267,10 @@ class Nats:
         if not self._watching:
             self._watching = True
 
-            async def hear(message: Any) -> None:
-                self._presence.hear(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
+            async def receive(message: Any) -> None:
+                self._presence.receive(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
 
-            self._listen(HEARTBEATS + "**", hear)
+            self._listen(HEARTBEATS + "**", receive)
 
     def _listen(self, pattern: str, arrive: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         async def subscribe() -> None:
@@ -294,7 +294,7 @@ class Nats:
         self._closed = True
         with suppress(Exception):
             self._wait(self._end(), 2.0 * PATIENCE)
-        with suppress(Exception):  # what still waits for a broker that says nothing
+        with suppress(Exception):  # what still waits for a silent broker
             self._wait(self._cancel(), PATIENCE)
         self._loop.call_soon_threadsafe(self._loop.stop)
         if threading.current_thread() is not self._thread:

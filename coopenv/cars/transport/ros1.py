@@ -86,7 +86,7 @@ def join(address: Address, timeout: float) -> Master:
         if _master is None:
             os.environ["ROS_MASTER_URI"] = master.uri
             if not {"ROS_IP", "ROS_HOSTNAME"} & set(os.environ):
-                os.environ["ROS_IP"] = _own_address(address)  # else rospy listens on, and says, whatever it finds
+                os.environ["ROS_IP"] = _own_address(address)  # else rospy chooses any address
             options = {"disable_signals": True, "disable_rostime": True, "disable_rosout": True}
             library.init_node("coopenv", argv=[], anonymous=True, **options)
             atexit.register(library.signal_shutdown, "the process ends")
@@ -127,7 +127,7 @@ def opened(message: bytes) -> tuple[bytes, bytes] | None:
 
 PRESENCE = "coopenv/presence"
 MOST_WAITING = 256  # messages per topic and peer; then the oldest are lost
-PATIENCE = 0.5  # s that the first reliable message of a topic waits for somebody to hear it
+PATIENCE = 0.5  # s that the first reliable message of a topic waits for a subscriber
 CHECKS = 4  # of the presence's beats until the master is looked at again
 
 
@@ -181,11 +181,11 @@ class Ros1:
         with self._lock:
             self._wanted.append((pattern, callback))
             if "*" not in pattern:
-                self._hear(len(self._wanted) - 1, pattern)
+                self._subscribe(len(self._wanted) - 1, pattern)
         with suppress(OSError):
             self._discover()
 
-    def _hear(self, place: int, topic: str) -> None:
+    def _subscribe(self, place: int, topic: str) -> None:
         callback, typed = self._wanted[place][1], topic in self._types
 
         def arrive(message: Any) -> None:
@@ -210,7 +210,7 @@ class Ros1:
             with self._lock:
                 for place, matches in patterns:
                     if matches(topic) and (place, topic) not in self._subscribers and not self._ended.is_set():
-                        self._hear(place, topic)
+                        self._subscribe(place, topic)
 
     def announce(self, name: str) -> None:
         """Announce, see `Transport`."""
@@ -223,10 +223,10 @@ class Ros1:
             if not self._watching:
                 self._watching = True
                 self._wanted.append((PRESENCE, self._heartbeat))
-                self._hear(len(self._wanted) - 1, PRESENCE)
+                self._subscribe(len(self._wanted) - 1, PRESENCE)
 
     def _heartbeat(self, arrival: Arrival) -> None:
-        self._presence.hear(arrival.attachment.decode(errors="replace"), arrival.payload)
+        self._presence.receive(arrival.attachment.decode(errors="replace"), arrival.payload)
 
     def _beat(self) -> None:
         beats = 0
@@ -246,11 +246,11 @@ class Ros1:
             self._unregister()
             for place, (pattern, _) in enumerate(self._wanted):
                 if "*" not in pattern:
-                    self._hear(place, pattern)
+                    self._subscribe(place, pattern)
 
     def _unregister(self) -> None:
         for thing in (*self._publishers.values(), *self._subscribers.values()):
-            with suppress(Exception):  # whom nobody knows cannot be struck off
+            with suppress(Exception):  # not known to the master
                 thing.unregister()
         self._publishers.clear()
         self._subscribers.clear()

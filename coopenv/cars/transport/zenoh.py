@@ -29,7 +29,7 @@ class Zenoh:
 
     def __init__(self, session: Any, module: Any) -> None:
         self._session, self._zenoh = session, module
-        self._kept: list[Any] = []  # what is declared ends when nobody holds it
+        self._kept: list[Any] = []  # a declaration ends with its last reference
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -130,35 +130,35 @@ def open_zenoh(
         return Zenoh(zenoh.open(config), zenoh)
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen]) or "no endpoints"
-        said = _reason(error, connect, tls)
-        if said is None:
+        reason = _reason(error, connect, tls)
+        if reason is None:
             raise LinkError(f"{where}: does not answer within {timeout:g} s") from None
-        raise LinkError(f"{where}: no Zenoh there ({said})") from None
+        raise LinkError(f"{where}: no Zenoh there ({reason})") from None
 
 
 def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str | None:
     """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error.
 
-    None: nobody answers, or somebody who takes a connection and says nothing, as a firewall may.
+    None: no answer, or a connection without an answer, as by a firewall.
     """
     context = tls.context() if tls else None
     for endpoint in connect:
         if trouble := trouble_at(address_of(endpoint), context, 1.0):
             return None if trouble == NO_ANSWER else trouble
-    said = str(error).split(" at /")[0].split("\n")[0][:120]
-    return None if connect and "Timeout" in said else said
+    text = str(error).split(" at /")[0].split("\n")[0][:120]
+    return None if connect and "Timeout" in text else text
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
     """Connect to the network of a fleet; topics are those of the profile on every kind of network.
 
     Args:
-        deployment: says where, how and with which certificates.
+        deployment: the network and its certificates.
         timeout: s to wait for the router, broker or master.
 
     Raises:
         DeploymentError: certificates that cannot be used, or what the kind of network cannot do.
-        LinkError: nobody answers there.
+        LinkError: no answer there.
         CoopenvError: an extra is not installed.
     """
     network, certificates = deployment.network, certificates_of(deployment)

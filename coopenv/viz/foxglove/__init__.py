@@ -43,10 +43,10 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
         CoopenvError: Foxglove's SDK is not installed.
     """
     check_installed()
-    from coopenv.backends.mcap.format import Clock
+    from coopenv.backends.mcap.format import LogClock
     from coopenv.viz.foxglove.messages import RunView, topics
 
-    return topics(RunView(recording, run, Clock(recording.dt, start), gain))
+    return topics(RunView(recording, run, LogClock(recording.dt, start), gain))
 
 
 _PLOTS = {

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgba
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.format import Clock, View, codec, ros_definition
+from coopenv.backends.mcap.format import LogClock, View, codec, ros_definition
 from coopenv.base.format import jsonable
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array, covariance_in_map
@@ -68,7 +68,7 @@ class RunView:
 
     recording: Recording
     run: Run
-    clock: Clock
+    clock: LogClock
     gain: bool
     """Whether the observer's P is a gain matrix, and no covariance."""
 

@@ -15,7 +15,7 @@ from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.tracks import LONGEST_GAP
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.samples import Detections, Pose, RobustReport, Sample, Twist, Value
+from coopenv.cars.samples import CarPose, Detections, RobustReport, Sample, Twist, Value
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -81,7 +81,7 @@ class Senses:
     def _poses(self, until: float) -> Iterator[Sample]:
         for k in range(int(until * 100)):
             R, p = self.path.pose(k / 100)
-            yield sample(Role.TRUTH, START + k * 10 * MS, Pose(p, R))
+            yield sample(Role.TRUTH, START + k * 10 * MS, CarPose(p, R))
 
 
 def ticks(assembler: Assembler, samples: list[Sample], first: float, count: int) -> Iterator[tuple[int, Sensed]]:
@@ -127,7 +127,7 @@ def test_a_moving_landmark_is_where_it_was_when_the_frame_was_exposed() -> None:
     fleet = [Car(name="car0", marker=5), Car(name="lead", landmark="ML", marker=4)]
     assembler = Assembler(bind(world(landmarks=[*given, ml]), fleet, MARKERS, "lab.toml", None))
     said = [
-        sample(Role.ESTIMATE, START + k * 16 * MS, Pose(np.array([3.0 + 0.5 * 0.016 * k, 0, 0]), np.eye(3)), "lead")
+        sample(Role.ESTIMATE, START + k * 16 * MS, CarPose(np.array([3.0 + 0.5 * 0.016 * k, 0, 0]), np.eye(3)), "lead")
         for k in range(120)
     ]
     samples = sorted((*Senses(Path(3.0), 2.0).samples, *said), key=lambda s: s.received)
@@ -217,7 +217,7 @@ def test_other_cars_are_heard_where_one_is_estimated_alone() -> None:
     assembler = Assembler(binding(2, only="car1"))
     assembler.begin(START)
     turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    said = Pose(np.array([1.0, 2.0, 0.0]), turned, np.diag([0.1, 0.2, 0.3, 0.0, 0.0, 0.04]))
+    said = CarPose(np.array([1.0, 2.0, 0.0]), turned, np.diag([0.1, 0.2, 0.3, 0.0, 0.0, 0.04]))
     assembler.put(sample(Role.ESTIMATE, START + MS, said, "car0"))
     assembler.put(sample(Role.ESTIMATE, START + MS, said, "car1"))  # its own
     tick = assembler.tick(1, START + 11 * MS)
@@ -233,7 +233,7 @@ def test_other_cars_are_heard_where_one_is_estimated_alone() -> None:
 def test_the_observers_own_message_counts_before_the_pose() -> None:
     assembler = Assembler(binding(2, only="car1"))
     assembler.begin(START)
-    assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), "car0"))
+    assembler.put(sample(Role.ESTIMATE, START + MS, CarPose(np.zeros(3), np.eye(3)), "car0"))
     report = RobustReport(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
     assembler.put(sample(Role.REPORT, START + MS, report, "car0"))
     assert set(assembler.tick(1, START + 5 * MS).messages[1, 0].message.extra) == {"odometry"}
@@ -242,7 +242,7 @@ def test_the_observers_own_message_counts_before_the_pose() -> None:
 def test_stale_messages_are_dropped() -> None:
     assembler = Assembler(binding(2, only="car1"))
     assembler.begin(START)
-    assembler.put(sample(Role.ESTIMATE, START, Pose(np.zeros(3), np.eye(3)), "car0"))
+    assembler.put(sample(Role.ESTIMATE, START, CarPose(np.zeros(3), np.eye(3)), "car0"))
     assert not heard(assembler.tick(1, START + STALE + MS))
     assert assembler.refused["stale message"] == 1
 
@@ -259,7 +259,7 @@ def test_a_moving_landmark_counts_as_long_as_it_is_heard() -> None:
         return assembler.tick(k, stamp + 5 * MS)
 
     assert not look(1).visible.any() and assembler.refused["landmark of unknown position"] == 1
-    assembler.put(sample(Role.ESTIMATE, START + 15 * MS, Pose(np.array([2.0, 2.0, 0.1]), np.eye(3)), "lorry"))
+    assembler.put(sample(Role.ESTIMATE, START + 15 * MS, CarPose(np.array([2.0, 2.0, 0.1]), np.eye(3)), "lorry"))
     tick = look(2)
     assert tick.visible[0, 2]
     np.testing.assert_allclose(tick.landmarks[2], [2.0, 2.0, 0.1])
@@ -273,7 +273,7 @@ def test_what_a_moving_landmark_says_counts_once_and_not_for_long() -> None:
 
     def say(stamp: int, place: float, delay: int = MS) -> None:
         assembler.put(
-            sample(Role.ESTIMATE, START + stamp, Pose(np.array([place, 2.0, 0.0]), np.eye(3)), "lorry", delay)
+            sample(Role.ESTIMATE, START + stamp, CarPose(np.array([place, 2.0, 0.0]), np.eye(3)), "lorry", delay)
         )
 
     say(0, 2.0)
@@ -300,7 +300,7 @@ def test_what_queues_leave_out_is_counted() -> None:
     for stamp in (20, 10, 20):
         assembler.put(sample(Role.IMU, START + stamp * MS, Twist(None, np.ones(3))))
     for stamp in (20, 10):
-        assembler.put(sample(Role.TRUTH, START + stamp * MS, Pose(np.zeros(3), np.eye(3))))
+        assembler.put(sample(Role.TRUTH, START + stamp * MS, CarPose(np.zeros(3), np.eye(3))))
     for k in (1, 2):
         assembler.tick(k, START + (50 + k) * MS)
     assert {why: count for why, count in assembler.refused.items() if count} == {
@@ -320,7 +320,7 @@ def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearin
         assembler = Assembler(binding(3, only=f"car{receiver}", topology={"mode": "sensed", **topology}))
         assembler.begin(START)
         for sender in range(3):
-            assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), f"car{sender}"))
+            assembler.put(sample(Role.ESTIMATE, START + MS, CarPose(np.zeros(3), np.eye(3)), f"car{sender}"))
         messages = assembler.tick(1, START + 5 * MS).messages
         assert set(messages) == {(receiver, sender) for sender in hearing.get(receiver, set())}
         assert not assembler.refused
@@ -329,7 +329,7 @@ def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearin
 def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:
     assembler = Assembler(binding())
     for k in (0, 1, 30, 31):
-        assembler.put(sample(Role.TRUTH, START + k * 10 * MS, Pose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3))))
+        assembler.put(sample(Role.TRUTH, START + k * 10 * MS, CarPose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3))))
     known = [np.isfinite(assembler.truth(0, START + t * MS)[1]).all() for t in (5, 150, 305, 310)]
     assert known == [True, False, True, True]
     np.testing.assert_allclose(assembler.truth(0, START + 5 * MS)[1], [0.05, 0.0, 0.0])
@@ -339,7 +339,7 @@ def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:
 def test_origins_of_maps_are_taken_off() -> None:
     bound = binding(map={"origin": [1.0, 2.0, 0.0]})
     assembler = Assembler(bound)
-    assembler.put(sample(Role.TRUTH, START, Pose(np.array([1.5, 2.5, 0.0]), np.eye(3))))
+    assembler.put(sample(Role.TRUTH, START, CarPose(np.array([1.5, 2.5, 0.0]), np.eye(3))))
     np.testing.assert_allclose(assembler.truth(0, START)[1], [0.5, 0.5, 0.0])
     np.testing.assert_allclose(assembler.begin(START).landmarks[0], np.array(LANDMARKS["A"]) - [1.0, 2.0, 0.0])
 

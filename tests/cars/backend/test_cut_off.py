@@ -104,7 +104,7 @@ def test_a_replay_says_what_the_live_run_said(recorded: Any, tmp_path: Path) -> 
 def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp_path: Path) -> None:
     data, all_ticks = recorded[0].read_bytes(), ticks_of(recorded[0])
     numbers = []
-    for size in np.linspace(4000, len(data) - 1, 14).astype(int).tolist():
+    for size in np.linspace(4000, len(data) - 1, 8).astype(int).tolist():
         path = tmp_path / f"{size}.mcap"
         path.write_bytes(data[:size])
         assert is_drive(path)
@@ -120,9 +120,7 @@ def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp
                 continue
         (warning,) = caught
         assert issubclass(warning.category, DataWarning)
-        assert str(warning.message).startswith(
-            f"{path}: cut off, the end of the MCAP file is missing: of what came after "
-        )
+        assert str(warning.message).startswith(f"{path}: cut off, the end of the MCAP file is missing: nothing after ")
         for tick, same in zip(ticks, all_ticks, strict=False):
             np.testing.assert_array_equal(tick.bearings, same.bearings)
             np.testing.assert_array_equal(tick.truth.position, same.truth.position)

@@ -15,9 +15,9 @@ from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Gate, GateClock
-from coopenv.cars.gate.process import Link
+from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.samples import Pose, Sample, Twist
+from coopenv.cars.samples import CarPose, Sample, Twist
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.processes import wait_until
 
@@ -30,8 +30,8 @@ def sample(car: str, role: Role, stamp: int, value: Any = None, received: int | 
     return Sample(car, role, stamp, stamp if received is None else received, value)
 
 
-def at(x: float, y: float = 0.0) -> Pose:
-    return Pose(np.array([x, y, 0.0]))
+def at(x: float, y: float = 0.0) -> CarPose:
+    return CarPose(np.array([x, y, 0.0]))
 
 
 def test_only_newer_messages_are_signs_of_life() -> None:
@@ -112,13 +112,15 @@ class Yard:
     def __init__(self) -> None:
         self.hub = Hub()
         self.clock = GateClock(time.time_ns, time.monotonic_ns)
-        self.links = {car: Link(Gate(car, USUAL, self.clock), car, self.hub.connect(), None) for car in ("a", "b")}
+        self.links = {
+            car: GateConnection(Gate(car, USUAL, self.clock), car, self.hub.connect(), None) for car in ("a", "b")
+        }
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
         self.tell()
 
     def tell(self) -> None:
         for link in self.links.values():
-            link.tell()
+            link.publish_status()
 
     def stop(self, car: str) -> None:
         self.hub.connect().publish(SVEA.topic_of(car, Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
@@ -153,12 +155,12 @@ def test_gates_open(yard: Yard) -> None:
 
 def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.MonkeyPatch) -> None:
     slow = yard.links.pop("b")
-    slow.tell()
+    slow.publish_status()
     pressed: list[bool] = []
 
     def during() -> None:
         yard.tell()
-        slow.tell()
+        slow.publish_status()
         if states(yard)[0] == "armed" and not pressed:
             pressed.append(True)
             yard.stop("a")
@@ -183,7 +185,7 @@ def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
     yard.stop("b")
     yard.tell()
     assert yard.gates.stopped_by_others == {"b"}
-    with pytest.raises(CoopenvError, match="b: somebody has stopped it"):
+    with pytest.raises(CoopenvError, match="b: it was stopped elsewhere"):
         yard.gates.begin()
     yard.gates.begin(release=True)
     assert not yard.gates.stopped_by_others and states(yard) == ["armed", "armed"]
@@ -248,7 +250,7 @@ def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMo
     live(yard, dog, monitor, 0.6, usable=True)
     assert dog.trip is None
     live(yard, dog, monitor, 5.0, usable=False)
-    assert dog.trip is not None and "nothing new that could be used on fleet/a/mavros/wheel" in dog.trip.reason
+    assert dog.trip is not None and "no usable new message on fleet/a/mavros/wheel" in dog.trip.reason
     yard.tell()
     assert states(yard) == ["stopped", "stopped"]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.backends.base import Told
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.neighbours import estimate_message, report_message
 from coopenv.cars.codec import decode, encode
@@ -23,10 +23,10 @@ PLACE, ROTATION = np.array([0.7, -0.4, 0.1]), exp_so3(np.array([0.0, 0.0, 0.8]))
 ODOMETRY = np.array([0.0, 0.0, 0.3, 0.5, 0.2, 0.0])
 
 
-def told() -> Told:
+def told() -> VehicleBroadcast:
     extra = {"odometry": ODOMETRY, "depends_on": np.array([2], dtype=np.uint64)}
     covariance = np.diag([1e-3, 1e-3, 2e-3, 0.01, 0.02, 0.03])
-    return Told(0, ROTATION, PLACE, covariance, Message(PLACE, ROTATION, covariance, extra))
+    return VehicleBroadcast(0, ROTATION, PLACE, covariance, Message(PLACE, ROTATION, covariance, extra))
 
 
 @pytest.mark.parametrize(("role", "write"), [(Role.ESTIMATE, estimate_message), (Role.REPORT, report_message)])

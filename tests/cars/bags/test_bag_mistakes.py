@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap.format import metadata_names
-from coopenv.backends.sources import Kind, is_bag, kind_of
+from coopenv.backends.sources import SourceKind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.files import BagFile
@@ -34,9 +34,18 @@ pytest.importorskip("rosbags", reason="needs the extra 'log'")
 SHORT = [m for m in bags.messages(bags.drive()) if m.stamp < 500_000_000]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short(tmp_path_factory: pytest.TempPathFactory) -> None:
+    WRITTEN.append(bags.write(tmp_path_factory.mktemp("short") / "drive", SHORT, "ros1"))
+
+
+WRITTEN: list[Path] = []
+"""The bag of `SHORT`, written once."""
+
+
 def opened(tmp_path: Path, text: str, drive: list[bags.Message] | None = None, form: str = "ros1") -> Bag:
     (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
-    path = bags.write(tmp_path / "drive", SHORT if drive is None else drive, form)
+    path = WRITTEN[-1] if drive is None else bags.write(tmp_path / "drive", drive, form)
     return Bag([path], tmp_path / "topics.toml")
 
 
@@ -77,7 +86,7 @@ def test_a_bag_of_one_frame_is_too_short(tmp_path: Path) -> None:
         opened(tmp_path, MAP, [m for m in SHORT if m.stamp == 0])
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
 @pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
 def test_a_truncated_bag_is_one_line_or_what_could_be_read(form: str, share: float, tmp_path: Path) -> None:
     (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
@@ -113,7 +122,7 @@ def test_bytes_that_changed_are_one_line_or_what_could_be_read(form: str, tmp_pa
     whole = bags.write(tmp_path / "whole", SHORT, form)
     file = whole if whole.is_file() else next(whole.glob("whole*.*"))
     data, generator = bytearray(file.read_bytes()), np.random.default_rng(5)
-    for number in range(12):
+    for number in range(6):
         changed = bytearray(data)
         for place in generator.integers(0, len(data), 4):
             changed[place] = int(generator.integers(256))
@@ -206,12 +215,15 @@ def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:
 def test_files_of_others_are_told_from_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     foreign = bags.write(tmp_path / "foreign", SHORT, "mcap")
     shutil.copy(next(foreign.glob("*.mcap")), tmp_path / "foreign.mcap")
-    assert metadata_names(tmp_path / "foreign.mcap") == frozenset() and kind_of(tmp_path / "foreign.mcap") is Kind.BAG
-    assert kind_of(foreign) is Kind.BAG
+    assert (
+        metadata_names(tmp_path / "foreign.mcap") == frozenset()
+        and kind_of(tmp_path / "foreign.mcap") is SourceKind.BAG
+    )
+    assert kind_of(foreign) is SourceKind.BAG
     assert main(["run", str(tmp_path / "foreign.mcap")]) == 2
     assert "foreign.mcap: a ROS bag, which needs a map" in capsys.readouterr().err
     (tmp_path / "text.mcap").write_bytes(b"no log")
-    assert metadata_names(tmp_path / "text.mcap") is None and kind_of(tmp_path / "text.mcap") is Kind.LOG
+    assert metadata_names(tmp_path / "text.mcap") is None and kind_of(tmp_path / "text.mcap") is SourceKind.LOG
     assert is_bag(tmp_path / "text.mcap", "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
 
 

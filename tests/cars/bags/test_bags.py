@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import read_recording
-from coopenv.backends.sources import Kind, kind_of, open_recording
+from coopenv.backends.sources import SourceKind, kind_of, open_recording
 from coopenv.base.errors import DataWarning
 from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags import Bag
+from coopenv.cars.bags.log import reconcile, recorders, regularity
 from coopenv.cli import main
 from coopenv.observers import run
 from coopenv.observers.recording import Sensed
@@ -42,6 +45,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def path_of(folder: Path, form: str) -> Path:
     return folder / {"ros1": "ros1.bag"}.get(form, form)
+
+
+@pytest.fixture(scope="module")
+def reference(folder: Path) -> list[Sensed]:
+    """Ticks of the drive."""
+    return ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml"))
 
 
 def open_bag(path: Path, folder: Path, text: str = bags.MAP) -> Bag:
@@ -79,18 +88,12 @@ def test_ticks_are_those_of_the_drive(form: str, folder: Path) -> None:
         assert_allclose(tick.truth.rotation, made.truth.rotation[k + 1], atol=1e-9)
 
 
-def test_ros_1_and_ros_2_give_the_same_ticks(folder: Path) -> None:
-    first, *others = (ticks_of(Bag([path_of(folder, form)], folder / "topics.toml")) for form in FORMS)
-    for other in others:
-        assert_same(first, other)
-
-
 @pytest.mark.parametrize("inside", ["sqlite3/sqlite3.db3", "mcap/mcap.mcap"])
-def test_bare_files_are_as_good_as_their_folders(inside: str, folder: Path) -> None:
-    assert kind_of(folder / inside) is Kind.BAG
+def test_bare_files_are_as_good_as_their_folders(inside: str, folder: Path, reference: list[Sensed]) -> None:
+    assert kind_of(folder / inside) is SourceKind.BAG
     assert_same(
         ticks_of(Bag([folder / inside], folder / "topics.toml")),
-        ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")),
+        reference,
     )
 
 
@@ -111,7 +114,7 @@ def test_an_imported_bag_is_a_recording(folder: Path, capsys: pytest.CaptureFixt
     assert main(line) == 0
     printed = capsys.readouterr().out
     assert "/agent8/pixy_node/objectsInfo" in printed and "svea3 detections" in printed and "240 ticks" in printed
-    assert kind_of(out) is Kind.LOG
+    assert kind_of(out) is SourceKind.LOG
     recording, direct = read_recording(out), record(Bag([folder / "sqlite3"], given))
     for name in ("rotation", "translation", "bearings", "visible", "start_position"):
         assert_array_equal(getattr(recording, name), getattr(direct, name))
@@ -158,16 +161,16 @@ def test_the_python_interface_takes_a_bag(folder: Path) -> None:
         open_recording(folder / "ros1.bag")
 
 
-def test_definitions_that_a_bag_lacks_are_known(folder: Path, tmp_path: Path) -> None:
+def test_definitions_that_a_bag_lacks_are_known(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     path = tmp_path / "old.db3"
     path.write_bytes((folder / "sqlite3" / "sqlite3.db3").read_bytes())
     with sqlite3.connect(path) as database:
         database.execute("delete from message_definitions")
     database.close()
-    assert_same(ticks_of(open_bag(path, tmp_path)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+    assert_same(ticks_of(open_bag(path, tmp_path)), reference)
 
 
-def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path) -> None:
+def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     drive = bags.messages(bags.drive())
     captured = [m for m in drive if m.topic.startswith("/qualisys")]
     first = [m for m in drive if m.topic.startswith("/agent8")] + captured
@@ -176,40 +179,40 @@ def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path) ->
     a, b = bags.write(tmp_path / "a", first, "ros1"), bags.write(tmp_path / "b", apart, "sqlite3")
     with pytest.warns(DataWarning, match=r"clock of svea1: stamps are -0\.500 s behind, and were moved"):
         two = Bag([a, b], folder / "topics.toml")
-    assert_same(ticks_of(two), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+    assert_same(ticks_of(two), reference)
     offsets = {row.topic: row.offset for row in two.log.rows}
     assert offsets["/agent7/riccatiPoint"] == pytest.approx(-0.5) and offsets["/qualisys/svea3/pose"] == 0.0
 
 
-def test_a_cars_clock_that_is_behind_is_moved_within_a_file(folder: Path, tmp_path: Path) -> None:
+def test_a_cars_clock_that_is_behind_is_moved(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     drive = bags.later(bags.messages(bags.drive()), received=0.004)
     path = bags.write(tmp_path / "behind", bags.later(drive, stamps=-3.0, topics="/agent8"), "mcap")
     with pytest.warns(DataWarning, match=r"clock of svea3: stamps are \+3\.004 s behind"):
         moved = ticks_of(Bag([path], folder / "topics.toml"))
     believed = ticks_of(open_bag(path, tmp_path, bags.MAP + '[clocks]\nmode = "auto"\noffsets = { svea3 = 3.0 }\n'))
-    assert_same(believed, ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")), atol=1e-12)
+    assert_same(believed, reference, atol=1e-12)
     same = ("visible", "bearings", "rotation")
     assert all(
         np.allclose(getattr(moved[k], n), getattr(believed[k], n), equal_nan=True) for k in (5, 90) for n in same
     )
 
 
-def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Path) -> None:
+def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     unstamped = [replace(m, stamp=-bags.BEGIN) if "twist" in m.topic else m for m in bags.messages(bags.drive())]
     path = bags.write(tmp_path / "unstamped", unstamped, "ros1")
     with pytest.warns(DataWarning, match="actuation_twist: messages without stamps count when they were received"):
         bag = Bag([path], folder / "topics.toml")
-    assert_same(ticks_of(bag), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+    assert_same(ticks_of(bag), reference)
 
 
-def test_messages_that_make_no_sense_are_left_out(folder: Path, tmp_path: Path) -> None:
+def test_messages_that_make_no_sense_are_left_out(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     drive = bags.messages(bags.drive())
     nowhere = {"pose": bags.pose(np.eye(3), np.full(3, np.nan))}
     broken = [replace(m, fields=nowhere) if m.kind.endswith("PoseStamped") and m.stamp % 7 == 0 else m for m in drive]
     path = bags.write(tmp_path / "broken", broken, "mcap")
     with pytest.warns(DataWarning, match=r"svea3/pose: \d+ of 241 messages left out: truth: pose.position"):
         bag = Bag([path], folder / "topics.toml")
-    assert_same(ticks_of(bag), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")), atol=1e-3)
+    assert_same(ticks_of(bag), reference, atol=1e-3)
 
 
 TWO_CARS = """
@@ -263,7 +266,7 @@ def test_two_cars_that_recorded_themselves_see_each_other(tmp_path: Path) -> Non
     assert not replayed.failure and (replayed.bytes_per_second > 0.0).any()
 
 
-def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path) -> None:
+def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     names = {"/agent8/pixy_node/objectsInfo": "fleet/svea3/pixy/objects_info",
              "/agent8/actuation_twist": "fleet/svea3/mavros/wheel_odometry/velocity",
              "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
@@ -275,6 +278,47 @@ def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path) -> None:
     for number, m in enumerate(drive):
         recorder.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
     recorder.close()
-    assert kind_of(path) is Kind.LOG  # which is replayed as it was
+    assert kind_of(path) is SourceKind.LOG  # which is replayed as it was
     text = bags.MAP.replace('"authors"', '"svea"') + '[cars.topics]\npoint = "/fleet/svea1/point"\n'
-    assert_same(ticks_of(open_bag(path, tmp_path, text)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+    assert_same(ticks_of(open_bag(path, tmp_path, text)), reference)
+
+
+MS = 1_000_000
+clocks = st.integers(-(10**12), 10**12)
+
+
+@given(st.lists(clocks, min_size=2, max_size=4), clocks)
+def test_recorders_that_share_a_source_are_brought_together(ahead: list[int], truth: int) -> None:
+    """Everything is received at once; `ahead` are the clocks of cars that record themselves and motion capture."""
+    files = [{f"car{i}": 0, "truth": clock - truth} for i, clock in enumerate(ahead)]
+    found = reconcile(files, 20 * MS, {})
+    assert found.recorders == tuple(ahead[0] - clock for clock in ahead)
+    for i, clock in enumerate(ahead):
+        offset = ahead[0] - clock
+        shift = found.shifts[f"car{i}"]
+        assert shift.offset == offset and shift.added == (offset if abs(offset) > 20 * MS else 0)
+    assert found.shifts["truth"].offset == ahead[0] - truth
+
+
+def test_recorders_are_reached_through_others() -> None:
+    files = [{"a": 0}, {"b": 7}, {"b": 10, "a": 5}]
+    assert recorders(files) == [0, -2, -5]  # -5 by a, and 10 - 7 back by b
+
+
+def test_files_with_nothing_in_common_keep_their_stamps() -> None:
+    found = reconcile([{"a": 900 * MS}, {"b": 900 * MS}], 20 * MS, {})
+    assert found.shifts["a"].added == 900 * MS
+    assert found.shifts["b"].added == 0 and not found.shifts["b"].linked
+
+
+def test_what_somebody_says_counts() -> None:
+    found = reconcile([{"a": 900 * MS, "b": 3 * MS}], 20 * MS, {"a": 5 * MS})
+    assert found.shifts["a"].added == 5 * MS and found.shifts["b"].added == 0
+    assert reconcile([{"a": 900 * MS}], float("inf"), {}).shifts["a"].added == 0
+
+
+def test_gaps_are_counted() -> None:
+    stamps = np.array([0, 10, 20, 30, 130, 140]) * MS
+    rate, gap, gaps = regularity(stamps)
+    assert rate is not None and abs(rate - 5 / 0.14) < 1e-9 and gap == 0.1 and gaps == 1
+    assert regularity(stamps[:1]) == (None, None, None)

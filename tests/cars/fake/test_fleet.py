@@ -101,7 +101,7 @@ def test_who_cannot_start_says_why() -> None:
 
 def test_who_is_slow_is_not_waited_for() -> None:
     port = free_port()
-    with pytest.raises(FakesError, match="router is not ready in time: it has said nothing"):
+    with pytest.raises(FakesError, match="router is not ready in time: it has printed nothing"):
         fakes(OVERTAKING, port, patience=0.05).__enter__()
     assert not mentioning(f"tcp/127.0.0.1:{port}")
 

@@ -1,4 +1,4 @@
-"""Bytes of messages, against bytes put together by hand."""
+"""Bytes, types and names of messages and topics."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ from coopenv.cars.codec import (
     make,
     make_time,
     ros1,
+    ros2,
     stamp_of,
 )
+from coopenv.cars.profile import SVEA, Role, presence_of
+from coopenv.cars.transport.base import matcher
 
 ENCAPSULATION = bytes.fromhex("00010000")
 MANUAL = "mavros_msgs/msg/ManualControl"
@@ -109,3 +112,67 @@ def test_random_bytes_are_refused_or_read(payload: bytes) -> None:
             assert read(payload, MANUAL if read is decode else POINT) is not None
         except CoopenvError as error:
             assert "\n" not in str(error)
+
+
+MD5 = {
+    "svea_msgs/msg/lli_ctrl": "f4c1d25e08fe7c24fca84a1ec3ad2a96",
+    "svea_msgs/msg/VehicleState": "63c01f5a2a38c7ae477ab5ec3d89c8c3",
+    "pixy_camera/msg/ObjectBearingArrayStamped": "390db9f9b054c1851184795495a51256",
+    "nav_msgs/msg/Odometry": "cd5e73d190d741a2f92e81eda573aca7",
+    "geometry_msgs/msg/PointStamped": "c63aecb41bfdfd6b7e1fac37c7cbe7bf",
+}
+"""Of ROS 1, from genpy on the authors' stack."""
+
+RIHS01 = {
+    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+}
+"""Of ROS 2 Jazzy, as published."""
+
+
+@pytest.mark.parametrize("kind", MD5)
+def test_checksums_of_ros1_are_those_of_the_cars(kind: str) -> None:
+    assert ros1().generate_msgdef(kind)[1] == MD5[kind]
+
+
+@pytest.mark.parametrize("kind", RIHS01)
+def test_hashes_of_ros2_are_the_published_ones(kind: str) -> None:
+    assert ros2().hash_rihs01(kind) == f"RIHS01_{RIHS01[kind]}"
+
+
+def test_every_topic_has_a_type() -> None:
+    assert {topic.type for topic in SVEA.topics.values()} <= set(ros2().types)
+
+
+NAMES = {
+    Role.ODOMETRY: ("fleet/svea7/odometry/local", "nav_msgs/msg/Odometry", 0.2),
+    Role.WHEEL: ("fleet/svea7/mavros/wheel_odometry/velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", 0.1),
+    Role.IMU: ("fleet/svea7/mavros/imu/data_raw", "sensor_msgs/msg/Imu", 0.1),
+    Role.BEARINGS: ("fleet/svea7/pixy/objects_bearing", "pixy_camera/msg/ObjectBearingArrayStamped", 0.05),
+    Role.CAMERA_INFO: ("fleet/svea7/pixy/camera_info", "sensor_msgs/msg/CameraInfo", None),
+    Role.ESTIMATE: ("fleet/svea7/v2x/estimate", "geometry_msgs/msg/PoseWithCovarianceStamped", 0.25),
+    Role.STATE: ("fleet/svea7/mavros/state", "mavros_msgs/msg/State", 2.0),
+    Role.REMOTE: ("fleet/svea7/mavros/rc/in", "mavros_msgs/msg/RCIn", 2.0),
+    Role.BATTERY: ("fleet/svea7/mavros/battery", "sensor_msgs/msg/BatteryState", 2.0),
+    Role.COMMAND: ("fleet/svea7/coopenv/cmd", "ackermann_msgs/msg/AckermannDriveStamped", 0.15),
+    Role.MANUAL: ("fleet/svea7/mavros/manual_control/send", "mavros_msgs/msg/ManualControl", None),
+    Role.STOP: ("fleet/svea7/coopenv/estop", "std_msgs/msg/Bool", None),
+    Role.TRUTH: ("fleet/qualisys/svea7/odom", "nav_msgs/msg/Odometry", 0.1),
+}
+
+
+@pytest.mark.parametrize("role", NAMES)
+def test_names_types_and_ages_are_those_agreed(role: Role) -> None:
+    name, kind, age = NAMES[role]
+    assert SVEA.topic_of("svea7", role) == name
+    assert (SVEA.topics[role].type, SVEA.topics[role].max_age) == (kind, age)
+
+
+def test_commands_overtake_and_a_stop_waits_rather_than_is_lost() -> None:
+    assert SVEA.topics[Role.COMMAND].urgent
+    assert SVEA.topics[Role.STOP].urgent
+    assert SVEA.topics[Role.STOP].reliable
+
+
+def test_the_pattern_of_all_presences_matches_each() -> None:
+    assert matcher(presence_of("*"))(presence_of("svea7"))

@@ -13,7 +13,7 @@ from coopenv import CoopenvError
 from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, CarStatus, Detections, Pose, RobustReport, Twist
+from coopenv.cars.samples import Calibration, CarPose, CarStatus, Detections, RobustReport, Twist
 from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
@@ -133,7 +133,7 @@ def test_velocities() -> None:
     )
     moved, truth = read(Role.ODOMETRY, own), read(Role.TRUTH, own)
     assert isinstance(moved, Twist) and moved.linear is not None and moved.linear.tolist() == [2, 0, 0]
-    assert isinstance(truth, Pose) and truth.position.tolist() == [1, 2, 3] and truth.covariance is None
+    assert isinstance(truth, CarPose) and truth.position.tolist() == [1, 2, 3] and truth.covariance is None
 
 
 def imu(first: float = 0.0, w: Any = (0.1, 0.2, 0.3)) -> Any:
@@ -162,17 +162,17 @@ def test_poses_and_points() -> None:
     P = np.diag([1.0, 2, 3, 4, 5, 6])
     posed = with_covariance("Pose", P, pose=pose(q=turn.as_quat()))
     value = read(Role.ESTIMATE, make("geometry_msgs/msg/PoseWithCovarianceStamped", header=head(), pose=posed))
-    assert isinstance(value, Pose) and value.rotation is not None
+    assert isinstance(value, CarPose) and value.rotation is not None
     assert_allclose(value.rotation, turn.as_matrix(), atol=1e-12)
     assert_array_equal(value.covariance, P)
     for ros in (1, 2):
         stamped = make("geometry_msgs/msg/PoseStamped", ros, header=head(ros), pose=pose(q=turn.as_quat()))
         seen = read(Role.TRUTH, stamped)
-        assert isinstance(seen, Pose) and seen.rotation is not None
+        assert isinstance(seen, CarPose) and seen.rotation is not None
         assert_allclose(seen.rotation, turn.as_matrix(), atol=1e-12)
     point = make("geometry_msgs/msg/PointStamped", 1, header=head(1), point=pose().position)
     told = read(Role.POINT, point)
-    assert isinstance(told, Pose) and told.position.tolist() == [1, 2, 3] and told.rotation is None
+    assert isinstance(told, CarPose) and told.position.tolist() == [1, 2, 3] and told.rotation is None
 
 
 def test_reports() -> None:

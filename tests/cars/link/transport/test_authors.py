@@ -14,9 +14,9 @@ from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, 
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
-from coopenv.cars.samples import Pose
+from coopenv.cars.samples import CarPose
 from coopenv.cars.transport.authors import COUNTERPARTS, Authors, routes_of, to_ros1
-from coopenv.cars.transport.base import Arrival, Hub, Local
+from coopenv.cars.transport.base import Arrival, Hub, HubTransport
 
 CAR = Car(name="svea1", agent=7)
 STAMP = 3_000_000_004
@@ -24,7 +24,7 @@ POINT = struct.pack("<IIII", 0, 3, 4, 3) + b"map" + struct.pack("<3d", 1.5, -2.0
 ESTIMATE, HEARD = SVEA.topic_of("svea1", Role.ESTIMATE), SVEA.topic_of("svea1", Role.POINT)
 
 
-def ends() -> tuple[Authors, Local, list[Arrival]]:
+def ends() -> tuple[Authors, HubTransport, list[Arrival]]:
     """Return a translating end, a plain one on the same network and what that hears."""
     hub = Hub()
     plain, heard = hub.connect(), []  # type: ignore[var-annotated]
@@ -62,7 +62,7 @@ def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> No
     assert [(a.topic, a.attachment) for a in heard] == [(HEARD, b"signed")]
     message = decode(heard[0].payload, SVEA.topics[Role.POINT].type)
     told = read(Role.POINT, message)
-    assert isinstance(told, Pose)
+    assert isinstance(told, CarPose)
     np.testing.assert_array_equal(told.position, [1.5, -2.0, 0.25])
     assert told.rotation is None
     assert told.covariance is None

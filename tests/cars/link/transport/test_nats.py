@@ -12,12 +12,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from coopenv.cars.codec import empty, encode
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Arrival, Certificates, LinkError
-from coopenv.cars.transport.nats import MOST_WAITING, open_nats
+from coopenv.cars.transport import nats
+from coopenv.cars.transport.base import Arrival, Certificates, LinkError, matcher
+from coopenv.cars.transport.nats import (
+    LEASE,
+    MOST_WAITING,
+    Outbox,
+    Presence,
+    QueuedMessage,
+    open_nats,
+    subject_of,
+    subjects_of,
+)
 from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.authority import Authority
 from tests.helpers.brokers import nats_server
@@ -155,3 +167,92 @@ def test_a_deployment_reaches_cars_over_the_authors_wire(tmp_path: Path) -> None
         car.close()
         station.close()
     assert {(a.topic, a.payload, a.attachment) for a in heard} == {(bearings, sent, b"signed"), (gate, b"status", b"")}
+
+
+def test_a_subject_is_the_topic_with_dots() -> None:
+    assert subject_of("agent7/riccatiPoint") == "agent7.riccatiPoint"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "subjects"),
+    [
+        ("agent7/riccatiPoint", ("agent7.riccatiPoint",)),
+        ("fleet/*/x", ("fleet.*.x",)),
+        ("fleet/a/**", ("fleet.a", "fleet.a.>")),
+        ("fleet/**/x", ("fleet.>",)),
+        ("**", (">",)),
+    ],
+)
+def test_patterns_as_subjects(pattern: str, subjects: tuple[str, ...]) -> None:
+    assert subjects_of(pattern) == subjects
+
+
+def covers(subject: str, topic: str) -> bool:
+    """Say what a NATS server delivers: `*` is a token, `>` at the end one or more."""
+    wanted, tokens = subject.split("."), topic.split("/")
+    for i, token in enumerate(wanted):
+        if token == ">":
+            return len(tokens) > i
+        if i >= len(tokens) or token not in ("*", tokens[i]):
+            return False
+    return len(tokens) == len(wanted)
+
+
+@given(
+    pattern=st.lists(st.sampled_from(["a", "b", "*", "**"]), min_size=1, max_size=4),
+    topic=st.lists(st.sampled_from(["a", "b"]), min_size=1, max_size=4),
+)
+def test_no_topic_is_missed_and_none_comes_twice(pattern: list[str], topic: list[str]) -> None:
+    times = sum(covers(subject, "/".join(topic)) for subject in subjects_of("/".join(pattern)))
+    assert times <= 1
+    if matcher("/".join(pattern))("/".join(topic)):
+        assert times == 1
+
+
+def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(nats.time, "monotonic", lambda: now[0])
+    seen: list[tuple[str, bool]] = []
+    watcher = Presence(lambda name, payload: None)
+    ends = [Presence(watcher.receive) for _ in range(2)]
+    watcher.watch("fleet/alive/*", lambda *change: seen.append(change))
+    for end in ends:
+        end.announce("fleet/alive/svea7")
+    ends[0].announce("fleet/other")
+    assert seen == [("fleet/alive/svea7", True)]
+    ends[0].leave()
+    assert len(seen) == 1
+    now[0] += 0.9 * LEASE
+    ends[1].beat()
+    now[0] += 0.9 * LEASE
+    watcher.beat()
+    assert len(seen) == 1
+    now[0] += 0.2 * LEASE
+    watcher.beat()
+    assert seen[1:] == [("fleet/alive/svea7", False)]
+    ends[1].beat()
+    assert seen[2:] == [("fleet/alive/svea7", True)]
+
+
+def letter(number: int) -> QueuedMessage:
+    return QueuedMessage("t", bytes([number]), b"")
+
+
+def test_urgent_ones_overtake_and_the_oldest_go_first_when_there_is_no_room() -> None:
+    outbox = Outbox(2, 0.0)
+    for number in range(4):
+        outbox.put(letter(number), urgent=False, patient=False)
+    outbox.put(letter(9), urgent=True, patient=False)
+    assert [outbox.take() for _ in range(4)] == [letter(9), letter(2), letter(3), None]
+
+
+def test_a_patient_sender_waits_for_room_and_loses_nothing() -> None:
+    outbox = Outbox(1, 60.0)
+    outbox.put(letter(1), urgent=True, patient=False)
+    sender = threading.Thread(target=lambda: outbox.put(letter(2), urgent=True, patient=True), daemon=True)
+    sender.start()
+    time.sleep(0.1)
+    assert sender.is_alive()
+    assert outbox.take() == letter(1)
+    sender.join(60.0)
+    assert outbox.take() == letter(2)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport.base import Arrival, Certificates, LinkError
+from coopenv.cars.transport.base import Address, Arrival, Certificates, LinkError, address_of, trouble_at
 from coopenv.cars.transport.zenoh import open_transport, open_zenoh
 from tests.helpers.authority import Authority
 from tests.helpers.processes import wait_until
@@ -99,3 +101,34 @@ def test_files_that_cannot_be_used_are_named_in_one_line(tmp_path: Path, fleet: 
         open_transport(deployment(tmp_path, "tls/127.0.0.1:1", **{"certificate": "a.pem", "key": "a.key", **changed}))
     assert said.format(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_endpoints_have_three_parts() -> None:
+    assert address_of("tcp/127.0.0.1:7447") == Address("tcp", "127.0.0.1", 7447)
+    assert address_of("tls/car.lab:0#iface=eth0") == Address("tls", "car.lab", 0)
+    assert address_of("tcp/[::1]:7447") == Address("tcp", "::1", 7447)
+    assert address_of("tcp/[::1]:7447").authority == "[::1]:7447"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost", "LocalHost"])
+def test_what_is_on_this_computer(host: str) -> None:
+    assert address_of(f"tcp/{host}:7447").loopback
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "10.0.0.1", "[::]", "[fe80::1]", "localhost.lab", "127.0.0.1.lab", "car"])
+def test_what_may_be_elsewhere(host: str) -> None:
+    assert not address_of(f"tcp/{host}:7447").loopback
+
+
+@pytest.mark.parametrize(
+    "text", ["", "tcp", "tcp/", "tcp/a", "tcp/a:b", "tcp/a:65536", "http/a:1", "tcp/a b:1", "tcp/a:1\n"]
+)
+def test_what_is_none_is_refused(text: str) -> None:
+    with pytest.raises(CoopenvError, match="is no endpoint, expected for example"):
+        address_of(text)
+
+
+def test_the_reason_of_a_failure_is_found() -> None:
+    assert trouble_at(Address("tcp", "127.0.0.1", free_port()), None, 1.0) == "Connection refused"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        assert trouble_at(Address("tcp", "127.0.0.1", server.getsockname()[1]), None, 1.0) is None
