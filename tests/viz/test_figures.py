@@ -1,4 +1,4 @@
-"""What the figures say: the artists are read back and compared with the run they were drawn from."""
+"""Contents of the figures: the artists are read back and compared with the run that they show."""
 
 from __future__ import annotations
 
@@ -38,19 +38,14 @@ def test_all_figures_are_written_under_their_stable_names(run: Trajectory, tmp_p
         assert picture[..., :3].std() > 0.05  # not blank
 
 
-def test_every_figure_says_what_it_is_of(run: Trajectory, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: (drawn.append(figure), path.touch()))
-    save_figures(run, tmp_path, note="overtaking, robust, seed 3")
-    assert all(figure.get_supxlabel().endswith("overtaking, robust, seed 3") for figure in drawn)
-    assert len(drawn) == len(NAMES)
-
-
 @pytest.mark.parametrize("ticks", [1, 2])
-def test_short_runs_are_drawn(ticks: int, tmp_path: Path) -> None:
-    assert len(save_figures(make_trajectory(ticks=ticks), tmp_path)) == len(NAMES)
+def test_short_runs_are_drawn_with_a_note(ticks: int, unwritten: list[Figure], tmp_path: Path) -> None:
+    save_figures(make_trajectory(ticks=ticks), tmp_path, note="overtaking, robust, seed 3")
+    assert all(figure.get_supxlabel().endswith("overtaking, robust, seed 3") for figure in unwritten)
+    assert len(unwritten) == len(NAMES)
 
 
+@pytest.mark.usefixtures("unwritten")
 def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
     run = make_trajectory(ticks=90)
     lost = np.where(run.t[:, None] > 1, np.nan, 1.0) * np.ones(5)
@@ -65,6 +60,7 @@ def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
     assert "no covariance declared" in texts(error_figures.consistency_figure(run))
 
 
+@pytest.mark.usefixtures("unwritten")
 def test_observers_that_are_lost_from_the_start_are_drawn(tmp_path: Path) -> None:
     run = make_trajectory(ticks=90)
     values = np.array([np.nan, np.inf, 1e300, np.nan, 1e300])
@@ -85,11 +81,12 @@ def test_a_place_that_cannot_be_written_is_one_clear_error(run: Trajectory, tmp_
 
 def test_global_state_of_matplotlib_is_left_alone() -> None:
     code = (
-        "import tempfile, matplotlib as mpl, matplotlib._pylab_helpers\n"
+        "import pathlib, tempfile, matplotlib as mpl, matplotlib._pylab_helpers\n"
         "before = dict(mpl.rcParams)\n"
         "from tests.helpers.synthetic import make_trajectory\n"
-        "from coopenv.viz.figures import save_figures\n"
-        "save_figures(make_trajectory(ticks=20), tempfile.mkdtemp())\n"
+        "from coopenv.viz.figures import draw_figure\n"
+        "from coopenv.viz.style import save\n"
+        "save(draw_figure('trajectories_3d', make_trajectory(ticks=20)), pathlib.Path(tempfile.mkdtemp(), 'f.png'))\n"
         "assert dict(mpl.rcParams) == before\n"
         "assert not mpl._pylab_helpers.Gcf.figs\n"
     )
