@@ -7,6 +7,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from coopenv.base.installation import list_envs
+from coopenv.base.sections import Section
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import SVEA, CarProfile, Role
@@ -139,22 +140,22 @@ def topics() -> str:
     return f"{TOPIC}{found}\n\n{PROFILE}{_reference(CarProfile)}"
 
 
-def _reference(part: type[BaseModel]) -> str:
+def _reference(part: type[Section]) -> str:
     """Return the table of the keys of a file, from the docstrings of its fields."""
     rows = [
-        (f"`{key}`", _default(field), _values(field), " ".join((field.description or "").split()))
-        for key, field in _keys(part)
+        (f"`{key}`", _default(field), _values(field), " ".join(meaning.split())) for key, field, meaning in _keys(part)
     ]
     return table(("key", "default", "values", "meaning"), rows) + "\n"
 
 
-def _keys(part: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield the dotted keys of a section and of those in it, each with its field."""
+def _keys(part: type[Section], prefix: str = "") -> Iterator[tuple[str, FieldInfo, str]]:
+    """Yield the dotted keys of a section and of those in it, each with its field and its meaning."""
+    meanings = part.meanings()
     for name, field in part.model_fields.items():
-        if field.description and f"{prefix}{name}" not in ("file", "path"):
-            yield f"{prefix}{name}", field
+        if name in meanings and f"{prefix}{name}" not in ("file", "path"):
+            yield f"{prefix}{name}", field, meanings[name]
         for kind in (field.annotation, *get_args(field.annotation)):
-            if isinstance(kind, type) and issubclass(kind, BaseModel) and kind is not CarProfile:
+            if isinstance(kind, type) and issubclass(kind, Section) and kind is not CarProfile:
                 yield from _keys(kind, f"{prefix}{name}.")
 
 

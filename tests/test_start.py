@@ -57,6 +57,7 @@ def test_start_loads_no_simulation(statement: str) -> None:
         ["list", "observers"],
         ["list", "agents"],
         ["list", "scenes"],
+        ["list", "variants"],
         ["describe", "facade"],
         ["describe", "busy_intersection", "--json"],
         ["describe", "large_crossing", "--all"],

@@ -25,7 +25,7 @@ def list_command(
     from coopenv.runs import summary
 
     if kind is Kind.variants:
-        from coopenv.bench.observers.sources import variant_rows
+        from coopenv.bench.observers.faults import variant_rows
 
         rows = variant_rows()
     elif kind is Kind.scenes:

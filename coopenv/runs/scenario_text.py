@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
+from coopenv.base.sections import Section
 from coopenv.scenario.bodies import (
     Body,
     ConstantMotion,
@@ -389,6 +390,7 @@ def observation(scenario: Scenario) -> Listing:
 
 def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str, bool]]:
     """Yield (dotted key, value, meaning, whether it differs from the default) of a section's fields that matter."""
+    meanings = part.meanings() if isinstance(part, Section) else {}
     unused = IMAGE_FIELDS if isinstance(part, Camera) and part.model != "pinhole" else ()
     for name, info in type(part).model_fields.items():
         if name in unused:
@@ -399,7 +401,7 @@ def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str,
         elif name == "custom":
             yield from ((f"custom.{key}", setting(row.function), row.meaning, True) for key, row in value.items())
         else:
-            meaning = " ".join((info.description or "").split())
+            meaning = " ".join(meanings.get(name, "").split())
             yield f"{prefix}{name}", setting(value), meaning, value != info.get_default()
     for name, value in (part.model_extra or {}).items():
         yield f"{prefix}{name}", setting(value), "A term of one's own, see docs/terms.md", True

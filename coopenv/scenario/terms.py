@@ -7,7 +7,7 @@ weights that a scenario may set, the kernel (`coopenv.api.terms`), and the table
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from coopenv.base import user_code
@@ -155,22 +155,23 @@ Per = Literal["vehicle", "target", "neighbour", "landmark"]
 of each of the landmarks that are nearest by the vehicle's own estimate."""
 
 
-def _or_text(schema: dict[str, Any]) -> None:
-    """Say, for editors, that a row may be the text of its function alone."""
-    row = dict(schema)
-    schema.clear()
-    schema["anyOf"] = [{"type": "string", "description": row["properties"]["function"]["description"]}, row]
-
-
 class Row(Section):
     """What every term says of itself; a text alone is its function."""
-
-    model_config = ConfigDict(json_schema_extra=_or_text)
 
     function: str | SkipJsonSchema[Callable[..., Any]]
     """`file.py:name`, the file relative to the scenario's, or `package.module:name`."""
     unit: Text = "1"
     meaning: Text = ""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> Any:
+        """Return the JSON schema; for editors the text of the function alone is a row, too."""
+        schema = super().__get_pydantic_json_schema__(core_schema, handler)
+        whole = handler.resolve_ref_schema(schema)
+        row = dict(whole)
+        whole.clear()
+        whole["anyOf"] = [{"type": "string", "description": cls.meanings()["function"]}, row]
+        return schema
 
     @model_validator(mode="before")
     @classmethod

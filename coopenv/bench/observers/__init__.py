@@ -1,7 +1,21 @@
-"""The benchmark of observers: where records come from, who judges, and what is printed and written."""
+"""The benchmark of observers: records with faults, judged against the truth and the bounds, as tables and files."""
 
-from coopenv.bench.observers.comparison import Comparison, compare
-from coopenv.bench.observers.rows import Row
-from coopenv.bench.observers.sources import Source, find_source
+from typing import TYPE_CHECKING
+
+from coopenv.base import lazy_names
+
+if TYPE_CHECKING:
+    from coopenv.bench.observers.comparison import Comparison, compare
+    from coopenv.bench.observers.rows import Row
+    from coopenv.bench.observers.sources import Source, find_source
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "coopenv.bench.observers.comparison": ["Comparison", "compare"],
+            "coopenv.bench.observers.rows": ["Row"],
+            "coopenv.bench.observers.sources": ["Source", "find_source"],
+        },
+    )
 
 __all__ = ["Comparison", "Row", "Source", "compare", "find_source"]

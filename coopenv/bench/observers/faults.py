@@ -5,21 +5,25 @@ The spelling is that of `coopenv.base.fault_text`; `/` joins several faults of o
 `vehicle_2:lie=drift:0.05@10/gyro_bias=0.0175`.
 """
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
-from coopenv.observers.interference import Interference
-from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.sensing import LONGEST_REPLAY
 from coopenv.scenario.starts import neighbour_sets, processing_order
+
+if TYPE_CHECKING:
+    from coopenv.observers.interference import Interference
+    from coopenv.observers.recording import Recording
 
 NOMINAL = "nominal"
 DIRECTION = np.array([0.6, 0.8, 0.0])
@@ -94,6 +98,8 @@ def with_lie(recording: Recording, fault: Fault) -> Recording:
 
 def _honest(recording: Recording) -> Interference:
     """Return no interference, in arrays of a recording's size."""
+    from coopenv.observers.interference import Interference
+
     K, N = recording.ticks, len(recording.setups)
     vectors, zeros = np.zeros((K, N, 3)), np.zeros((K, N), np.int64)
     none = zeros[0].copy()
@@ -322,6 +328,21 @@ VARIANTS = {
     }.items()
 }
 """Variants with a name of their own."""
+
+ROBOT_VARIANTS = {
+    "landmarks": "no robot sees another",
+    "landmarks+robots": "everything that was seen counts",
+    "blind": "robots 3 to 5 see no landmark",
+}
+"""Variants of recorded robots, each with its meaning."""
+
+
+def variant_rows() -> list[dict[str, str]]:
+    """Return the rows of `list variants`."""
+    named = {name: variant.summary for name, variant in VARIANTS.items()}
+    faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
+    kinds = {"environments, logs": named, "recorded robots": ROBOT_VARIANTS, "--fault": faults}
+    return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
 
 
 def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]) -> FaultVariant:

@@ -15,9 +15,9 @@ from coopenv.backends.base import Backend
 from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.bench.observers.faults import (
-    FAULTS,
     NO_FOLLOWERS,
     NOMINAL,
+    ROBOT_VARIANTS,
     VARIANTS,
     FaultVariant,
     check_recorded,
@@ -122,12 +122,8 @@ class Robots(Source):
 
     data: Path | None
     """The folder with the data; None: as the environment variable COOPENV_DATA says."""
-    named: ClassVar[Mapping[str, str]] = {
-        "landmarks": "no robot sees another",
-        "landmarks+robots": "everything that was seen counts",
-        "blind": "robots 3 to 5 see no landmark",
-    }
-    usual: ClassVar[tuple[str, ...]] = tuple(named)
+    named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
+    usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
     friendly: ClassVar[str] = (
         "Friendly: robots start at their true pose and are judged from t = 0 on; who is seen is known from barcodes, "
         "their own left out; planar_robust's wheels were fitted to these robots; all hear all, 10 Hz, no loss."
@@ -224,13 +220,6 @@ def _is_planar(recording: Recording) -> bool:
 
 
 ALL = "all"  # asks for every variant that the source can have
-
-
-def variant_rows() -> list[dict[str, str]]:
-    """Return what `list variants` says of every variant."""
-    faults = {f"{name}={kind.value}" if kind.value else name: kind.meaning for name, kind in FAULTS.items()}
-    kinds = {"environments, logs": Source.named, "recorded robots": Robots.named, "--fault": faults}
-    return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
 
 
 def find_source(
