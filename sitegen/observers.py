@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pkgutil import resolve_name
 
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.registry import ZOO, Entry
+from coopenv.observers.registry import ZOO, ZooEntry
 from coopenv.runs.page import bullets, table
 from sitegen.mirror import ROOT, relinked
 
@@ -47,7 +47,7 @@ def _docstring(file: str) -> str:
     return ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
 
 
-def _where(entry: Entry) -> str:
+def _where(entry: ZooEntry) -> str:
     """Return the sentence that says where an observer is computed."""
     if entry.kernels:
         return "Runs inside the kernels of a batch, on the CPU and on a GPU."
@@ -58,7 +58,7 @@ def _where(entry: Entry) -> str:
     return "Runs in Python on the host."
 
 
-def _page(name: str, entry: Entry, about: str, sends: str) -> str:
+def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
     place, _, item = entry.plugin.partition(":")
     file = f"coopenv/observers/{place.replace('.', '/')}.py"
     package = file.rpartition("/")[0] + "/__init__.py"

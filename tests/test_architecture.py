@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2200, 8),
     "estimation": (1815, 11),
     "evaluation": (450, 3),
-    "observers": (12270, 48),
+    "observers": (12290, 48),
     "policies": (1315, 7),
     "runs": (3600, 15),
     "scenario": (2955, 14),

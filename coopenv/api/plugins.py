@@ -9,7 +9,7 @@ from coopenv.backends.base import SensingWorld
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
-from coopenv.observers.group import Group, ObserverError
+from coopenv.observers.group import ObserverError, ObserverGroup
 from coopenv.observers.interference import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
@@ -33,7 +33,7 @@ class PlugIns:
             raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
         self.name, self._world = name, world
         observer_init = world.observer_init
-        self.groups = [Group(factory, observer_init) for _ in range(world.worlds)]
+        self.groups = [ObserverGroup(factory, observer_init) for _ in range(world.worlds)]
         self._order: Sequence[int] = observer_init.order
         self._ticking = np.zeros(world.worlds, dtype=bool)  # worlds that are in the tick under way
         self._failures: dict[int, str] = {}

@@ -105,10 +105,10 @@ class CovarianceIntersection(Mekf):
     sends_covariance = True
 
     def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
-        """Correct by bearings, which are linearised at the prediction."""
+        """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([m is None or m.covariance is None for m in measured.messages])
         if known.any():
-            super().correct(tick, measured.only(known), linear.only(known))
+            self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
             self.intersect(tick, measured.one(n))
 
@@ -174,13 +174,11 @@ def updated_parts(
     return R, p, P, P_i, nis
 
 
-class SplitCovarianceIntersection(Mekf):
+class SplitCovarianceIntersection(CovarianceIntersection):
     """Kalman filter; neighbours by split intersection.
 
     It sends position and covariance. The normalised innovation is that of the landmarks.
     """
-
-    sends_covariance = True
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose with independent errors."""
@@ -192,25 +190,17 @@ class SplitCovarianceIntersection(Mekf):
         self.independent = replace(self.state, P=self.independent).predicted(tick).P
         super().predict(tick)
 
-    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
-        """Correct by the landmarks, then by neighbours one at a time."""
-        known = np.array([m is None or m.covariance is None for m in measured.messages])
-        if known.any():
-            self.nis = self.intersect(tick, measured.only(known))
-            self.nis_dof = 2 * int(known.sum())
-        for n in np.flatnonzero(~known).tolist():
-            self.intersect(tick, measured.one(n))
+    def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
+        """Fuse one bearing to a neighbour with the covariance of its position."""
+        P, P_i, linear = self.state.P, self.independent, linearised(self.state, tick, one)
+        w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
+        if w < 1.0:
+            self.state = replace(self.state, P=(P - P_i) / w + P_i)
+            self.fuse(tick, one._replace(covariances=one.covariances / (1.0 - w)))
 
-    def intersect(self, tick: Tick, measured: BearingMeasurements) -> float:
-        """Correct by bearings to landmarks, or by one to a neighbour; return the normalised innovation squared."""
-        state, P, P_i = self.state, self.state.P, self.independent
-        if measured.covariances.any():
-            linear = linearised(state, tick, measured)
-            w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
-            if w == 1.0:
-                return 0.0
-            P = (P - P_i) / w + P_i
-            measured = measured._replace(covariances=measured.covariances / (1.0 - w))
-        R, p, P, P_i, nis = updated_parts(state.kind, state.R, state.p, P, P_i, frame_of(tick, measured))
-        self.state, self.independent = self.state_type(R, p, P), P_i
+    def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
+        """Correct by bearings; return their normalised innovation squared."""
+        state, frame = self.state, frame_of(tick, measured)
+        R, p, P, self.independent, nis = updated_parts(state.kind, state.R, state.p, state.P, self.independent, frame)
+        self.state = self.state_type(R, p, P)
         return float(nis)

@@ -1,6 +1,6 @@
 """The plug-in observers of one world's vehicles and the messages between them.
 
-Whoever has ticks drives a group with them: the runner on a record, the environment on a world or a replay.
+A source of ticks drives a group: the runner on a record, the environment on a world or a replay.
 """
 
 import copy
@@ -29,33 +29,33 @@ from coopenv.observers.recording import ObserverInit, Sensed
 
 
 class ObserverError(CoopenvError):
-    """An observer raised or returned what is no estimate; the message says whose, when and why."""
+    """An observer raised an exception or returned an invalid estimate; the message names vehicle, time and reason."""
 
 
-ANYTHING = (Exception, SystemExit)  # what may come out of an observer, which is anybody's code
+ANYTHING = (Exception, SystemExit)  # exceptions of an observer, which is foreign code
 
 
-class Answer(NamedTuple):
-    """An estimate, and what it took, s (message included; a joint observer's time is shared out)."""
+class TimedEstimate(NamedTuple):
+    """An estimate and its time, s (message included; a joint observer's time is divided by the vehicles)."""
 
     estimate: Estimate
     elapsed: float
 
 
 class Tamper(Protocol):
-    """Changes what some vehicle broadcasts , as tests and attacks do."""
+    """Changes the broadcasts of some vehicle in tests and attacks."""
 
     def applies(self, vehicle: int, time: float) -> bool:
         """Return whether it changes the message of a vehicle at a time, s."""
 
     def broadcast(self, observer: Observer, message: Message) -> Message:
-        """Return what is broadcast in place of a message."""
+        """Return the broadcast in place of a message."""
 
 
-class Group:
+class ObserverGroup:
     """One observer per vehicle, or a joint one of all; `start` comes first and begins anew.
 
-    What observers raise, or return that is no estimate, becomes an `ObserverError`.
+    Exceptions and invalid estimates of observers become an `ObserverError`.
     """
 
     def __init__(self, factory: Factory, observer_init: ObserverInit, tamper: Tamper | None = None) -> None:
@@ -87,18 +87,18 @@ class Group:
 
     def update(
         self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike, interference: Interference | None = None
-    ) -> Answer:
+    ) -> TimedEstimate:
         """Let one vehicle's observer take a tick; vehicles come in the order of the observer_init.
 
-        `inbox_tick` is as for `Mailbox.inbox`; `interference` is what the world's faults do at this tick.
+        `inbox_tick` is as for `Mailbox.inbox`; `interference` holds the world's faults at this tick.
         """
         k, clock = sensed.index, None if interference is None else interference.clock
         try:
             if interference is not None and interference.restarts[vehicle]:
                 self._restart(vehicle, sensed)
             observer = self.observers[vehicle]
-            heard = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
-            tick = sensed.tick(self.observer_init.setups[vehicle], heard)
+            messages = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
+            tick = sensed.tick(self.observer_init.setups[vehicle], messages)
             begin = perf_counter()
             estimate = observer.update(tick)
             message = observer.message() if k % self.observer_init.period == 0 else None
@@ -108,10 +108,10 @@ class Group:
                 self._post(vehicle, k, message, interference, self.tamper)
         except ANYTHING as error:
             raise self._blamed(error, k, vehicle) from error
-        return Answer(estimate, elapsed)
+        return TimedEstimate(estimate, elapsed)
 
     def _restart(self, vehicle: int, sensed: Sensed) -> None:
-        """Let a vehicle's observer lose all and start anew, knowing nothing but that it is about the landmarks."""
+        """Restart a vehicle's observer without messages, with a wide prior about the landmarks' centre."""
         middle = sensed.landmarks.mean(axis=0) if len(sensed.landmarks) else np.zeros(3)
         self.observers[vehicle] = self.factory(self.observer_init.setups[vehicle])
         self.observers[vehicle].reset((np.eye(3), middle), UNKNOWN.copy())
@@ -120,9 +120,9 @@ class Group:
     def _post(
         self, vehicle: int, k: int, message: Message, interference: Interference | None, tamper: Tamper | None
     ) -> None:
-        """Send a message, or what the world's faults and whoever tampers with it make of it.
+        """Send a message, changed by the world's faults and by `tamper`.
 
-        A CoopenvError says that it is none. Where nothing is made of it, only the mailbox looks at it, if it is sound.
+        A CoopenvError names why it is invalid. An unchanged valid message is checked by the mailbox alone.
         """
         unchanged = interference is None and tamper is None
         if not unchanged:
@@ -139,11 +139,11 @@ class Group:
 
     @property
     def refused(self) -> NDArray[np.int64]:
-        """(N,) messages that a vehicle received and that were none, or none that its observer understands."""
+        """(N,) received messages that were invalid, or that the vehicle's observer could not read."""
         own = [getattr(observer, "ignored_messages", 0) for observer in self.observers]
         return self.mail.refused + np.array(own or 0, dtype=np.int64)
 
-    def update_all(self, sensed: Sensed) -> list[Answer]:
+    def update_all(self, sensed: Sensed) -> list[TimedEstimate]:
         """Let a joint observer take a tick of every vehicle."""
         setups = self.observer_init.setups
         try:
@@ -158,7 +158,7 @@ class Group:
                 self.mail.bytes[i] += message.size_bytes
         except ANYTHING as error:
             raise self._blamed(error, sensed.index) from error
-        return [Answer(estimate, elapsed) for estimate in estimates]
+        return [TimedEstimate(estimate, elapsed) for estimate in estimates]
 
     def _check(self, estimate: Estimate) -> None:
         check_estimate(estimate)
@@ -167,7 +167,7 @@ class Group:
             raise CoopenvError("error coordinates must stay the same")
 
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
-        """Return an error that says whose observer failed, when, and how."""
+        """Return an error that names the vehicle, the time and the reason."""
         whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
         return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}")
 
@@ -185,8 +185,7 @@ class Group:
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
         """Return a deep copy of what `get_state` of such a group returned, before or after the start of an episode.
 
-        A CoopenvError says that it is of another group. The observers in it are trusted to be what they seem: whoever
-        made the state could run any code in them.
+        A CoopenvError says that it is of another group. The observers in it are not checked: they can run any code.
         """
         try:
             copied = copy.deepcopy(state)
@@ -199,7 +198,7 @@ class Group:
             if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             Mailbox(self.observer_init).set_state(mail)
-        except Exception as error:  # of anything that is no state
+        except Exception as error:  # of any other value
             raise CoopenvError(f"state: the observers do not fit: {error_text(error)}") from error
         return dict(copied)
 

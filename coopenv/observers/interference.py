@@ -1,6 +1,6 @@
-"""What a world's faults do to observers on the host: to their messages, their clocks, and to themselves.
+"""Faults of a world for observers on the host: changed messages, clock offsets, restarts.
 
-The world decides (`coopenv.world.v2x`), so that observers in its kernels and on the host meet the same.
+The world draws them (`coopenv.world.v2x`), so that observers in its kernels and on the host have the same faults.
 """
 
 from collections.abc import Callable
@@ -21,18 +21,18 @@ FIELDS = ("broadcast_shift", "broadcast_turn")
 
 @dataclass(frozen=True)
 class Interference:
-    """What faults do at one tick, or (K, ...) at several, see `[faults]` of a scenario; no observer reads it."""
+    """Faults at one tick, or (K, ...) at several, see `[faults]` of a scenario; no observer reads it."""
 
     shift: Array  # (..., N, 3) added to positions that a vehicle broadcasts, m, map
     turn: Array  # (..., N, 3) rotation vector by which orientations that it broadcasts are turned, rad
-    std: Array  # (..., N) what it claims to know its pose by, rad and m; 0: what it knows
+    std: Array  # (..., N) claimed standard deviation of its pose, rad and m; 0: the true one
     replay: NDArray[np.int64]  # (..., N) ticks by which the content of its messages is old; 0: new
     clock: NDArray[np.int64]  # (N,) ticks by which its clock is ahead
     restarts: NDArray[np.bool_]  # (..., N) whether its observer starts anew before this tick
-    kept: NDArray[np.int64]  # (N,) ticks for which it keeps what it sent, to replay it
+    kept: NDArray[np.int64]  # (N,) ticks for which it keeps its messages to replay them
 
     def at(self, k: int) -> "Interference":
-        """Return what happens at tick k."""
+        """Return the faults at tick k."""
         return replace(
             self, **{name: getattr(self, name)[k] for name in ("shift", "turn", "std", "replay", "restarts")}
         )
@@ -45,7 +45,7 @@ class Interference:
 def altered(observer: Any, message: Message, shift: Array, turn: Array | None = None, std: float = 0.0) -> Message:
     """Return a message that states another pose, and a covariance std^2 I of whatever size (std 0: its own).
 
-    Other entries only their observer can change: if it has a method `tampered(message)`, that one makes them agree.
+    Other entries are changed by the observer: its method `tampered(message)`, if it has one, makes them agree.
     """
     position, R, P = message.position, message.rotation, message.covariance
     turned = turn is not None and bool(np.any(turn))
@@ -64,7 +64,7 @@ def altered(observer: Any, message: Message, shift: Array, turn: Array | None = 
 def interference_of(
     scenario: Scenario, model: Any, view: Callable[[str], NDArray[Any]], world: int, k: int
 ) -> Interference | None:
-    """Return what the faults of one world do at tick k, from its state by name; None where there can be none."""
+    """Return the faults of one world at tick k, from its state by name; None without any."""
     if not any(faults.any for faults in scenario.all_faults):
         return None
     fault = model.fault.numpy()
@@ -84,7 +84,7 @@ def interference_of(
 
 
 def stacked(ticks: list[Interference | None]) -> Interference | None:
-    """Return what happens at several ticks as one."""
+    """Return the faults at several ticks as one."""
     there = [tick for tick in ticks if tick is not None]
     if not there:
         return None

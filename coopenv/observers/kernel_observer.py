@@ -1,7 +1,7 @@
 """An observer with kernels as a plug-in: one vehicle, fed with ticks on the host.
 
-The kernels get a world of their own, filled with what this vehicle measures and receives. Where arrays have a row per
-vehicle, one row is shared by all of them; truth is NaN.
+The kernels get a world of their own, filled with the measurements and messages of this vehicle. Where arrays have a row
+per vehicle, one row is shared by all of them; truth is NaN.
 """
 
 import math
@@ -33,7 +33,7 @@ def views_of(record: Any, declared: Mapping[str, Any], vehicle: int = 0) -> Simp
 
 
 def model_of(setup: Setup, p: Precision) -> Any:
-    """Return the model of the world that a vehicle knows of."""
+    """Return the model of the world from a vehicle's setup."""
     L, T = setup.landmarks, len(setup.target_names)
     N, model = T - L, model_struct(p)()
     model.landmarks, model.vehicles, model.agents = L, N, T
@@ -57,8 +57,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     camera.focal_std = known.focal_length
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
-    model.fault = _for_everybody(fault, N)
-    model.camera, model.noise = _for_everybody(camera, N), _for_everybody(noise, N)
+    model.fault = _shared_entry(fault, N)
+    model.camera, model.noise = _shared_entry(camera, N), _shared_entry(noise, N)
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
@@ -73,8 +73,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     return model
 
 
-def _for_everybody(entry: Any, count: int) -> Any:
-    """Return the array in which every vehicle has the same entry."""
+def _shared_entry(entry: Any, count: int) -> Any:
+    """Return an array with the same entry for every vehicle."""
     return repeated(wp.array([entry], dtype=struct_of(entry), device="cpu"), 0, count)
 
 
@@ -90,7 +90,7 @@ class KernelObserver:
     """One vehicle's observer, computed in float64 by the kernels of an embedded one."""
 
     def __init__(self, embedded: Embedded, setup: Setup) -> None:
-        """Allocate the world of a vehicle that knows what is in a setup."""
+        """Allocate the world of a vehicle from its setup."""
         p = precision(PRECISION)
         self.embedded, self.setup = embedded, setup
         self._model = model_of(setup, p)
@@ -111,9 +111,9 @@ class KernelObserver:
         self._now_views = [array.numpy() for array in self._now]
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
         self._set_clock(None, setup.noise.odometry_period)
-        self._heard: dict[
+        self._received: dict[
             int, tuple[Message, int, bool]
-        ] = {}  # by sender: the last one, when it was sent, whether sound
+        ] = {}  # by sender: the last one, its tick of sending, whether it is valid
         self.ignored_messages = 0
         """Malformed ones since the start."""
 
@@ -131,7 +131,7 @@ class KernelObserver:
             never[...] = -1
         self._start_covariance[...] = initial_covariance
         self._set_clock(None, self.setup.noise.odometry_period)
-        self._heard.clear()
+        self._received.clear()
         self.ignored_messages = 0
         self._run("start_one")
 
@@ -155,7 +155,7 @@ class KernelObserver:
         return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
 
     def message(self) -> Message:
-        """Return what the kernels put on the air."""
+        """Return the message that the kernels send."""
         self._run("send_one", self._now[0])
         return cast(Message, self._messages.write(self))
 
@@ -169,16 +169,16 @@ class KernelObserver:
         s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid], now
 
     def _receive(self, messages: Mapping[int, Received], now: int) -> None:
-        """Write what the vehicle hears; a message that is malformed, or older than the start, is as none."""
+        """Write the received messages; a malformed one, or one older than the start, is ignored."""
         s = self.state
         s.inbox_tick[...] = s.inbox_stamp[...] = -1
         for target, received in messages.items():
             sender, sent = target - self.setup.landmarks, now - self.units(received.age)
-            message, before, sound = self._heard.get(sender, (None, 0, False))
+            message, before, valid = self._received.get(sender, (None, 0, False))
             if message is not received.message or abs(before - sent) > 1:
-                before, sound = sent, sent >= 0 and self._read(sender, received.message, sent)
-                self._heard[sender] = received.message, sent, sound
-            if sound:
+                before, valid = sent, sent >= 0 and self._read(sender, received.message, sent)
+                self._received[sender] = received.message, sent, valid
+            if valid:
                 s.inbox_tick[sender] = s.inbox_stamp[sender] = before
 
     def _read(self, sender: int, message: Message, sent: int) -> bool:
@@ -213,10 +213,10 @@ class KernelObserver:
     def __reduce__(self) -> Any:
         """Travel, and be copied, as the name of the kernels and all that has changed since they began."""
         arrays = [view.copy() for view in self._all_views()]
-        return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self.unit, self._heard)
+        return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self.unit, self._received)
 
     def __setstate__(self, state: Any) -> None:
-        arrays, origin, unit, self._heard = state
+        arrays, origin, unit, self._received = state
         for view, values in zip(self._all_views(), arrays, strict=True):
             view[...] = values
         self._set_clock(origin, unit * UNITS_PER_TICK)
@@ -269,4 +269,4 @@ def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int
 
 
 POSITION = Messages(write_position, read_position)
-POSE = Messages(write_pose, read_pose)  # all that an observer sends that says nothing else
+POSE = Messages(write_pose, read_pose)  # of an observer that declares no messages of its own

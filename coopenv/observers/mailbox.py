@@ -1,6 +1,6 @@
 """Messages between the plug-in observers of one world: contents on the host, delivery as the radio decided.
 
-Whoever receives a message checks it: what is none is refused, counted, and as if it had been lost.
+The receiver checks each message. An invalid message is refused and counted; otherwise it has the effect of a loss.
 """
 
 from collections.abc import Mapping
@@ -19,53 +19,53 @@ from coopenv.observers.recording import ObserverInit, sealed
 MOST_CONTENTS = 100_000  # bytes of a message
 
 
-class Heard(NamedTuple):
+class LastReceived(NamedTuple):
     """The last message of a sender that reached a receiver."""
 
     sent: int
     """Tick of sending."""
     message: Message | None
-    """The last one that was sound; None: there was none."""
+    """The last valid one; None: there was none."""
     stamp: int
-    """Tick at which that one was sent, as the receiver believes."""
+    """Tick at which that one was sent, by the clock of the receiver."""
 
 
 class Mailbox:
-    """Carries the observers' messages; which of them arrive when is the radio's business."""
+    """Carries the observers' messages; the radio decides when each of them arrives."""
 
     def __init__(self, observer_init: ObserverInit) -> None:
         self.observer_init = observer_init
         self.sent: list[dict[int, Message | None]] = [{} for _ in observer_init.setups]
-        """Per sender: tick of sending to message, of those that may still be under way; None: it is no message."""
-        self.said: list[dict[int, Message]] = [{} for _ in observer_init.setups]
-        """Per sender that may replay: tick to what it had to say."""
-        self.heard: list[dict[int, Heard]] = [{} for _ in observer_init.setups]
-        """Per receiver: sender to what was heard last."""
+        """Per sender: tick of sending to message, of those that may still be under way; None: it is invalid."""
+        self.replayable: list[dict[int, Message]] = [{} for _ in observer_init.setups]
+        """Per sender that may replay: tick to its message before the fault."""
+        self.received: list[dict[int, LastReceived]] = [{} for _ in observer_init.setups]
+        """Per receiver: sender to its last message."""
         self.bytes = np.zeros(len(observer_init.setups))
         self.refused = np.zeros(len(observer_init.setups), dtype=np.int64)
-        """Per receiver: messages that were none."""
+        """Per receiver: invalid messages."""
         self.forms: dict[int, tuple[int, ...]] = {}
         """Per vehicle: the shape of the covariances that it sends itself, in which it expects those of others."""
         self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in observer_init.setups]
         """Per receiver: the targets that are vehicles."""
 
     def expect_as(self, vehicle: int, message: Message) -> None:
-        """Let a vehicle expect of others covariances of the shape that it has itself."""
+        """Let a vehicle expect received covariances of the shape of its own."""
         if message.covariance is not None:
             self.forms[vehicle] = np.shape(message.covariance)
 
     def post(self, vehicle: int, k: int, message: Message, replay: int = 0, kept: int = 0) -> bool:
-        """Send one message, and return whether it is one; that of the start is heard but not counted.
+        """Send one message and return whether it is valid; that of the start is received but not counted.
 
-        One that is a replay is in truth the one of so many ticks before; for that it is kept for so many.
+        A replay sends the message of `replay` ticks before; for that, messages are kept for `kept` ticks.
         """
-        sent, said = self.sent[vehicle], self.said[vehicle]
+        sent, before = self.sent[vehicle], self.replayable[vehicle]
         if kept > 0:
-            said[k] = message
-            message = said.get(max(k - replay, 0), message)
-            while (oldest := next(iter(said))) < k - kept:
-                del said[oldest]
-        sent[k] = self._sound(vehicle, message)
+            before[k] = message
+            message = before.get(max(k - replay, 0), message)
+            while (oldest := next(iter(before))) < k - kept:
+                del before[oldest]
+        sent[k] = self._valid_copy(vehicle, message)
         while (oldest := next(iter(sent))) < k - self.observer_init.flight - 1:
             del sent[oldest]
         if k > 0:
@@ -80,24 +80,24 @@ class Mailbox:
         arrived: Mapping[tuple[int, int], Received] = MappingProxyType({}),
         clock: ArrayLike | None = None,
     ) -> dict[int, Received]:
-        """Return what a vehicle has heard by tick k, by target, without what is stale.
+        """Return the messages that a vehicle has received by tick k, by target, without stale ones.
 
-        `inbox_tick` (N,) says when the last message was sent that the radio delivered of each sender, -1: none;
-        `arrived` is what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`; `clock`
-        (N,) is by how many ticks vehicles' clocks are ahead.
+        `inbox_tick` (N,) holds the tick of sending of the last message that the radio delivered of each sender, -1:
+        none; `arrived` the messages of this tick from vehicles that are estimated elsewhere, see `Sensed.messages`;
+        `clock` (N,) the ticks by which the vehicles' clocks are ahead.
         """
-        b, landmarks, heard = self.observer_init, self.observer_init.setups[vehicle].landmarks, self.heard[vehicle]
+        b, landmarks, lasts = self.observer_init, self.observer_init.setups[vehicle].landmarks, self.received[vehicle]
         ticks, received = np.asarray(inbox_tick).tolist(), {}
         ahead = None if clock is None else np.asarray(clock).tolist()
         for target in self._senders[vehicle]:
             sender = target - landmarks
-            sent, last = ticks[sender], heard.get(sender)
+            sent, last = ticks[sender], lasts.get(sender)
             if (vehicle, sender) in arrived:
-                self._hear(vehicle, sender, sent, self._sound(sender, arrived[vehicle, sender].message), sent)
+                self._receive(vehicle, sender, sent, self._valid_copy(sender, arrived[vehicle, sender].message), sent)
             elif sent in self.sent[sender] and (last is None or last.sent != sent):
                 stamp = sent if ahead is None else min(max(sent + ahead[sender] - ahead[vehicle], 0), k)
-                self._hear(vehicle, sender, sent, self.sent[sender][sent], stamp)
-            last = heard.get(sender)
+                self._receive(vehicle, sender, sent, self.sent[sender][sent], stamp)
+            last = lasts.get(sender)
             if last is not None and last.message is not None and last.sent == sent >= 0:
                 age = (k - last.stamp) * b.dt
                 if age <= b.staleness:
@@ -105,26 +105,26 @@ class Mailbox:
         return received
 
     def forget(self, vehicle: int) -> None:
-        """Let a vehicle lose what it has heard."""
-        self.heard[vehicle].clear()
+        """Clear the messages that a vehicle has received."""
+        self.received[vehicle].clear()
 
-    def _hear(self, vehicle: int, sender: int, sent: int, message: Message | None, stamp: int) -> None:
-        """Take a message that has reached a vehicle, or refuse it: then the last one stays."""
-        heard = self.heard[vehicle]
+    def _receive(self, vehicle: int, sender: int, sent: int, message: Message | None, stamp: int) -> None:
+        """Store a message that has reached a vehicle, or refuse it: then the last one stays."""
+        lasts = self.received[vehicle]
         if message is not None and self._fits(vehicle, message):
-            heard[sender] = Heard(sent, message, stamp)
+            lasts[sender] = LastReceived(sent, message, stamp)
             return
         self.refused[vehicle] += 1
-        last = heard.get(sender)
-        heard[sender] = Heard(sent, None, stamp) if last is None else last._replace(sent=sent)
+        last = lasts.get(sender)
+        lasts[sender] = LastReceived(sent, None, stamp) if last is None else last._replace(sent=sent)
 
     def _fits(self, vehicle: int, message: Message) -> bool:
-        """Return whether a message's covariance, if it has one, is what the receiver expects."""
+        """Return whether the shape of a message's covariance, if it has one, is the one that the receiver expects."""
         P, form = message.covariance, self.forms.get(vehicle)
         return P is None or form is None or P.shape == form
 
-    def _sound(self, sender: int, message: Any) -> Message | None:
-        """Return a copy of a message that nobody can change, the sender included; None where it is no message."""
+    def _valid_copy(self, sender: int, message: Any) -> Message | None:
+        """Return a read-only copy of a message; None if it is invalid."""
         try:
             if _size(message) > MOST_CONTENTS:
                 return None
@@ -135,31 +135,34 @@ class Mailbox:
         return copied
 
     def get_state(self) -> dict[str, Any]:
-        """Return what has been sent and heard."""
-        heard = [{sender: tuple(last) for sender, last in of_receiver.items()} for of_receiver in self.heard]
+        """Return the sent and received messages and the counts."""
+        received = [{sender: tuple(last) for sender, last in of_one.items()} for of_one in self.received]
         counts = {"bytes": self.bytes, "refused": self.refused}
-        return {"sent": self.sent, "said": self.said, "heard": heard, **counts}
+        return {"sent": self.sent, "said": self.replayable, "heard": received, **counts}
 
     def set_state(self, state: Any) -> None:
-        """Take over what `get_state` returned, so that nobody can change it; anything else raises what it raises."""
+        """Set the state that `get_state` returned, as read-only arrays; other values raise any exception."""
         senders = range(len(self.observer_init.setups))
-        sent, heard, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
+        sent, received, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
         refused = np.asarray(state["refused"], np.int64)
-        said = [{index(k): _checked(message) or Message() for k, message in own.items()} for own in state["said"]]
-        lengths = {len(sent), len(said), len(heard), len(count), len(refused)}
+        replayable = [{index(k): _checked(message) or Message() for k, message in own.items()} for own in state["said"]]
+        lengths = {len(sent), len(replayable), len(received), len(count), len(refused)}
         if lengths != {len(senders)} or not np.isfinite(count).all():
             raise CoopenvError("not one mailbox per vehicle")
-        self.said = said
+        self.replayable = replayable
         self.sent = [{index(k): _checked(message) for k, message in of_sender.items()} for of_sender in sent]
-        self.heard = [
-            {senders[j]: Heard(index(k), _checked(message), index(stamp)) for j, (k, message, stamp) in of_one.items()}
-            for of_one in heard
+        self.received = [
+            {
+                senders[j]: LastReceived(index(k), _checked(message), index(stamp))
+                for j, (k, message, stamp) in of_one.items()
+            }
+            for of_one in received
         ]
         self.bytes, self.refused = count, refused
 
 
 def _size(message: Any) -> int:
-    """Return the bytes of a message; of what is none something."""
+    """Return the bytes of a message, 0 if they cannot be counted."""
     try:
         return int(message.size_bytes)
     except (ValueError, TypeError, AttributeError):
@@ -177,7 +180,7 @@ def _checked(message: Message | None) -> Message | None:
 
 
 def _copied(message: Message) -> Message:
-    """Return a copy that nobody can change, the sender included."""
+    """Return a read-only copy."""
     position, rotation, covariance = map(_floats, (message.position, message.rotation, message.covariance))
     extra = {name: sealed(np.array(value)) for name, value in message.extra.items()}
     return Message(position, rotation, covariance, extra)

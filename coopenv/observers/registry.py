@@ -2,8 +2,8 @@
 
 An observer is a class, or a function of a setup, that runs on the host (`contract.Observer`), or it has kernels
 (`coopenv.world.embedded.Embedded`), which run in worlds and, for one vehicle, on the host as well; or it has both.
-A package offers its own under the entry point group `coopenv.observers`. What is in a file or module of the user's own
-is named by its place: `mine.py:Mine` or `package.module:Mine`.
+A package offers its own under the entry point group `coopenv.observers`. An observer in a file or module of the user
+is named by its import path: `mine.py:Mine` or `package.module:Mine`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """Where an observer stands in this package; nothing is loaded before it is asked for."""
+class ZooEntry:
+    """An observer of this package; its modules load on first use."""
 
     plugin: str  # module and class, or function of a setup
     about: str  # one line for tables
@@ -40,65 +40,69 @@ class Entry:
 
 
 ZOO = {
-    "dead_reckoning": Entry(
+    "dead_reckoning": ZooEntry(
         "single_frame:DeadReckoning", "Adds up odometry and sends nothing", "riccati.kernels:DEAD_RECKONING"
     ),
     # on a plane bearings to three points say more than a pose needs
-    "p3p": Entry("single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False),
-    "riccati": Entry(
+    "p3p": ZooEntry(
+        "single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False
+    ),
+    "riccati": ZooEntry(
         "riccati.kernels:riccati",
         "The paper's observer, with the scenario's gains",
         "riccati.kernels:RICCATI",
         covariance=False,
     ),
-    "hamel_samson": Entry(
+    "hamel_samson": ZooEntry(
         "error_state_filters:HamelSamson", "The paper's observer with landmarks alone", covariance=False
     ),
-    "mekf": Entry("error_state_filters:Mekf", "Error-state filter; takes received positions as exact"),
-    "mekf_covariance": Entry(
+    "mekf": ZooEntry("error_state_filters:Mekf", "Error-state filter; takes received positions as exact"),
+    "mekf_covariance": ZooEntry(
         "error_state_filters:MekfCovariance", "Error-state filter; weighs received positions by covariance"
     ),
-    "mekf_covariance_ungated": Entry(
+    "mekf_covariance_ungated": ZooEntry(
         "error_state_filters:MekfCovarianceUngated", "Error-state filter that accepts every bearing"
     ),
-    "covariance_intersection": Entry(
+    "covariance_intersection": ZooEntry(
         "covariance_intersection:CovarianceIntersection", "Kalman filter; neighbours by covariance intersection"
     ),
-    "split_covariance_intersection": Entry(
+    "split_covariance_intersection": ZooEntry(
         "covariance_intersection:SplitCovarianceIntersection", "Kalman filter; neighbours by split intersection"
     ),
-    "pairwise": Entry("schmidt_kalman:Pairwise", "Keeps cross-covariances pair by pair"),
-    "schmidt_kalman": Entry("schmidt_kalman:SchmidtKalman", "Considers neighbours with cross-covariances"),
-    "iterated_ekf": Entry(
+    "pairwise": ZooEntry("schmidt_kalman:Pairwise", "Keeps cross-covariances pair by pair"),
+    "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman", "Considers neighbours with cross-covariances"),
+    "iterated_ekf": ZooEntry(
         "error_state_filters:IteratedEkf", "Error-state filter that iterates corrections; sends covariances"
     ),
-    "left_invariant": Entry("error_state_filters:LeftInvariant", "Invariant filter, left error; sends covariances"),
-    "right_invariant": Entry("error_state_filters:RightInvariant", "Invariant filter, right error; sends covariances"),
-    "ukf": Entry("error_state_filters:Ukf", "Unscented (sigma-point) filter; sends covariances"),
-    "factor_graph": Entry(
+    "left_invariant": ZooEntry("error_state_filters:LeftInvariant", "Invariant filter, left error; sends covariances"),
+    "right_invariant": ZooEntry(
+        "error_state_filters:RightInvariant", "Invariant filter, right error; sends covariances"
+    ),
+    "ukf": ZooEntry("error_state_filters:Ukf", "Unscented (sigma-point) filter; sends covariances"),
+    "factor_graph": ZooEntry(
         "factor_graph:FactorGraph", "Factor graph smoothed at key frames; sends covariances", needs="gtsam"
     ),
-    "planar_ekf": Entry("planar.plugin:PlanarEkf", "Extended Kalman filter of x, y and heading", in_space=False),
-    "planar_robust": Entry(
+    "planar_ekf": ZooEntry("planar.plugin:PlanarEkf", "Extended Kalman filter of x, y and heading", in_space=False),
+    "planar_robust": ZooEntry(
         "planar.plugin:PlanarRobust",
         "Calibrates its odometry online; fuses neighbours by split covariance intersection",
         in_space=False,
     ),
-    "robust": Entry(
+    "robust": ZooEntry(
         "robust.observer:robust",
         "This project's observer for vehicles in space: several hypotheses, gates",
         "robust.observer:ROBUST",
         on_a_plane=False,
         kernels_on_a_plane=False,
     ),
-    "robust_joint": Entry(
+    "robust_joint": ZooEntry(
         "robust.joint_fusion:robust_joint",
         "The robust observer with larger, joint messages, for vehicles in space",
         "robust.joint_fusion:ROBUST_JOINT",
         on_a_plane=False,
         kernels_on_a_plane=False,
     ),
-    "centralised": Entry("centralised:Centralised", "One filter over all vehicles and all measurements"),
+    "centralised": ZooEntry("centralised:Centralised", "One filter over all vehicles and all measurements"),
 }
 """By name."""
 
@@ -108,19 +112,19 @@ GROUP = "coopenv.observers"
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
-class Registered(NamedTuple):
-    """What a program has registered under a name, as a class or function, with kernels, or both."""
+class RegisteredObserver(NamedTuple):
+    """A registered observer: a class or function, kernels, or both."""
 
     factory: Factory | None
     embedded: Embedded | None
 
 
-_registered: dict[str, Registered] = {}
-_places: dict[str, str] = {}  # where those of `_registered` stand that are named by their place
+_registered: dict[str, RegisteredObserver] = {}
+_places: dict[str, str] = {}  # import paths of those in `_registered`
 
 
 def register(name: str, factory: Factory | None = None, *, embedded: Embedded | None = None) -> None:
-    """Make an observer known by name in this program.
+    """Register an observer by name in this program.
 
     Args:
         name: up to 64 letters, digits and `_.-`, a letter first, as scenarios and the command line take it.
@@ -138,7 +142,7 @@ def register(name: str, factory: Factory | None = None, *, embedded: Embedded | 
         raise CoopenvError(f"observer '{name}': expected a class or function, got {shown(factory)}")
     if (factory is None and embedded is None) or (embedded is not None and not _has_kernels(embedded)):
         raise CoopenvError(f"observer '{name}': expected a class, a function or an Embedded, got {shown(embedded)}")
-    row = Registered(factory, embedded)
+    row = RegisteredObserver(factory, embedded)
     if name in ZOO or _registered.get(name, row) != row:
         raise CoopenvError(f"an observer named '{name}' exists already")
     _registered[name] = row
@@ -152,15 +156,15 @@ def _has_kernels(observer: Any) -> bool:
     return isinstance(observer, Embedded)
 
 
-def _row(observer: Any) -> Registered:
-    return Registered(None, observer) if _has_kernels(observer) else Registered(observer, None)
+def _row(observer: Any) -> RegisteredObserver:
+    return RegisteredObserver(None, observer) if _has_kernels(observer) else RegisteredObserver(observer, None)
 
 
 def named(observer: str | Factory) -> str:
-    """Return the name of an observer; a class or a place in code becomes known by the name of the class.
+    """Return the name of an observer; a class or an import path is registered by the name of the class.
 
-    Where another observer has that name, the name of its file or module is put before it: `mine.Riccati`. A
-    CoopenvError says that there is none at that place, that it is no observer or has no name, or that both are taken.
+    If another observer has that name, the name of the file or module precedes it: `mine.Riccati`. A CoopenvError says
+    that the import path has no observer, that it has no name, or that both names are taken.
     """
     if isinstance(observer, str) and not is_reference(observer):
         return observer
@@ -184,13 +188,13 @@ def named(observer: str | Factory) -> str:
     raise CoopenvError(f"observers named '{name}' and '{full}' exist already: rename the class")
 
 
-def _origin(row: Registered) -> tuple[str, object]:
+def _origin(row: RegisteredObserver) -> tuple[str, object]:
     code = row.factory if row.embedded is None else row.embedded.estimate.func
     return str(getattr(code, "__module__", "")), getattr(code, "__qualname__", code)
 
 
 def portable(name: str) -> str | Factory:
-    """Return what `find` takes in another process, which does not know what was registered in this one."""
+    """Return the argument of `find` for another process, in which nothing is registered."""
     row = _registered.get(name)
     return _places.get(name) or (name if row is None else row.factory or row.embedded)
 
@@ -210,7 +214,7 @@ def states_covariance(name: str) -> bool:
 
 
 def description(name: str) -> str:
-    """Return what a known observer is in one line, or why it cannot be used here."""
+    """Return the description of a known observer in one line, or why it cannot be used here."""
     if reason := obstacle(name):
         return reason
     if name in ZOO:
@@ -219,7 +223,7 @@ def description(name: str) -> str:
 
 
 def check_known(name: str) -> None:
-    """Refuse an unknown name without loading what is behind one. Raises CoopenvError: unknown, with the names known."""
+    """Refuse an unknown name without loading an observer. Raises CoopenvError: unknown, with the known names."""
     if not is_reference(name) and name not in (names := observer_names()):
         raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
 
@@ -245,10 +249,10 @@ def available_names(planar: bool | None = None) -> list[str]:
 
 
 def find(name: str | Factory) -> Factory:
-    """Return the factory of a name or of a place in code, a class or function as it is, and one made of kernels.
+    """Return the factory of a name or an import path; a class or function itself; for kernels their plug-in.
 
     Raises:
-        CoopenvError: unknown name, or what it needs is not installed, or it cannot be loaded, or is no factory.
+        CoopenvError: unknown name, a missing dependency, an import that fails, or no factory.
     """
     if isinstance(name, str) and name in ZOO:
         if reason := obstacle(name):
@@ -280,8 +284,8 @@ def _loaded(reference: str) -> Any:
     return found
 
 
-def _found(observer: str | Factory) -> Registered:
-    """Return what stands behind a name that is not of the zoo, a place in code, or an observer itself."""
+def _found(observer: str | Factory) -> RegisteredObserver:
+    """Return the observer of a name outside the zoo, of an import path, or an observer itself."""
     if not isinstance(observer, str):
         return _row(observer)
     if is_reference(observer):
@@ -292,5 +296,5 @@ def _found(observer: str | Factory) -> Registered:
     point = _installed()[observer]
     try:
         return _row(point.load())
-    except (Exception, SystemExit) as error:  # anybody's code
+    except (Exception, SystemExit) as error:  # foreign code
         raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {error_text(error)}") from error

@@ -1,8 +1,8 @@
 """Record what every vehicle of a world senses, and run any observer on the record.
 
-A record is made once per seed and serves every observer, so that all of them see the same ticks. Observers read ticks;
-truth only judges them. What neighbours tell each other are the observers' own messages, sent with the scenario's
-period and delivered, lost or delayed as the world's radio delivered its own.
+A record is made once per seed and serves every observer, so that all of them have the same ticks. Observers read ticks;
+truth is only for errors. Messages are those of the observers, sent with the scenario's period and delivered, lost or
+delayed like those of the world's radio.
 """
 
 import gc
@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, SensorNoise, Setup
-from coopenv.observers.group import Answer, Group, ObserverError, Tamper
+from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedEstimate
 from coopenv.observers.recording import ObserverInit, Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
 
 OBJECTS = 100_000
-"""New ones after which Python looks for garbage while observers run."""
+"""New objects after which Python collects garbage while observers run."""
 PLANAR_STATES = (2, 3, 4)
-"""Yaw, x and y among (theta, rho): what NEES is about for vehicles on a plane, whose other errors are zero."""
+"""Yaw, x and y among (theta, rho): the states of NEES for vehicles on a plane, whose other errors are zero."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """How one observer did on one record; NaN from where it failed."""
+    """Estimates and errors of one observer on one record; NaN after a failure."""
 
     t: Array  # (K,) s
     rotation: Array  # (K, N, 3, 3) estimates
@@ -43,19 +43,19 @@ class Run:
     orientation_error: Array  # (K, N) deg, geodesic
     nees: Array  # (K, N), in the observer's own coordinates
     nees_dof: int  # 6, or 3 on a plane
-    nis: Array  # (K, N), NaN where the observer tells none
+    nis: Array  # (K, N), NaN where the observer states none
     nis_dof: NDArray[np.int64]  # (K, N)
     bytes_per_second: Array  # (N,) sent, payload
     microseconds_per_update: Array  # (N,) median, message included; a joint observer's time is shared out
-    refused: NDArray[np.int64]  # (N,) messages that were none, or not understood, per receiver
-    failure: str = ""  # who failed, when and why; empty where nobody did
+    refused: NDArray[np.int64]  # (N,) invalid or unreadable messages per receiver
+    failure: str = ""  # vehicle, time and reason of a failure; empty without one
 
     def position_rmse(self, after: float = 0.0) -> Array:
         """Return (N,) the root mean square of |pbar - pbarhat| from a time on, m."""
         return np.sqrt(self.mean(self.position_error**2, self.t >= after))
 
     def anees(self, after: float = 0.0) -> Array:
-        """Return (N,) the mean NEES from a time on divided by its dimension; 1 for an honest covariance.
+        """Return (N,) the mean NEES from a time on divided by its dimension; 1 for a consistent covariance.
 
         Ticks at which the observer states no covariance, such as the start, do not count; NaN where it never does.
         """
@@ -75,20 +75,20 @@ class Run:
 def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = None) -> Run:
     """Run an observer, by name or class, for all vehicles on a record.
 
-    What it receives is checked, and what is no message counts as lost, so that none can end a run. An observer that
-    raises or returns something that is not finite ends its run: `Run.failure` says who, when and why.
+    Received messages are checked, and invalid ones count as lost, so that none can end a run. An observer that raises
+    an exception or returns numbers that are not finite ends its run: `Run.failure` names vehicle, time and reason.
 
     Args:
         observer: name or factory.
-        recording: what it runs on.
-        tamper: changes what some vehicle broadcasts.
+        recording: its data.
+        tamper: changes the broadcasts of some vehicle.
 
     Raises:
         CoopenvError: unknown name.
     """
     factory = find(observer)
     r, failure = recording, ""
-    group, shape = Group(factory, r.observer_init, tamper), (r.ticks, len(r.setups))
+    group, shape = ObserverGroup(factory, r.observer_init, tamper), (r.ticks, len(r.setups))
     R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
     nis, nis_dof, elapsed = np.full(shape, np.nan), np.zeros(shape, np.int64), np.full(shape, np.nan)
     try:
@@ -101,7 +101,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
                     P[k, i] = estimate.covariance
                 if estimate.nis is not None and estimate.nis_dof > 0:
                     nis[k, i], nis_dof[k, i] = estimate.nis, estimate.nis_dof
-    except ObserverError as error:  # its row says what went wrong, the others go on
+    except ObserverError as error:  # the comparison goes on with the next observer
         failure = str(error)
     coordinates = group.coordinates or Coordinates.LEFT
     states = PLANAR_STATES if all(setup.planar for setup in r.setups) else tuple(range(6))
@@ -129,9 +129,9 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
 
 @contextmanager
 def _rarely_collecting() -> Iterator[None]:
-    """Let Python look less often for garbage in circles, of which there is hardly any: looking takes 4 % of a run."""
+    """Collect cyclic garbage less often: there is hardly any, and collections take 4 % of a run."""
     youngest, *older = gc.get_threshold()
-    if youngest > 0:  # 0: it never looks
+    if youngest > 0:  # 0: no collection
         gc.set_threshold(max(youngest, OBJECTS), *older)
     try:
         yield
@@ -139,7 +139,7 @@ def _rarely_collecting() -> Iterator[None]:
         gc.set_threshold(youngest, *older)
 
 
-def _play(group: Group, recording: Recording) -> Iterator[tuple[int, int, Answer]]:
+def _play(group: ObserverGroup, recording: Recording) -> Iterator[tuple[int, int, TimedEstimate]]:
     """Run the observers over a record, yielding (tick, vehicle, answer) after each update."""
     for k in range(1, recording.ticks):
         sensed = recording.at(k)
@@ -173,7 +173,7 @@ EXACT_START_STD = 1e-3  # rad and m, where a scenario starts its estimates at th
 
 
 def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
-    """Return what the observers of a simulated world are told."""
+    """Return the initial data of the observers of a simulated world."""
     s, L, places = scenario, len(scenario.landmarks), scenario.cameras
     cameras, noises = model.camera.numpy(), model.noise.numpy()
     targets, counts = model.targets.numpy(), model.target_count.numpy()
@@ -234,8 +234,8 @@ def start_covariances(scenario: Scenario) -> Array:
     """Return the covariances (N, 6, 6) of the initial estimates in LEFT coordinates.
 
     Where the scenario draws the initial error it is that error's. Per axis: a^2 / 9 of an angle U(0, a) about a random
-    axis, (pi^2 / 3 + 2) / 3 of a rotation uniform over SO(3), r^2 / 5 of a point uniform in a ball of radius r. A fixed
-    initial error is no distribution: the scenario's P(0) stands for it.
+    axis, (pi^2 / 3 + 2) / 3 of a rotation uniform over SO(3), r^2 / 5 of a point uniform in a ball of radius r. For a
+    fixed initial error it is the scenario's P(0).
     """
     floor, (angle_P0, position_P0) = EXACT_START_STD**2, scenario.observer.P0
     covariances = []

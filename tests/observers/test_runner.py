@@ -28,7 +28,7 @@ from coopenv.observers import (
     register,
     run,
 )
-from coopenv.observers.group import Group
+from coopenv.observers.group import ObserverGroup
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.oracles.batch import small_errors
@@ -268,7 +268,7 @@ def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
 @pytest.mark.parametrize("restored", [False, True])
 def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
     made = recording()
-    group = Group(Probe, made.observer_init)
+    group = ObserverGroup(Probe, made.observer_init)
     group.start(made.start_rotation, made.start_position)
     sensed = made.at(1)
     for i in made.order:

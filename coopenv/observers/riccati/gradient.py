@@ -1,8 +1,8 @@
 """A differentiable rollout: from actions to the uncertainty of every vehicle, through Warp's tape.
 
-It covers what has a derivative: noise off, no losses and no delay, k = 1, and ticks in which one linearisation
-suffices. Whether a target is in view is taken as it falls out on the way forward. Contact and arrival end nothing here:
-vehicles drive on through one another.
+It needs a scenario with derivatives: noise off, no losses and no delay, k = 1, and ticks in which one linearisation
+suffices. Visibility is that of the forward pass. Contact and arrival do not end an episode here: vehicles drive on
+through one another.
 
 They call the stages' own functions. Sums over targets are atomic additions from one thread per target, because Warp
 does not differentiate through variables that a dynamic loop changes.
@@ -35,7 +35,7 @@ scalar, vec2, vec3, vec4, mat33, mat66 = (
 
 
 @wp.struct
-class Truth:
+class TrueMotion:
     """True motion at one instant."""
 
     rotation: mat33
@@ -55,8 +55,8 @@ class Held:
 
 
 @wp.struct
-class Belief:
-    """What an observer believes."""
+class PoseBelief:
+    """Estimated pose and covariance."""
 
     rotation: mat33
     position: vec3
@@ -102,7 +102,7 @@ def drive_kernel(
     R, position, speed, steering = bicycle_step(
         limits, now.rotation, now.position, now.speed, now.steering, command[world, vehicle], dt, 0
     )
-    truth_after[world, vehicle] = Truth(R, position, speed, steering)
+    truth_after[world, vehicle] = TrueMotion(R, position, speed, steering)
     odometry = held[world, vehicle]
     v = odometry.velocity
     w = odometry.angular_velocity
@@ -117,7 +117,7 @@ def drive_kernel(
 
 
 def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float64):
-    """Carry every vehicle's belief through one tick of odometry."""
+    """Propagate the estimate of every vehicle by one tick of odometry."""
     world, vehicle = wp.tid()
     belief = before[world, vehicle]
     step = held[world, vehicle]
@@ -126,13 +126,13 @@ def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float6
     E = wp.transpose(step.rotation)
     v1, v2 = model.observer.v1 * dt, model.observer.v2 * dt
     A, B, D = predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
-    after[world, vehicle] = Belief(R, p, join6(A, B, wp.transpose(B), D))
+    after[world, vehicle] = PoseBelief(R, p, join6(A, B, wp.transpose(B), D))
 
 
 def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected: Any, vehicle: int, sums: Any):
-    """Add what one target in view tells one vehicle. Grid: (worlds, its targets).
+    """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
-    `state` holds the same truth, to tell what is in view; leaders have their corrected belief of this tick already.
+    `state` holds the same truth, for visibility; leaders have their corrected estimate of this tick already.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
@@ -162,7 +162,7 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
 
 
 def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.float64, turn: wp.array(dtype=scalar)):
-    """Correct one vehicle's belief over one tick."""
+    """Correct the estimate of one vehicle over one tick."""
     world = wp.tid()
     belief = predicted[world, vehicle]
     R = belief.rotation
@@ -176,7 +176,7 @@ def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.f
     )
     wp.atomic_max(turn, 0, wp.length(dx1))
     P_after = join6(A, B, wp.transpose(B), D)
-    after[world, vehicle] = Belief(orthonormalise(R * exp_so3(dx1)), belief.position + dx2, P_after)
+    after[world, vehicle] = PoseBelief(orthonormalise(R * exp_so3(dx1)), belief.position + dx2, P_after)
 
 
 def trace_kernel(after: Any, total: wp.array(dtype=Any)):
@@ -291,10 +291,10 @@ class DifferentiableWorld:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
         R, p = state.rotation.numpy()[:, L:], state.position.numpy()[:, L:]
-        truth = self._make(Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
+        truth = self._make(TrueMotion, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
         held = self._make(Held, velocity=speed[..., None] * np.eye(3)[0])
         R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
-        return truth, held, self._make(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
+        return truth, held, self._make(PoseBelief, rotation=R, position=p, covariance=state.covariance.numpy())
 
     def _command(self, commands: list[Any], tick: int) -> Any:
         """Return the command in force during a tick, see `coopenv.world.dynamics.command_in_force`."""
@@ -309,7 +309,7 @@ class DifferentiableWorld:
             steps = max(1, math.ceil(duration / float(LONGEST_SUBSTEP)))
             for step in range(steps):
                 before, due = [world.model, truth, command, held, int(first)], int(sample and step == steps - 1)
-                truth, held, first = self._make(Truth), self._make(Held), False
+                truth, held, first = self._make(TrueMotion), self._make(Held), False
                 self._launch(drive_kernel, [*before, due, wp.float64(duration / steps), truth, held])
         return truth, held
 
@@ -323,7 +323,7 @@ class DifferentiableWorld:
             record_tape=False,
         )
         dt = wp.float64(1.0 / rate)
-        predicted, after = self._make(Belief), self._make(Belief)
+        predicted, after = self._make(PoseBelief), self._make(PoseBelief)
         sums = self._record(Information)
         self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
@@ -355,7 +355,7 @@ def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[floa
 
 
 def check_differentiable(scenario: Scenario) -> None:
-    """Refuse what has no derivative or what this rollout leaves out.
+    """Refuse scenarios without a derivative or with features that this rollout does not have.
 
     Raises:
         ScenarioError: the first such setting.

@@ -24,13 +24,13 @@ from coopenv.observers.robust.constants import (
     MIN_VELOCITY_STD,
     THIRD,
 )
-from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
+from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec2d, vec6d
 from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
 QUARTER = 0.25 / MAX_ACCELERATION**2
-BEYOND = -0.9  # cosine of an angle from which on the skew part of a rotation says little of its axis
+BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
 
 
 @wp.func
@@ -72,7 +72,7 @@ def displaced(pose: Pose, error: Any):
 
 @wp.func
 def recentring(error: Any):
-    """Return the derivative, 6x6, of errors about a pose that has been moved by an error by those about it before.
+    """Return the derivative, 6x6, of errors about a moved pose by errors about the pose before.
 
     Exp(theta') = Exp(-dtheta) Exp(theta) and rho' = Exp(-dtheta) (rho - drho): diag(J_r(dtheta), Exp(-dtheta)).
     Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, arXiv:1812.01537, (143).
@@ -194,7 +194,7 @@ def odometry_noise(model: Any, i: int, dt: Any):
 
 @device_function
 def averaging_time(model: Any, i: int):
-    """Return over which time vehicle i averages a velocity by odometry that changes by `MAX_ACCELERATION` at most, s.
+    """Return the time, s, over which vehicle i averages a velocity that changes by `MAX_ACCELERATION` at most.
 
     Over a time t noise of density q has the variance q / (2 t), and the lag is a t: their sum is least at this one.
     """
@@ -212,14 +212,14 @@ def with_noise(P: Any, noise: Any):
 
 
 @wp.func
-def carried(estimate: Estimate, step: Pose, noise: Any):
+def carried(estimate: PoseEstimate, step: Pose, noise: Any):
     """Return an estimate after an increment of odometry with noise."""
-    return Estimate(moved(estimate.pose, step), with_noise(propagated(estimate.P, step), noise))
+    return PoseEstimate(moved(estimate.pose, step), with_noise(propagated(estimate.P, step), noise))
 
 
 @wp.func
 def is_known(P: Any):
-    """Return whether a pose of covariance P is certain enough to linearise about and to tell others."""
+    """Return whether the covariance P of a pose is small enough to linearise about it and to broadcast it."""
     for i in range(3):
         if not (P[i, i] < wp.float64(KNOWN_ANGLE_VARIANCE) and P[i + 3, i + 3] < wp.float64(KNOWN_POSITION_VARIANCE)):
             return False
@@ -228,7 +228,7 @@ def is_known(P: Any):
 
 @wp.func
 def is_regular(M: Any, inverse: Any, most: Any):
-    """Return whether tr(M) tr(M^-1) of a positive definite M, 6x6, is below `most`; False where numbers are none.
+    """Return whether tr(M) tr(M^-1) of a positive definite M, 6x6, is below `most`; False for NaN.
 
     That is at least the condition number, the ratio of the largest eigenvalue to the smallest, and at most 36 times it.
     """
@@ -237,20 +237,20 @@ def is_regular(M: Any, inverse: Any, most: Any):
 
 @wp.func
 def inverse_factor(A: Any):
-    """Return the inverse of the Cholesky factor of a positive definite 6x6 matrix; not numbers where it is not one."""
+    """Return the inverse of the Cholesky factor of a positive definite 6x6 matrix; NaN if it is not."""
     _, L21, _, I11, I22 = cholesky6(block3(A, 0, 0), block3(A, 0, 3), block3(A, 3, 3))
     return lower_blocks(I11, -(I22 * L21 * I11), I22)
 
 
 @wp.func
 def inverse6(A: Any):
-    """Return the inverse of a positive definite 6x6 matrix; not numbers where it is not one."""
+    """Return the inverse of a positive definite 6x6 matrix; NaN if it is not."""
     X = inverse_factor(A)
     return wp.transpose(X) * X
 
 
 @wp.func
-def distance_squared(a: Estimate, b: Estimate):
+def distance_squared(a: PoseEstimate, b: PoseEstimate):
     """Return the squared distance of two independent estimates, in standard deviations."""
     e = left_error(a.pose, b.pose)
     return wp.length_sq(inverse_factor(a.P + b.P) * e)
@@ -272,7 +272,7 @@ def multiply(memory: Any, world: int, x: int, y: int, z: int, count: int):
 
 @device_function
 def recentre(memory: Any, world: int, x: int, count: int):
-    """Turn the information x about some errors into that about others, of which `scratch` holds the derivatives."""
+    """Transform the information x to other errors, whose derivatives are in `scratch`."""
     for a in range(count):
         Gt = wp.transpose(memory.scratch[world, a].recentring)
         for b in range(count):

@@ -21,7 +21,7 @@ from coopenv.observers.robust.algebra import (
     with_noise,
 )
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
-from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Estimate, Member, Pose, mat66d
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Pose, PoseEstimate, mat66d
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
 
@@ -38,7 +38,7 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 
 @device_function
-def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
+def begin_belief(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Begin the belief with the vehicle itself; the calibration states are kept without correlations."""
     others = memory.belief[world, i].others
     memory.belief[world, i].members = others
@@ -54,11 +54,11 @@ def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
 @device_function
 def own_estimate(memory: Any, world: int, i: int):
     """Return the own estimate."""
-    return Estimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
+    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
 
 
 @device_function
-def put_own(memory: Any, world: int, i: int, estimate: Estimate):
+def put_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Set the own pose and covariance to an estimate."""
     memory.member[world, i, 0].pose = estimate.pose
     memory.P[world, i, 0, 0] = estimate.P
@@ -212,5 +212,5 @@ def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
 @device_function
 def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
     """Store the own pose as the anchor: the prior of a search after a loss."""
-    here = Estimate(memory.member[world, i, 0].pose, P)
+    here = PoseEstimate(memory.member[world, i, 0].pose, P)
     memory.anchor[world, i] = Anchor(here, memory.belief[world, i].odometry, tick)

@@ -8,7 +8,7 @@ from coopenv.observers.robust.algebra import by_rows, displaced, recentring, tra
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import innovation_cross_covariance, linearise, project
-from coopenv.observers.robust.memory import Frame, mat66d, vec6d
+from coopenv.observers.robust.memory import BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function
 
 
@@ -21,7 +21,7 @@ def store_poses(memory: Any, world: int, i: int):
 
 
 @device_function
-def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
+def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share: Any):
     """Linearise the bearings after a share of the correction, in errors about the poses before the correction.
 
     Considered members stay.
@@ -174,7 +174,7 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 
 
 @device_function
-def iterated_update(frame: Frame, memory: Any, world: int, i: int):
+def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """Correct by the bearings that fit, linearised at half of a small correction, or after all of a large one.
 
     For a large correction these are Gauss-Newton steps. For a small one, gain and innovation depend on the same noise.

@@ -19,7 +19,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Correlation, Known, Pose, Report, mat66d, mat66f, vec3d
+from coopenv.observers.robust.memory import Correlation, Pose, Regressor, SenderReport, mat66d, mat66f, vec3d
 from coopenv.observers.robust.tracklets import arrived, clear_messages, depends_on_own, marker_jacobian, receive, send
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
@@ -44,7 +44,7 @@ def bit_count(mask: wp.uint64) -> int:
 
 
 @device_function
-def rank(model: Any, vehicle: int, report: Report) -> int:
+def rank(model: Any, vehicle: int, report: SenderReport) -> int:
     """Return a number that is larger for vehicles that depend on more others, and then for later ones."""
     return bit_count(report.depends_on) * model.vehicles + vehicle
 
@@ -142,7 +142,7 @@ def clear_broadcasts(model: Any, memory: Any, world: int, i: int):
         for sender in range(model.vehicles):
             memory.correlation[world, i, sender, c] = no_correlation()
     for a in range(memory.known.shape[1]):
-        memory.known[world, a] = Known()
+        memory.known[world, a] = Regressor()
         for b in range(memory.known.shape[1]):
             memory.factor[world, a, b] = mat66d()
 

@@ -1,4 +1,4 @@
-"""Every message of a tick: whether its vehicles are new, its information is new, or another message has said it."""
+"""Fusion of joint messages: new vehicles are added, new information is fused, superseded messages are skipped."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ from coopenv.observers.robust.joint_messages import (
     send_joint,
 )
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
+from coopenv.observers.robust.memory import PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import JOINT_MESSAGES
 from coopenv.observers.robust.observer import OPTIONS, in_space, make_estimate, make_start
 from coopenv.observers.robust.propagation import increment_noise
@@ -56,7 +56,7 @@ from coopenv.world.warp_internals import device_function
 
 @device_function
 def predict_message(model: Any, memory: Any, world: int, i: int, c: int, count: int):
-    """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
+    """Propagate the contact's last message to the new one by odometry: poses to `step`, covariance to BEFORE."""
     for a in range(count):
         last = memory.contact_broadcast[world, i, c, a]
         step = between(last.odometry, memory.broadcast[world, a].odometry)
@@ -81,7 +81,7 @@ def predict_message(model: Any, memory: Any, world: int, i: int, c: int, count: 
 
 @device_function
 def propagate_to_message(model: Any, memory: Any, world: int, i: int, count: int):
-    """Carry the members that a message tells of on to where it says that they were, unless they stand there already."""
+    """Propagate the members in a message to the times of their poses in it."""
     for a in range(count):
         broadcast = memory.broadcast[world, a]
         n = index_of(memory, world, i, broadcast.vehicle)
@@ -143,7 +143,7 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
 
 @device_function
 def fuse_joint_information(memory: Any, world: int, i: int, count: int):
-    """Fuse information about the errors of all that a message tells of, see `fuse_information`.
+    """Fuse information about the errors of all vehicles in a message.
 
     The matrix BEFORE and the corrections in `scratch` hold it.
     """
@@ -184,7 +184,7 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
 
 @device_function
 def is_in_message(memory: Any, world: int, count: int, vehicle: int) -> bool:
-    """Return whether the message that has been read tells of a vehicle."""
+    """Return whether the message that has been read holds a vehicle."""
     for n in range(count):
         if memory.broadcast[world, n].vehicle == vehicle:
             return True
@@ -193,9 +193,9 @@ def is_in_message(memory: Any, world: int, count: int, vehicle: int) -> bool:
 
 @device_function
 def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, count: int) -> bool:
-    """Remove the members that the message tells of and, for want of room, those unseen for longest.
+    """Remove the members in the message and, if room is needed, those unseen for longest.
 
-    Return False, with nothing changed, if that does not make room for all that the message tells of.
+    Return False, with nothing changed, if that does not make room for all vehicles in the message.
     """
     own = wp.where(is_in_message(memory, world, count, i), 1, 0)
     staying = int(0)
@@ -219,7 +219,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
 
 @device_function
 def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int):
-    """Add all that the message that has been read tells of, if there is room; their errors are as it says."""
+    """Add all vehicles in the message that has been read, with its covariance, if there is room."""
     if not make_joint_room(model, memory, world, i, tick, count):
         return
     depends_on = joint_messages.dependence(memory, world, i, sender)
@@ -249,7 +249,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
 
 @device_function
 def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
-    """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
+    """Propagate the vehicles in a message to it, and fuse its information since the contact's last message."""
     ticks = memory.broadcast[world, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
     if not is_due(model, memory.contact_broadcast[world, i, c, 0].tick, memory.broadcast[world, 0].tick):
         return
@@ -260,7 +260,7 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
     broadcast = memory.broadcast[world, 0]
     was_excluded = memory.contact[world, i, c].excluded
     joint_messages.note_contacts(memory, world, i)
-    now = Estimate(broadcast.pose, memory.matrix[world, AFTER, 0, 0])
+    now = PoseEstimate(broadcast.pose, memory.matrix[world, AFTER, 0, 0])
     test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
     memory.contact[world, i, c].excluded = memory.member[world, i, n].excluded
     memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
@@ -274,7 +274,7 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
 
 @device_function
 def vehicle_in_message(memory: Any, world: int, i: int, sender: int, n: int) -> int:
-    """Return the n-th vehicle of which a received message tells, the sender first."""
+    """Return the n-th vehicle in a received message, the sender first."""
     if n == 0:
         return sender
     return memory.inbox_broadcast[world, i, sender, n - 1].vehicle
@@ -282,7 +282,7 @@ def vehicle_in_message(memory: Any, world: int, i: int, sender: int, n: int) -> 
 
 @device_function
 def includes_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
-    """Return whether a received message tells of a vehicle in view."""
+    """Return whether a received message holds a vehicle in view."""
     for n in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
         if state.sight[world, i, model.landmarks + vehicle_in_message(memory, world, i, sender, n)] == VISIBLE:
             return True
@@ -291,7 +291,7 @@ def includes_visible(model: Any, state: Any, memory: Any, world: int, i: int, se
 
 @device_function
 def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
-    """Fuse one message, or add those that it tells of, or neither where another message has said it all."""
+    """Fuse one message, or add its vehicles; skip it if another message supersedes it."""
     count = joint_messages.read_message(memory, world, i, sender)
     c = joint_messages.contact_of(memory, world, i, sender)
     if joint_messages.is_superseded(model, memory, world, i, sender, count):
@@ -309,7 +309,7 @@ def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
 
 @device_function
 def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Fuse the messages that tell of members, and add those that vehicles in view tell of; who tells of most first."""
+    """Fuse the messages about members and add the vehicles in those of senders in view, the largest messages first."""
     joint_messages.forget_contacts(memory, world, i)  # the belief may have begun anew
     mark_seen(model, state, memory, world, i, tick)
     for c in range(memory.contact.shape[2]):
@@ -320,7 +320,7 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
             c = joint_messages.contact_of(memory, world, i, sender)
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
-                if includes_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
+                if includes_visible(model, state, memory, world, i, sender):  # all vehicles in it then count as seen
                     for k in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
                         m = index_of(memory, world, i, vehicle_in_message(memory, world, i, sender, k))
                         if m > 0:

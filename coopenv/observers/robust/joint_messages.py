@@ -1,6 +1,6 @@
-"""Messages that tell of up to `MAX_TOLD` vehicles: what is sent, received, read, and kept of every sender.
+"""Joint messages of up to `MAX_BROADCAST` vehicles: sending, receiving, reading, and the last one of every sender.
 
-A contact is the last message of a sender that tells of members of the belief alone.
+A contact is the last message of a sender, if all vehicles in it are members of the belief.
 """
 
 from typing import Any
@@ -38,20 +38,20 @@ from coopenv.world.warp_internals import device_function
 
 @wp.struct
 class BroadcastVehicle:
-    """One of the vehicles that a joint message tells of."""
+    """A vehicle in a joint message."""
 
     vehicle: wp.int32
-    tick: wp.int32  # at which it stands
+    tick: wp.int32  # of its pose
     pose: Pose
     odometry: Pose
 
 
 @wp.struct
-class Joint:
-    """What a joint message has besides the sender's own report."""
+class JointHeader:
+    """The part of a joint message beside the sender's own report."""
 
-    others: wp.int32  # how many other vehicles it tells of
-    complete: wp.int32  # whether these are all that the sender believes in
+    others: wp.int32  # number of other vehicles in it
+    complete: wp.int32  # whether these are all members of the sender's belief
 
 
 @wp.struct
@@ -59,25 +59,24 @@ class Contact:
     """The last joint message of a sender."""
 
     sender: wp.int32  # -1: none
-    count: wp.int32  # of vehicles that it tells of, the sender included
+    count: wp.int32  # of vehicles in it, the sender included
     depends_on: wp.uint64
     excluded: wp.int32
-    agreement_time: wp.float64  # s for which a distrusted sender has agreed
+    agreement_time: wp.float64  # s for which an excluded sender has agreed
     fused: wp.int32  # whether it is part of the belief at this tick
 
 
 JointMemory = extended(
     CommonMemory,
     "JointMemory",
-    """T vehicles that a message tells of, B of them others than its sender.
+    """T vehicles in a message, B of them others than its sender.
 
-    Of their covariances, matrices of E blocks, as much counts as there are vehicles; they travel as F numbers of the
-    Cholesky factor, row by row.
+    Their covariances are matrices of E blocks; messages hold the F numbers of the Cholesky factor, row by row.
     """,
-    outbox_joint=array("WNS", Joint),
+    outbox_joint=array("WNS", JointHeader),
     outbox_broadcast=array("WNSB", BroadcastVehicle),
     outbox_factor=array("WNSF", wp.float32),
-    inbox_joint=array("WNN", Joint),
+    inbox_joint=array("WNN", JointHeader),
     inbox_broadcast=array("WNNB", BroadcastVehicle),
     inbox_factor=array("WNNF", wp.float32),
     contact=array("WNK", Contact),
@@ -102,7 +101,7 @@ JOINT_SIZES = {
 
 
 def _are_in_message(P: Any, fields: Any, model: Any) -> Any:
-    """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles that a contact tells of."""
+    """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles of a contact."""
     return are_joint(P.reshape(*P.shape[:3], MAX_BROADCAST, MAX_BROADCAST, 6, 6), fields["observer_contact.count"])
 
 
@@ -134,7 +133,7 @@ MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
 @device_function
 def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
-    """Forget what was sent and received, all contacts, and what is only used within a tick."""
+    """Clear all sent and received messages, contacts and scratch arrays."""
     clear_messages(model, memory, world, i)
     for c in range(memory.contact.shape[2]):
         memory.contact[world, i, c] = Contact()
@@ -151,13 +150,13 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
             for k in range(MAX_BROADCAST):
                 memory.matrix[world, x, n, k] = mat66d()
     for slot in range(model.radio.slots):
-        memory.outbox_joint[world, i, slot] = Joint()
+        memory.outbox_joint[world, i, slot] = JointHeader()
         for n in range(MAX_BROADCAST - 1):
             memory.outbox_broadcast[world, i, slot, n] = BroadcastVehicle()
         for k in range(memory.outbox_factor.shape[3]):
             memory.outbox_factor[world, i, slot, k] = wp.float32(0.0)
     for sender in range(model.vehicles):
-        memory.inbox_joint[world, i, sender] = Joint()
+        memory.inbox_joint[world, i, sender] = JointHeader()
         for n in range(MAX_BROADCAST - 1):
             memory.inbox_broadcast[world, i, sender, n] = BroadcastVehicle()
         for k in range(memory.inbox_factor.shape[3]):
@@ -166,13 +165,13 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Send the belief about oneself and as many others as fit, if a message is due."""
+    """Send the belief about the vehicle itself and as many other members as fit, if a message is due."""
     if tick % model.radio.period != 0:
         return
     slot = tick % model.radio.slots
     report = broadcast_report(model, state, world, i, own_report(model, memory, world, i, tick))
     claimed = wp.float64(claimed_std(model, state, world, i, tick))
-    joint = Joint()
+    joint = JointHeader()
     others = memory.belief[world, i].others
     members = memory.belief[world, i].members - others + 1  # without the odometry's errors
     count = wp.min(members, MAX_BROADCAST)
@@ -192,7 +191,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
                 memory.matrix[world, AFTER, a, b] = block
         if not factorise(memory, world, AFTER, 6 * count):
             report.valid = 0
-            joint = Joint()
+            joint = JointHeader()
     for n in range(joint.others):
         other = memory.member[world, i, others + n]
         broadcast = BroadcastVehicle(other.vehicle, other.report.tick, other.pose, other.report.odometry)
@@ -208,7 +207,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
 
 @device_function
 def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Take what the radio has delivered at this tick."""
+    """Receive the messages that the radio delivers at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
         sent = arrived(state, memory, world, i, sender)
@@ -231,7 +230,7 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
 
 @device_function
 def others_in_message(memory: Any, world: int, i: int, sender: int) -> int:
-    """Return of how many other vehicles a received message tells; of none where the sender depends on this vehicle."""
+    """Return the number of other vehicles in a received message that count: 0 if the sender depends on this vehicle."""
     if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
         return 0
     return memory.inbox_joint[world, i, sender].others
@@ -239,7 +238,7 @@ def others_in_message(memory: Any, world: int, i: int, sender: int) -> int:
 
 @device_function
 def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
-    """Return on whom a received message depends: on nobody where it tells of all that its sender believes in."""
+    """Return the vehicles on which a received message depends: none if it holds the whole belief of its sender."""
     depends_on = memory.inbox[world, i, sender].depends_on
     own = depends_on & bit_of(i)
     if own == wp.uint64(0) and memory.inbox_joint[world, i, sender].complete == 1:
@@ -249,7 +248,7 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
 
 @device_function
 def read_message(memory: Any, world: int, i: int, sender: int) -> int:
-    """Write what a received message tells of to `told`, their covariance to AFTER; return how many they are."""
+    """Write the vehicles in a received message to `broadcast`, their covariance to AFTER; return their number."""
     report = memory.inbox[world, i, sender]
     memory.broadcast[world, 0] = BroadcastVehicle(sender, report.tick, report.pose, report.odometry)
     others = others_in_message(memory, world, i, sender)
@@ -280,7 +279,7 @@ def contact_of(memory: Any, world: int, i: int, sender: int) -> int:
 
 @device_function
 def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: int):
-    """Let the message that has been read be the last one of a contact."""
+    """Store the message that has been read as the last one of a contact."""
     memory.contact[world, i, c].sender = sender
     memory.contact[world, i, c].count = count
     memory.contact[world, i, c].depends_on = dependence(memory, world, i, sender)
@@ -293,7 +292,7 @@ def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: i
 
 @device_function
 def includes_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bool:
-    """Return whether there is a contact whose last message tells of the same vehicles as the one that has been read."""
+    """Return whether there is a contact whose last message holds the same vehicles as the one that has been read."""
     if c < 0:
         return False
     if memory.contact[world, i, c].count != count:
@@ -306,7 +305,7 @@ def includes_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bo
 
 @device_function
 def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, count: int) -> bool:
-    """Return whether a message that is fused already says all that the one that has been read does."""
+    """Return whether a message that is fused already holds the sender of the one that has been read."""
     for c in range(memory.contact.shape[2]):
         other = memory.contact[world, i, c].sender
         if other >= 0 and other != sender and memory.contact[world, i, c].fused == 1:
@@ -322,7 +321,7 @@ def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, coun
 
 @device_function
 def forget_contacts(memory: Any, world: int, i: int):
-    """Forget the senders that tell of vehicles which are no members; they may be met again."""
+    """Clear the contacts with vehicles that are no members; they may begin anew."""
     for c in range(memory.contact.shape[2]):
         for n in range(memory.contact[world, i, c].count):
             vehicle = memory.contact_broadcast[world, i, c, n].vehicle
@@ -332,7 +331,7 @@ def forget_contacts(memory: Any, world: int, i: int):
 
 @device_function
 def note_contacts(memory: Any, world: int, i: int):
-    """Let the members show what their contacts say: whether they are trusted, and on whom they depend."""
+    """Copy exclusion and dependence of the contacts to the members."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         c = contact_of(memory, world, i, memory.member[world, i, n].vehicle)
         memory.member[world, i, n].excluded = 0

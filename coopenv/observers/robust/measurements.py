@@ -21,7 +21,7 @@ from coopenv.observers.robust.constants import (
     MEMBER_LINEARISATION_TIME,
     THIRD,
 )
-from coopenv.observers.robust.memory import Frame, mat26d, vec3d
+from coopenv.observers.robust.memory import BearingFrame, mat26d, vec3d
 from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
 from coopenv.observers.robust.sender_monitor import is_excluded
 from coopenv.observers.robust.tracklets import only_returns
@@ -192,7 +192,7 @@ def set_bearing_measurements(
         mounting = mounting_of(memory, world, i)
     else:
         variance += mounting_variances(model, i)[0]
-    return Frame(bearings, mounting, vec3d(model.camera[i].position), variance, period)
+    return BearingFrame(bearings, mounting, vec3d(model.camera[i].position), variance, period)
 
 
 @device_function
@@ -231,7 +231,7 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
 
 
 @device_function
-def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
+def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
     member = memory.measurement[world, n].member
     point = memory.measurement[world, n].point
@@ -316,7 +316,7 @@ def innovation_with(memory: Any, world: int, n: int, more: Any):
 
 
 @device_function
-def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
+def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise a bearing and return its normalised innovation squared, infinite for a target behind the camera.
 
     Its `gain` is set to H P.

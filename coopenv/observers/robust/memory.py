@@ -45,7 +45,7 @@ class Pose:
 
 
 @wp.struct
-class Estimate:
+class PoseEstimate:
     """A pose and its covariance."""
 
     pose: Pose
@@ -53,7 +53,7 @@ class Estimate:
 
 
 @wp.struct
-class Report:
+class SenderReport:
     """A message: pose of the sender, its dead reckoning, and the vehicles whose messages it has fused."""
 
     tick: wp.int32  # when it was sent; -1: never
@@ -77,7 +77,7 @@ class Member:
     dated_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
-    report: Report  # its last one, at which it stands
+    report: SenderReport  # its last one, at which it stands
     excluded: wp.int32
     agreement_time: wp.float64  # s for which an excluded sender has agreed
     considered: wp.int32  # whether its pose is the reported one, which bearings do not correct
@@ -108,7 +108,7 @@ class SenderMonitor:
 
 
 @wp.struct
-class Belief:
+class JointBelief:
     """The joint state of a vehicle's estimator, without the members' poses and covariance."""
 
     odometry: Pose  # by dead reckoning, in a frame of its own
@@ -131,7 +131,7 @@ class Belief:
 class Anchor:
     """The pose at which the bearings last fitted, or the initial one: the prior of a search."""
 
-    estimate: Estimate
+    estimate: PoseEstimate
     odometry: Pose  # then
     tick: wp.int32
 
@@ -141,7 +141,7 @@ class Search:
     """A search for the pose."""
 
     active: wp.int32
-    prior: Estimate  # carried on by odometry
+    prior: PoseEstimate  # carried on by odometry
     hypotheses: wp.int32  # how many
     tracked_time: wp.float64  # s for which hypotheses have been tracked
     least_time: wp.float64  # s for which they have to be tracked before one is accepted
@@ -154,14 +154,14 @@ class Search:
 class Hypothesis:
     """A candidate for the vehicle's pose, with a filter of its own."""
 
-    estimate: Estimate
+    estimate: PoseEstimate
     cost: wp.float64  # sum of normalised innovations squared, each limited, by the noise common to all hypotheses
     prior_distance: wp.float64  # squared, in standard deviations
     misfit: wp.float64  # sum of innovations squared by its own noise, less twice the value expected of the true one
 
 
 @wp.struct
-class Frame:
+class BearingFrame:
     """Properties that all bearings of a frame share; small, because functions receive copies of their arguments."""
 
     bearings: wp.int32  # how many bearings can be used
@@ -177,7 +177,7 @@ class BearingMeasurement:
 
     member: wp.int32  # its target; 0: a point in the map
     reported_by: wp.int32  # the member whose report states that point, see solution_separation.py
-    mounting: wp.int32  # see `Frame`
+    mounting: wp.int32  # see `BearingFrame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
@@ -212,18 +212,18 @@ class CommonMemory:
     K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`.
     """
 
-    belief: array("WN", Belief)
+    belief: array("WN", JointBelief)
     member: array("WNK", Member)
     P: array("WNKK", mat66d)  # blocks of the members' joint covariance
     anchor: array("WN", Anchor)
     search: array("WN", Search)
     monitor: array("WNN", SenderMonitor)  # per receiver and sender
     hypothesis: array("WNH", Hypothesis)
-    outbox: array("WNS", Report)
-    inbox: array("WNN", Report)  # per receiver and sender
+    outbox: array("WNS", SenderReport)
+    inbox: array("WNN", SenderReport)  # per receiver and sender
     measurement: array("WA", BearingMeasurement)
     scratch: array("WK", Scratch)
-    gain: array("WAK", mat26d)  # scratch: of a line in a member, transposed and not yet weighted, see correction.py
+    gain: array("WAK", mat26d)  # scratch: of a bearing in a member, transposed and not yet weighted, see correction.py
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
@@ -234,7 +234,7 @@ SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hy
 @device_function
 def clear(model: Any, memory: Any, world: int, i: int):
     """Clear an earlier episode, scratch included: equal states are equal in every bit."""
-    memory.belief[world, i] = Belief()
+    memory.belief[world, i] = JointBelief()
     memory.search[world, i] = Search()
     members = memory.member.shape[2]
     for n in range(members):
@@ -329,7 +329,7 @@ class Correlation:
 
 
 @wp.struct
-class Known:
+class Regressor:
     """The covariance of a sender's new error with that of a member; scratch, see correlations.py."""
 
     member: wp.int32
@@ -345,7 +345,7 @@ class LandmarkOnlySolution:
     exposed: wp.int32  # whether the belief has fused a sender since it was last set to this solution
     tick: wp.int32  # of the last propagation
     odometry: Pose  # of the belief, then
-    estimate: Estimate
+    estimate: PoseEstimate
 
 
 RobustMemory = extended(
@@ -355,7 +355,7 @@ RobustMemory = extended(
     landmark_only=array("WN", LandmarkOnlySolution),
     outbox_correlation=array("WNSC", Correlation),
     correlation=array("WNNC", Correlation),  # per receiver and sender
-    known=array("WK", Known),  # scratch
+    known=array("WK", Regressor),  # scratch
     factor=array("WKK", mat66d),  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
 )
 ROBUST_SIZES = {**SIZES, "C": MAX_CORRELATIONS}

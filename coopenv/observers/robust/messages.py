@@ -1,4 +1,4 @@
-"""What `robust` and `robust_joint` both send, as other programs see it: 196 bytes."""
+"""Messages of `robust` (196 bytes) and `robust_joint` between the kernels and other programs."""
 
 from dataclasses import replace
 from typing import Any
@@ -36,7 +36,7 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
     """Put a message into the inbox; a CoopenvError or LookupError says that it is malformed."""
     report = observer.memory.inbox[sender]
     report["tick"], report["valid"] = sent, 0
-    if message.position is None and not message.extra:  # the sender does not know where it is
+    if message.position is None and not message.extra:  # the sender is searching for its pose
         return
     check_pose(message)
     odometry, depends_on = np.asarray(message.extra["odometry"], np.float64), np.asarray(message.extra["depends_on"])
@@ -110,13 +110,13 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
 ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast)
 
 
-JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")  # what a joint message has besides
+JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")  # the entries of a joint message
 
 
 def write_joint(observer: Any) -> Message:
-    """Return a message that also tells of other vehicles: poses, odometry, and the factor of the joint covariance.
+    """Return a message with other vehicles, too: poses, odometry, and the factor of the joint covariance.
 
-    The factor, in single precision, keeps what a covariance would lose.
+    The factor in single precision keeps digits that a covariance would lose.
     """
     message = write(observer)
     if message.position is None:
@@ -137,7 +137,7 @@ def write_joint(observer: Any) -> Message:
 
 
 def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message that also tells of other vehicles into the inbox; errors are those of `read`."""
+    """Put a message with other vehicles into the inbox; errors are those of `read`."""
     m, extra = observer.memory, message.extra
     read(observer, sender, message, sent)
     if not m.inbox[sender]["valid"]:
@@ -175,7 +175,7 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
 
 
 def tampered(message: Message) -> Message:
-    """Return a message whose joint covariance claims what its own does, for studies of liars."""
+    """Return a message whose joint covariance agrees with its changed pose covariance, for studies of faults."""
     if message.covariance is None or "factor" not in message.extra:
         return message
     n = 6 * (1 + len(message.extra["vehicles"]))
@@ -183,7 +183,7 @@ def tampered(message: Message) -> Message:
     L[np.tril_indices(n)] = message.extra["factor"]
     P = L @ L.T
     if np.allclose(P[:6, :6], message.covariance, rtol=1e-3, atol=1e-3 * np.diag(message.covariance).min()):
-        return message  # it claims what it believes
+        return message  # its covariance is unchanged
     P[:6, 6:], P[6:, :6], P[:6, :6] = 0.0, 0.0, message.covariance
     factor = np.linalg.cholesky(P)[np.tril_indices(n)].astype(np.float32)
     more: dict[str, Any] = {**message.extra, "factor": factor}

@@ -45,9 +45,9 @@ from coopenv.observers.robust.measurements import (
 )
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
-    Estimate,
-    Frame,
+    BearingFrame,
     Pose,
+    PoseEstimate,
     RobustMemory,
     clear,
     mat33d,
@@ -67,7 +67,7 @@ from coopenv.observers.robust.propagation import (
     walk_errors,
     walk_mounting,
 )
-from coopenv.observers.robust.search import advance_search, begin_search, propagate_search, put_off
+from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
 from coopenv.observers.robust.sender_monitor import reset_monitors, test_innovations, test_rejected_bearings
 from coopenv.observers.robust.solution_separation import begin_broadcasts, separate
 from coopenv.observers.robust.tracklets import bit_of
@@ -77,7 +77,7 @@ from coopenv.world.warp_internals import device_function
 
 
 @device_function
-def gate(frame: Frame, memory: Any, world: int, i: int):
+def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     """Linearise the bearings and gate them; return the share of rejected ones, the number of the others, and their NIS.
 
     Bearings to excluded senders do not count in the share, which is -1 if none counts.
@@ -105,7 +105,7 @@ def gate(frame: Frame, memory: Any, world: int, i: int):
 
 
 @wp.func
-def is_valid(estimate: Estimate):
+def is_valid(estimate: PoseEstimate):
     """Return whether an estimate is finite and its covariance positive definite, but for rounding."""
     P = estimate.P
     for k in range(6):
@@ -127,7 +127,7 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
 
 
 @device_function
-def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: Frame):
+def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: BearingFrame):
     """Correct the belief by the bearings of a frame that pass the gate; begin a search if most fail."""
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
@@ -189,7 +189,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
 
 
 @device_function
-def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
+def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
     """Resect the own pose from a frame by least squares, from the current pose; return whether that converges."""
     bearings = frame.bearings
     inverse = mat66d()
@@ -218,7 +218,7 @@ ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # status of the own pose; found: by the 
 
 
 @device_function
-def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
+def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
     begin_belief(memory, world, i, estimate)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
@@ -265,7 +265,7 @@ def make_start(begin_messages: Any, receive: Any) -> Any:
         memory.belief[world, i].others = 1
         begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
-        initial = Estimate(
+        initial = PoseEstimate(
             Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i)
         )
         restart_belief(model, memory, world, i, initial)
@@ -307,7 +307,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
     elif resect(frame, memory, world, i) and is_known(wp.float64(SURE) * memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
     else:
-        put_off(memory, world, i)
+        postpone_acceptance(memory, world, i)
 
 
 def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:

@@ -31,13 +31,13 @@ def mounting_variances(model: Any, i: int):
 
 @device_function
 def has_mounting_errors(model: Any, i: int) -> bool:
-    """Return whether the mounting is declared not to be known."""
+    """Return whether an error of the mounting is declared."""
     return wp.max(mounting_variances(model, i)) > wp.float64(0.0)
 
 
 @device_function
 def begin_mounting(model: Any, memory: Any, world: int, i: int):
-    """Let member 2 stand for the mounting, and believe of it what is declared."""
+    """Begin the calibration state of the mounting, member 2, with its declared covariance."""
     if has_mounting_errors(model, i):
         memory.belief[world, i].others = MOUNTING + 1
         mounting = Member()
@@ -55,7 +55,7 @@ def begin_mounting(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Let the mounting be a little less certain after a time: see `MOUNTING_WALK`."""
+    """Inflate the covariance of the mounting by its walk over dt, see `MOUNTING_WALK`."""
     if mounting_of(memory, world, i) > 0:
         declared = (wp.float64(constants.MOUNTING_WALK * constants.MOUNTING_WALK) * dt) * mounting_variances(model, i)
         P = memory.P[world, i, MOUNTING, MOUNTING]
@@ -64,7 +64,7 @@ def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
 
 @device_function
 def mounting_of(memory: Any, world: int, i: int) -> int:
-    """Return the member that stands for the mounting, 0 if there is none."""
+    """Return the member with the calibration state of the mounting, 0 if there is none."""
     return wp.where(memory.belief[world, i].others > MOUNTING, MOUNTING, 0)
 
 
@@ -81,7 +81,7 @@ def lasting_variances(model: Any, i: int):
 
 @device_function
 def walk_variances(model: Any, i: int):
-    """Return by how much these variances grow, per second."""
+    """Return the growth of these variances per second."""
     noise = model.noise[i]
     bias = vec3d(noise.gyro_bias_walk)
     scale = wp.float64(noise.odometry_scale_walk)
@@ -98,7 +98,7 @@ def has_lasting_errors(model: Any, i: int) -> bool:
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
-    """Let member 1 stand for the odometry's errors, where there are any, and believe of them what is declared."""
+    """Begin the calibration states of odometry, member 1, and of the mounting, with their declared covariances."""
     if has_lasting_errors(model, i) or has_mounting_errors(model, i):
         memory.belief[world, i].others = ERRORS + 1
         errors = Member()
@@ -107,7 +107,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
         memory.member[world, i, ERRORS] = errors
         bias, scale = lasting_variances(model, i)
         least = wp.float64(MIN_ERROR_STD) * wp.float64(MIN_ERROR_STD)
-        P = wp.identity(6, wp.float64)  # of what does not exist, any
+        P = wp.identity(6, wp.float64)  # entries without a state are arbitrary
         for k in range(3):
             P[k, k] = wp.max(bias[k], least)
         P[3, 3] = wp.max(scale, least)
@@ -117,7 +117,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Let the odometry's errors have walked for a time."""
+    """Inflate the covariance of the odometry's errors by their walk over dt."""
     if memory.belief[world, i].others > ERRORS:
         bias, scale = walk_variances(model, i)
         for k in range(3):
@@ -127,7 +127,7 @@ def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
 
 @device_function
 def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return an increment over dt without the errors that are believed, to first order in the bias."""
+    """Return an increment over dt without the estimated errors, to first order in the bias."""
     if memory.belief[world, i].others <= ERRORS:
         return step
     bias = memory.member[world, i, ERRORS].w
@@ -159,7 +159,7 @@ def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
 
 @device_function
 def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: Any):
-    """Carry the vehicle itself through a corrected increment over dt, with noise and the errors that are left."""
+    """Propagate the own pose by a corrected increment over dt, with noise and the remaining calibration errors."""
     propagate(memory, world, i, 0, step, noise)
     if memory.belief[world, i].others > ERRORS:
         G = errors_transition(memory, world, i, step, dt)
@@ -176,10 +176,10 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
 
 @device_function
 def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
-    """Return the variances (rotation, translation) of an increment over dt by errors of odometry, taken as noise.
+    """Return the variances (rotation, translation) of an increment over dt by lasting odometry errors, taken as noise.
 
-    They are as large as the vehicle's own may be, as far as it knows them. An error that lasts adds up as noise does
-    that is the same for as long as it is `correlated`, s.
+    They have the covariance of the vehicle's own calibration. A lasting error adds up like noise that is constant over
+    the time `correlated`, s.
     """
     noise = vec2d()
     if memory.belief[world, i].others > ERRORS:
@@ -192,17 +192,17 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
 
 @device_function
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return the variances (rotation, translation) of an increment over dt, errors that last among them."""
+    """Return the variances (rotation, translation) of an increment over dt, lasting errors included."""
     noise = odometry_noise(model, i, dt)
     return noise + lasting_noise(memory, world, i, step, dt, wp.float64(ERRORS_TIME))
 
 
 @wp.func
 def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
-    """Return the variance, per axis, of a sum of samples between two of which the twist has changed by so much.
+    """Return the variance, per axis, of an increment in which the twist has changed by `change` between two samples.
 
-    What is more than the samples' noise and a `smooth` acceleration has come at once, in a collision for example, and
-    at any time of the period.
+    A change beyond the samples' noise and a `smooth` acceleration is sudden, as in a collision, at any time of the
+    period.
     """
     square = wp.dot(change, change)
     gate = wp.max(wp.float64(JUMP_GATE) * std * std, smooth * smooth * period * period)
@@ -211,12 +211,11 @@ def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
 
 @device_function
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
-    """Return the increment over a tick of dt and variances to add to its noise; carry the dead reckoning through it.
+    """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 
-    The mean velocity of late is kept, too, for `errors_transition`.
-    Samples are held until the next one, so that the sum lags by half a period. Half of what the held sample has changed
-    by makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T + (v1 - v0) T / 2. The noise that comes in goes out again
-    with the next sample.
+    The recent mean velocity is stored for `errors_transition`. Samples are held until the next one, so that their sum
+    lags by half a period. Half the change of the held sample makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T +
+    (v1 - v0) T / 2. The next sample removes the noise that this adds.
     """
     v = vec3d(state.odometry_velocity[world, i])
     w = vec3d(state.odometry_angular_velocity[world, i])

@@ -1,13 +1,12 @@
-"""Finding one's pose from nothing: solutions of the P3P problem are followed until motion has told them apart.
+"""Search for the pose without a prior: solutions of the P3P problem are tracked until motion separates them.
 
-Each hypothesis is a small filter of its own; one that predicts the bearings much worse than the best is given up. It
-costs its normalised innovations squared, each limited, so that the difference of two costs is twice the logarithm of
-their likelihoods' ratio; those that cost least come first. For that their noise must be the same: a vague hypothesis,
-whose linearisation leaves more out, would win by its noise. While a vehicle searches it believes nothing, so that the
-belief's arrays serve to correct one hypothesis after the other.
+Each hypothesis has a filter of its own. Its cost is the sum of its normalised innovations squared, each bounded. The
+difference of two costs is twice the logarithm of the likelihood ratio, if both have the same noise; otherwise a vague
+hypothesis with a large linearisation error would have the least cost. Hypotheses with a cost far above the least one
+are pruned. During a search there is no belief: its arrays serve to correct one hypothesis after the other.
 
-Where two solutions of P3P lie close together noise can make both of them vanish. So every bearing, and every position
-that is not exactly known, is also perturbed by some standard deviations to each side.
+Noise can remove two close solutions of P3P. Every bearing, and every position that is not exactly known, is therefore
+also perturbed by some standard deviations to each side.
 """
 
 from typing import Any
@@ -27,7 +26,7 @@ from coopenv.observers.robust.measurements import (
     set_bearing_measurements,
     tangent_basis,
 )
-from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search, mat33d, mat66d
+from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, PoseEstimate, Search, mat33d, mat66d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
 from coopenv.world.warp_internals import device_function
 
@@ -60,7 +59,7 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
 
 @wp.func
 def angles_within(P: Any, most: Any) -> bool:
-    """Return whether all variances of angles are what an inverse that exists may have, and no larger than `most`."""
+    """Return whether all variances of angles are positive and no larger than `most`."""
     for k in range(3):
         if not (P[k, k] > wp.float64(0.0) and P[k, k] <= most):
             return False
@@ -68,8 +67,8 @@ def angles_within(P: Any, most: Any) -> bool:
 
 
 @device_function
-def covariance_of(frame: Frame, memory: Any, world: int, i: int, triple: Any, patient: bool):
-    """Return whether three bearings determine the pose believed well enough, and its covariance."""
+def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool):
+    """Return whether three bearings determine the present pose well enough, and its covariance."""
     M = mat66d()
     for n in range(3):
         linearise(frame, memory, world, i, triple[n])
@@ -83,7 +82,7 @@ def covariance_of(frame: Frame, memory: Any, world: int, i: int, triple: Any, pa
 
 @device_function
 def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
-    """Return whether a hypothesis can be told apart from each of the first `count`."""
+    """Return whether a hypothesis differs from each of the first `count`."""
     for g in range(count):
         distance = distance_squared(memory.hypothesis[world, i, h].estimate, memory.hypothesis[world, i, g].estimate)
         if distance < wp.float64(constants.SAME_HYPOTHESIS):
@@ -92,7 +91,7 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
 
 
 @device_function
-def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
+def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Add a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
     if h < constants.MAX_HYPOTHESES:
@@ -102,27 +101,29 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
 
 
 @device_function
-def solve(frame: Frame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool):
+def solve(
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool
+):
     """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
 
-    They become hypotheses if they are to be followed.
+    With `tracking` they become hypotheses.
     """
     count, distances = solve_triangle(b, z)
     for n in range(count):
         R, camera = camera_pose(b, z, distances[n])
         if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
             pose = Pose(R, camera - R * frame.lever)
-            begin_belief(memory, world, i, Estimate(pose, mat66d()))
+            begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
             determined, P = covariance_of(frame, memory, world, i, triple, patient)
             if patient and not determined:
                 return False
             if tracking and determined:
-                add_hypothesis(memory, world, i, Estimate(pose, P))
+                add_hypothesis(memory, world, i, PoseEstimate(pose, P))
     return True
 
 
 @device_function
-def problem(frame: Frame, memory: Any, world: int, triple: Any, number: int):
+def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: int):
     """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
     The first is as measured. In the others a bearing is perturbed along an axis across it, or its point if that is not
@@ -151,10 +152,12 @@ def problem(frame: Frame, memory: Any, world: int, triple: Any, number: int):
 
 
 @device_function
-def solve_triple(frame: Frame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool) -> bool:
-    """Make hypotheses of the poses that agree with three bearings, in their order, if they are to be followed.
+def solve_triple(
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool
+) -> bool:
+    """Make hypotheses of the poses that agree with three bearings, in their order, if `tracking`.
 
-    Return False, without hypotheses, if a solution is not well determined and one is `patient` enough to wait.
+    Return False, without hypotheses, if `patient` and a solution is not well determined.
     """
     memory.search[world, i].hypotheses = 0
     for number in range(constants.PROBLEMS):
@@ -167,7 +170,7 @@ def solve_triple(frame: Frame, memory: Any, world: int, i: int, triple: Any, pat
 
 
 @device_function
-def begin_search(memory: Any, world: int, i: int, prior: Estimate):
+def begin_search(memory: Any, world: int, i: int, prior: PoseEstimate):
     """Start from a prior, without hypotheses."""
     memory.search[world, i] = Search()
     memory.search[world, i].active = 1
@@ -195,7 +198,7 @@ def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
 
 @device_function
 def sort_hypotheses(memory: Any, world: int, i: int):
-    """Put those that cost least first."""
+    """Sort hypotheses by their cost, the least one first."""
     count = memory.search[world, i].hypotheses
     for h in range(count):
         for g in range(h + 1, count):
@@ -207,7 +210,7 @@ def sort_hypotheses(memory: Any, world: int, i: int):
 
 @device_function
 def prune(memory: Any, world: int, i: int):
-    """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
+    """Prune hypotheses with a large cost, those equal to a better one, and all of them if the best one misfits."""
     sort_hypotheses(memory, world, i)
     least = memory.hypothesis[world, i, 0].cost
     misfit = memory.hypothesis[world, i, 0].misfit
@@ -223,8 +226,8 @@ def prune(memory: Any, world: int, i: int):
 
 
 @device_function
-def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
-    """Set for every line the largest noise that it has for any hypothesis, by which all of them are compared."""
+def set_common_noise(frame: BearingFrame, memory: Any, world: int, i: int):
+    """Set the noise of every bearing for comparisons: the largest for any hypothesis."""
     for n in range(frame.bearings):
         memory.measurement[world, n].common_noise = wp.float64(0.0)
     for h in range(memory.search[world, i].hypotheses):
@@ -236,10 +239,10 @@ def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
 
 
 @device_function
-def expected_of(frame: Frame, memory: Any, world: int, n: int):
-    """Return the normalised innovation squared of a line that is expected of a true hypothesis.
+def expected_of(frame: BearingFrame, memory: Any, world: int, n: int):
+    """Return the expected normalised innovation squared of a bearing for the true hypothesis.
 
-    Noise that is not the camera's stands for an error that is the same for a while, times the frames in that.
+    Noise beyond the camera's stands for a correlated error, multiplied by the number of frames in its correlation time.
     """
     time = wp.float64(constants.LINEARISATION_TIME)
     if memory.measurement[world, n].variance > wp.float64(0.0):
@@ -250,7 +253,7 @@ def expected_of(frame: Frame, memory: Any, world: int, n: int):
 
 
 @device_function
-def track_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used: Any):
+def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
     fitting = int(0)
@@ -276,7 +279,7 @@ def track_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used
 
 @device_function
 def add_prior(memory: Any, world: int, i: int):
-    """Add the prior as a hypothesis if it is known well enough to be followed."""
+    """Add the prior as a hypothesis if its covariance is small enough."""
     prior = memory.search[world, i].prior
     if is_known(prior.P):
         h = memory.search[world, i].hypotheses
@@ -286,7 +289,7 @@ def add_prior(memory: Any, world: int, i: int):
 
 
 @device_function
-def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
+def chosen_triple(frame: BearingFrame, memory: Any, world: int, i: int):
     """Return three well placed bearings, others at every attempt."""
     triples = frame.bearings * (frame.bearings - 1) * (frame.bearings - 2) // 6
     triple = wp.vec3i(0, 0, 0)
@@ -298,8 +301,8 @@ def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
 
 
 @device_function
-def wait(memory: Any, world: int, i: int, period: Any) -> bool:
-    """Count the time of a frame; return whether to look at it: not soon after one that was in doubt."""
+def may_solve(memory: Any, world: int, i: int, period: Any) -> bool:
+    """Add the time of a frame; return whether to use it: not soon after an undetermined one."""
     memory.search[world, i].waited_time += period
     memory.search[world, i].clear_time += period
     patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
@@ -307,11 +310,11 @@ def wait(memory: Any, world: int, i: int, period: Any) -> bool:
 
 
 @device_function
-def solve_chosen(frame: Frame, memory: Any, world: int, i: int, triple: Any, period: Any) -> bool:
-    """Solve a triple; return whether its solutions are hypotheses now: if for a while all were well determined.
+def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, period: Any) -> bool:
+    """Solve a triple; return whether its solutions are hypotheses now: if all were well determined for some time.
 
-    Where two solutions nearly meet, the region where they may be is no ellipsoid, and noise makes them come and go;
-    meanwhile a follower's leaders improve, which sets them apart.
+    Near a double solution the error has no ellipsoidal region, and noise makes the solutions appear and vanish. With
+    time the estimates of a follower's leaders improve, which separates the solutions.
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
     patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
@@ -333,16 +336,16 @@ def solve_chosen(frame: Frame, memory: Any, world: int, i: int, triple: Any, per
 
 
 @device_function
-def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any):
-    """Begin with a known prior at first, then with a frame's solutions, too; every attempt takes other bearings.
+def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, period: Any):
+    """Begin with a known prior in the first attempt, then with solutions, too; each attempt uses other bearings.
 
-    Return the bearings that have been used, and for how many hypotheses.
+    Return the used bearings, and for how many hypotheses.
     """
     triple = wp.vec3i(-1, -1, -1)
     solved = int(0)
     tracking = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
     if not tracking:
-        if wait(memory, world, i, period):
+        if may_solve(memory, world, i, period):
             triple = chosen_triple(frame, memory, world, i)
             tracking = solve_chosen(frame, memory, world, i, triple, period)
             solved = memory.search[world, i].hypotheses
@@ -354,14 +357,14 @@ def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any)
 
 
 @device_function
-def put_off(memory: Any, world: int, i: int):
-    """Follow the hypothesis that is left for some more frames: this one has not told the pose well enough."""
+def postpone_acceptance(memory: Any, world: int, i: int):
+    """Track the remaining hypothesis for some more frames: this frame does not determine the pose well enough."""
     memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.DOUBT_TIME)
 
 
 @device_function
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
-    """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
+    """Update the hypotheses by a frame; return whether a single one is left after some frames."""
     frame = set_bearing_measurements(model, state, memory, world, i, now.tick, now.period, SEARCH)
     beginning = memory.search[world, i].hypotheses == 0
     triple = wp.vec3i(-1, -1, -1)

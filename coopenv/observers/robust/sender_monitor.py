@@ -30,7 +30,17 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Drift, Estimate, Frame, Report, SenderMonitor, mat33d, mat66d, vec2d, vec3d
+from coopenv.observers.robust.memory import (
+    BearingFrame,
+    Drift,
+    PoseEstimate,
+    SenderMonitor,
+    SenderReport,
+    mat33d,
+    mat66d,
+    vec2d,
+    vec3d,
+)
 from coopenv.observers.robust.tracklets import test_sender
 from coopenv.world.warp_internals import device_function
 
@@ -125,8 +135,8 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     if grown > wp.float64(constants.RESET_GROWTH) * spread:
         inflate_covariance(memory, world, i, n, wp.float64(constants.THIRD) * grown)
     if dt > wp.float64(constants.SILENCE_TIME):
-        estimated = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-        if algebra.distance_squared(estimated, Estimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
+        estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+        if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
             inflate_covariance(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
             return True
     return False
@@ -143,14 +153,14 @@ def test_report(
     report = memory.member[world, i, n].report
     sender = memory.member[world, i, n].vehicle
     if memory.member[world, i, n].excluded == 1:
-        test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
+        test_sender(memory, world, i, n, PoseEstimate(report.pose, mat66d(report.P)), dt)
         if is_excluded(memory, world, i, sender, tick) or drift > wp.float64(0.0):
             memory.member[world, i, n].excluded = 1
             memory.member[world, i, n].agreement_time = wp.float64(0.0)
         return memory.member[world, i, n].excluded == 0
     if sender_reset_detected(memory, world, i, n, dt):
         return True
-    test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
+    test_sender(memory, world, i, n, PoseEstimate(report.pose, mat66d(report.P)), dt)
     if jumped or memory.member[world, i, n].excluded == 1:
         exclude(model, memory, world, i, n, tick, wp.float64(0.0), False)
         memory.monitor[world, i, sender].self_inconsistent = 1
@@ -236,7 +246,7 @@ def propagate_information(memory: Any, world: int, i: int, sender: int, x: Any, 
 
 
 @device_function
-def share_of(frame: Frame, memory: Any, world: int, dt: Any):
+def share_of(frame: BearingFrame, memory: Any, world: int, dt: Any):
     """Return the share of a frame's information that counts: noise beyond the camera's is correlated over frames."""
     frames = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0))
     most = frame.variance
@@ -289,7 +299,7 @@ def likely_error(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def test_innovations(frame: Frame, memory: Any, world: int, i: int, now: Any):
+def test_innovations(frame: BearingFrame, memory: Any, world: int, i: int, now: Any):
     """Add a frame's innovations to every considered member's sum; set the member that fails worst as suspect."""
     worst = int(0)
     most = wp.float64(constants.INNOVATION_SUM_GATE)
@@ -325,7 +335,15 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 
 @device_function
 def note_step(
-    memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, lasting: Any, dt: Any
+    memory: Any,
+    world: int,
+    i: int,
+    sender: int,
+    last: SenderReport,
+    report: SenderReport,
+    noise: Any,
+    lasting: Any,
+    dt: Any,
 ):
     """Add to a sender's sums the step from its propagated last report to its new one; return the step (3,), m, map.
 
@@ -333,7 +351,7 @@ def note_step(
     (rotation, translation) of the odometry, rad^2 and m^2; lasting errors are the same in all steps of a sum.
     """
     step = algebra.between(last.odometry, report.odometry)
-    carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
+    carried = algebra.carried(PoseEstimate(last.pose, mat66d(last.P)), step, noise)
     x = report.pose.p - carried.pose.p
     R = carried.pose.R
     before = block3(carried.P, 3, 3)

@@ -39,11 +39,28 @@ from coopenv.observers.robust.measurements import (
     set_bearing_measurements,
     time_between,
 )
-from coopenv.observers.robust.memory import Estimate, Frame, LandmarkOnlySolution, SenderMonitor, mat66d, vec2d, vec3d
+from coopenv.observers.robust.memory import (
+    BearingFrame,
+    LandmarkOnlySolution,
+    PoseEstimate,
+    SenderMonitor,
+    mat66d,
+    vec2d,
+    vec3d,
+)
 from coopenv.observers.robust.propagation import begin_errors, increment_noise, mounting_variances
 from coopenv.observers.robust.sender_monitor import exclude, reset_monitors
 from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.warp_internals import device_function
+
+
+@device_function
+def isolate_own(memory: Any, world: int, i: int):
+    """Reduce the belief to the own pose, without calibration states; return the belief and the own estimate."""
+    belief = memory.belief[world, i]
+    memory.belief[world, i].members = 1
+    memory.belief[world, i].others = 1
+    return belief, own_estimate(memory, world, i)
 
 
 @device_function
@@ -98,11 +115,11 @@ def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: 
                     bearings += 1
     variance = bearing_variance(model, i) + mounting[0]
     once = wp.float64(constants.LINEARISATION_TIME)  # s, a period for which the linearisation error counts once
-    return Frame(bearings, 0, vec3d(model.camera[i].position), variance, once)
+    return BearingFrame(bearings, 0, vec3d(model.camera[i].position), variance, once)
 
 
 @device_function
-def cost_of(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
+def cost_of(frame: BearingFrame, memory: Any, world: int, i: int, landmark_only: PoseEstimate):
     """Return the joint cost of an estimate and of the measurements that fit; set the own pose to their optimum.
 
     The cost is infinite if a target is behind the camera. Every other measurement costs as much as an outlier.
@@ -124,11 +141,11 @@ def cost_of(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estima
             if not linearise(frame, memory, world, i, n):
                 return wp.float64(wp.inf)
             cost += wp.length_sq(memory.measurement[world, n].residual) / memory.measurement[world, n].noise
-    return cost + distance_squared(landmark_only, Estimate(memory.member[world, i, 0].pose, mat66d()))
+    return cost + distance_squared(landmark_only, PoseEstimate(memory.member[world, i, 0].pose, mat66d()))
 
 
 @device_function
-def least_cost(frame: Frame, memory: Any, world: int, i: int, landmark_only: Estimate):
+def least_cost(frame: BearingFrame, memory: Any, world: int, i: int, landmark_only: PoseEstimate):
     """Return the member whose omission leaves the least cost, that cost, and the own pose at it."""
     faulty = int(0)
     least = wp.float64(wp.inf)
@@ -146,7 +163,7 @@ def least_cost(frame: Frame, memory: Any, world: int, i: int, landmark_only: Est
 
 @device_function
 def find_alternative_hypothesis(
-    model: Any, state: Any, memory: Any, world: int, i: int, tick: int, landmark_only: Estimate
+    model: Any, state: Any, memory: Any, world: int, i: int, tick: int, landmark_only: PoseEstimate
 ):
     """Return the frame and the index of the member to exclude in place of the present exclusions.
 
@@ -160,17 +177,12 @@ def find_alternative_hypothesis(
         rejected += 1 - fits
     if rejected == 0:
         return frame, int(0)
-    own = own_estimate(memory, world, i)
-    members = memory.belief[world, i].members
-    others = memory.belief[world, i].others
-    memory.belief[world, i].members = 1
-    memory.belief[world, i].others = 1
+    belief, own = isolate_own(memory, world, i)
     cost = cost_of(frame, memory, world, i, landmark_only)
     faulty, least, pose = least_cost(frame, memory, world, i, landmark_only)
-    memory.belief[world, i].members = members
-    memory.belief[world, i].others = others
+    memory.belief[world, i] = belief
     put_own(memory, world, i, own)
-    elsewhere = distance_squared(own, Estimate(pose, mat66d())) > wp.float64(constants.SEPARATION_GATE)
+    elsewhere = distance_squared(own, PoseEstimate(pose, mat66d())) > wp.float64(constants.SEPARATION_GATE)
     convincing = cost - least > wp.float64(constants.RETEST_MARGIN)
     return frame, wp.where(elsewhere and convincing, faulty, 0)
 
@@ -180,7 +192,7 @@ LASTING_FRAME = constants.LINEARISATION_TIME / constants.CONSIDERED_LINEARISATIO
 
 
 @device_function
-def begin_landmark_only(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
+def begin_landmark_only(memory: Any, world: int, i: int, estimate: PoseEstimate, tick: int):
     """Begin the landmark-only solution with an estimate at a tick."""
     memory.landmark_only[world, i].begun = 1
     memory.landmark_only[world, i].tick = tick
@@ -213,22 +225,18 @@ def propagate_landmark_only(model: Any, memory: Any, world: int, i: int, tick: i
 
 
 @device_function
-def correct_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> int:
+def correct_landmark_only(model: Any, frame: BearingFrame, memory: Any, world: int, i: int, elapsed: Any) -> int:
     """Correct the landmark-only solution by a frame, `elapsed` (s) after the last one; return how many landmarks fit.
 
     If landmarks are in view and none fits, the solution begins anew. It takes the belief's place during the correction.
     Errors that are the same in all frames count as one measurement.
     """
-    own = own_estimate(memory, world, i)
-    members = memory.belief[world, i].members
-    others = memory.belief[world, i].others
-    memory.belief[world, i].members = 1
-    memory.belief[world, i].others = 1
+    belief, own = isolate_own(memory, world, i)
     put_own(memory, world, i, memory.landmark_only[world, i].estimate)
     frames = wp.max(wp.float64(constants.CONSIDERED_LINEARISATION_TIME) / elapsed, wp.float64(1.0))
     mounting = wp.float64(constants.LANDMARK_ONLY_NOISE) * frames * mounting_variances(model, i)
     variance = wp.float64(constants.LANDMARK_ONLY_NOISE) * frame.variance + mounting[0]
-    inflated = Frame(frame.bearings, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
+    inflated = BearingFrame(frame.bearings, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
     fitting = int(0)
     landmarks = int(0)
     for n in range(inflated.bearings):
@@ -245,14 +253,13 @@ def correct_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: 
         memory.landmark_only[world, i].estimate = own_estimate(memory, world, i)
     elif landmarks > 0:
         memory.landmark_only[world, i].begun = 0
-    memory.belief[world, i].members = members
-    memory.belief[world, i].others = others
+    memory.belief[world, i] = belief
     put_own(memory, world, i, own)
     return fitting
 
 
 @device_function
-def exchange_own(memory: Any, world: int, i: int, estimate: Estimate):
+def exchange_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Set the own pose to an estimate that depends on no sender; keep its cross-covariances in `scratch.row`."""
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
@@ -262,7 +269,7 @@ def exchange_own(memory: Any, world: int, i: int, estimate: Estimate):
 
 
 @device_function
-def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
+def restore_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restore the own pose and its cross-covariances."""
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
@@ -289,7 +296,7 @@ def cost_without(memory: Any, world: int, i: int, bearings: int, without: int):
 
 
 @device_function
-def find_fault_hypothesis(frame: Frame, memory: Any, world: int, i: int, suspect: int):
+def find_fault_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, suspect: int):
     """Return (member, its cost, cost without the suspect, bearings): the member whose omission leaves the least cost.
 
     The member is 0 if no fused sender is in view. Costs are normalised innovations squared of the other bearings, about
@@ -336,7 +343,7 @@ def consistent_cost(bearings: int):
 
 
 @device_function
-def revert_to_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int, faulty: int):
+def revert_to_landmark_only(model: Any, frame: BearingFrame, memory: Any, world: int, i: int, tick: int, faulty: int):
     """Reset the belief to the landmark-only solution; exclude the faulty member and all that contradict landmarks."""
     landmark_only = memory.landmark_only[world, i].estimate
     away = wp.length(landmark_only.pose.p - memory.member[world, i, 0].pose.p)
@@ -367,7 +374,7 @@ def revert_to_landmark_only(model: Any, frame: Frame, memory: Any, world: int, i
 
 
 @device_function
-def test_suspect(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+def test_suspect(model: Any, frame: BearingFrame, memory: Any, world: int, i: int, tick: int):
     """Exclude the suspect, or another sender if landmarks contradict that one more clearly."""
     suspect = memory.belief[world, i].suspect
     propagate_landmark_only(model, memory, world, i, tick)
@@ -380,7 +387,7 @@ def test_suspect(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
 
 
 @device_function
-def test_separation(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+def test_separation(model: Any, frame: BearingFrame, memory: Any, world: int, i: int, tick: int):
     """Reset the belief if it is separated from the landmark-only solution.
 
     If several senders contradict that solution and few landmarks are in view, its odometry may be wrong. The solution
@@ -390,7 +397,7 @@ def test_separation(model: Any, frame: Frame, memory: Any, world: int, i: int, t
     landmarks = correct_landmark_only(model, frame, memory, world, i, elapsed)
     exposed = memory.landmark_only[world, i].exposed == 1
     pose = memory.member[world, i, 0].pose
-    away = distance_squared(memory.landmark_only[world, i].estimate, Estimate(pose, mat66d()))
+    away = distance_squared(memory.landmark_only[world, i].estimate, PoseEstimate(pose, mat66d()))
     if exposed and landmarks > 0 and away > wp.float64(constants.SEPARATION_GATE):
         faulty, least, _, count = find_fault_hypothesis(frame, memory, world, i, 0)
         consistent = count == 0 or least <= consistent_cost(count - 1)
@@ -439,7 +446,7 @@ def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
                 wp.float64(constants.KNOWN_POSITION * constants.KNOWN_POSITION),
             )
             pose = memory.member[world, i, 0].pose
-            begin_landmark_only(memory, world, i, Estimate(pose, with_noise(mat66d(), variances)), now.tick)
+            begin_landmark_only(memory, world, i, PoseEstimate(pose, with_noise(mat66d(), variances)), now.tick)
         note_exposure(memory, world, i)
         since = wp.float64(now.tick - memory.landmark_only[world, i].tick) * model.camera_period
         looking = since > wp.float64(constants.LANDMARK_ONLY_PERIOD - constants.SAME_TIME)

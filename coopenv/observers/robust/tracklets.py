@@ -15,7 +15,7 @@ import warp as wp
 from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
-from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d
+from coopenv.observers.robust.memory import Pose, PoseEstimate, SenderReport, mat66f, vec3d
 from coopenv.world.v2x import as_broadcast, claimed_std, content_tick
 from coopenv.world.warp_internals import device_function
 
@@ -38,7 +38,7 @@ def marker_jacobian(marker: Any):
 @device_function
 def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     """Return pose, covariance and odometry at the marker, or an empty report while the pose is not known."""
-    report = Report()
+    report = SenderReport()
     report.tick = tick
     P = memory.P[world, i, 0, 0]
     if memory.search[world, i].active == 0 and algebra.is_known(P):
@@ -59,14 +59,14 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
 def clear_messages(model: Any, memory: Any, world: int, i: int):
     """Clear all sent and received reports."""
     for slot in range(model.radio.slots):
-        memory.outbox[world, i, slot] = Report()
+        memory.outbox[world, i, slot] = SenderReport()
     for sender in range(model.vehicles):
-        memory.inbox[world, i, sender] = Report()
+        memory.inbox[world, i, sender] = SenderReport()
         memory.inbox[world, i, sender].tick = -1
 
 
 @device_function
-def broadcast_report(model: Any, state: Any, world: int, i: int, report: Report):
+def broadcast_report(model: Any, state: Any, world: int, i: int, report: SenderReport):
     """Return a report as a vehicle broadcasts it, its `lie` faults included, see `[faults]`."""
     R, p = as_broadcast(model, state, world, i, report.pose.R, report.pose.p)
     report.pose = Pose(R, p)
@@ -125,9 +125,9 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: 
 
 
 @device_function
-def test_sender(memory: Any, world: int, i: int, n: int, reported: Estimate, dt: Any):
+def test_sender(memory: Any, world: int, i: int, n: int, reported: PoseEstimate, dt: Any):
     """Exclude or readmit a sender by the distance of its new report, dt after the last one, from its estimate."""
-    estimated = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+    estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
     agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.MESSAGE_GATE)
     agreed = wp.float64(0.0)
     excluded = wp.where(agrees, 0, 1)

@@ -29,7 +29,7 @@ class Alters:
     def applies(self, vehicle: int, time: float) -> bool:
         return vehicle == self.sender and time >= self.start and self.rng.random() < 0.8
 
-    def told(self, observer: Any, message: Message) -> Message:
+    def broadcast(self, observer: Any, message: Message) -> Message:
         if message.position is None:
             return message
         names = ["position", "covariance", *message.extra]
