@@ -151,18 +151,14 @@ def start_warp() -> None:
 def kernel(function: Function, precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only.
 
-    Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`;
-    "inline_threshold" is the compiler's, see `inlining`. What is a kernel already stays as it is.
+    Its module has the options that its file sets with `wp.set_module_options`. A `wp.Kernel` is returned unchanged.
     """
     if isinstance(function, wp.Kernel):
         return function
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
-    options = dict(getattr(function, "options", {}))
-    threshold = options.pop("inline_threshold", None)
-    module.options.update(options if threshold is None else {**inlining(threshold), **options})
-    module.options["enable_backward"] = differentiable
+    module.options.update(compiler_options(), enable_backward=differentiable)
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
@@ -173,33 +169,28 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
         name: of the module, besides the precision.
         p: the `Precision` that it serves.
         functions: as for `wp.kernel`.
-        options: of the module; "inline_threshold" is the compiler's, see `inlining`.
+        options: of the module.
     """
     module = wp.get_module(f"coopenv.{name}.{p.name}")
-    threshold = options.pop("inline_threshold", None)
-    module.options.update({} if threshold is None else inlining(threshold))
-    module.options.update(options, enable_backward=False)
+    module.options.update({**compiler_options(), **options}, enable_backward=False)
     return {function.__name__: wp.Kernel(func=function, key=function.__name__, module=module) for function in functions}
 
 
-def inlining(threshold: int) -> dict[str, Any]:
-    """Return options of kernels in which functions up to a cost are inlined: Warp's 9000 takes long to compile.
+INLINE_THRESHOLD = 1000
+"""Cost up to which LLVM inlines a function. Warp's 9000 compiles longer and runs no faster."""
 
-    It serves functions with large records as arguments, which are copied except for a `device_function`.
+
+def compiler_options() -> dict[str, Any]:
+    """Return the compiler's options of all kernels; flags that the user has set are kept.
+
+    The same for all modules, because Warp's headers are parsed once for each set of flags.
     """
     flags = (wp.config.cpu_compiler_flags or "").split()
     if not any("-inline-threshold" in flag for flag in flags):
-        return {}  # flags set by the user
+        return {}
     kept = [flag for flag in flags if "-inline-" not in flag]
-    return {"cpu_compiler_flags": " ".join([*kept, f"-mllvm=-inline-threshold={threshold}"])}
-
-
-def near_inlining() -> dict[str, Any]:
-    """Return options of kernels that gain nothing from Warp's far inlining, which takes long to compile.
-
-    They are those of the large observers: the compiler parses Warp's headers once for all modules of the same flags.
-    """
-    return {"optimization_level": 3, **inlining(1000)}
+    threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
+    return {"cpu_compiler_flags": " ".join([*kept, threshold]), "optimization_level": 3}
 
 
 def default_threads(worlds: int, device: str) -> int:

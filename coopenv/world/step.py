@@ -12,7 +12,7 @@ import warp as wp
 
 from coopenv.world.dynamics import decide as make_commands
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
-from coopenv.world.launch import module_kernels, near_inlining
+from coopenv.world.launch import module_kernels
 from coopenv.world.model import Precision, model_struct
 from coopenv.world.quality import sample_gramian
 from coopenv.world.state import state_struct
@@ -76,7 +76,7 @@ def begin_kernel(source: Source, p: Precision) -> wp.Kernel:
                 deliver(model, state, world, vehicle, 0)
                 broadcast_estimate(model, state, world, vehicle, 0)
 
-    return module_kernels(f"begin_{source.name}", p, begin, max_unroll=1, **near_inlining())["begin"]
+    return module_kernels(f"begin_{source.name}", p, begin, max_unroll=1)["begin"]
 
 
 @cache
@@ -97,7 +97,7 @@ def source_kernels(source: Source, p: Precision) -> Kernels:
         if is_active(model, state, hold, world):
             sense_tick(model, state, record, world, state.tick[world] + 1)
 
-    return module_kernels(f"sense_{source.name}", p, decide, sense, max_unroll=1, **near_inlining())
+    return module_kernels(f"sense_{source.name}", p, decide, sense, max_unroll=1)
 
 
 @cache

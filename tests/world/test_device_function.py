@@ -80,13 +80,14 @@ def test_what_is_no_record_stays_a_value() -> None:
     assert increased.get_overload([wp.float32], {}).input_types == {"state": wp.float32}
 
 
-def test_inlining_changes_the_threshold_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_threshold_of_inlining_replaces_that_of_warp(monkeypatch: pytest.MonkeyPatch) -> None:
     flags = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -O1"
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
-    assert launch.inlining(7) == {"cpu_compiler_flags": "-march=native -O1 -mllvm=-inline-threshold=7"}
+    monkeypatch.setattr(launch, "INLINE_THRESHOLD", 7)
+    assert launch.compiler_options()["cpu_compiler_flags"] == "-march=native -O1 -mllvm=-inline-threshold=7"
 
 
 @pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])
-def test_flags_that_somebody_has_chosen_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
+def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
-    assert launch.inlining(7) == {}
+    assert launch.compiler_options() == {}

@@ -25,7 +25,7 @@ from coopenv.scenario.own_terms import record_count
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, Row
 from coopenv.world import launch
 from coopenv.world.dynamics import UNDER_WAY
-from coopenv.world.launch import PerWorld, near_inlining
+from coopenv.world.launch import PerWorld, compiler_options
 from coopenv.world.state import allocate
 from coopenv.world.world import World
 
@@ -237,7 +237,7 @@ def condition_kernel(term: OwnTerm) -> wp.Kernel:
 
 
 def _kernel(function: Callable[..., None]) -> wp.Kernel:
-    return wp.kernel(function, module="unique", module_options={"enable_backward": False, **near_inlining()})
+    return wp.kernel(function, module="unique", module_options={"enable_backward": False, **compiler_options()})
 
 
 def _own_fields(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:

@@ -36,7 +36,6 @@ from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.world.dynamics import UNDER_WAY
-from coopenv.world.launch import near_inlining
 from coopenv.world.model import Precision
 from coopenv.world.quality import (
     cholesky_of,
@@ -299,7 +298,3 @@ def write_records(model: Any, state: Any, records: Records, results: Any):
     ego, truth = own_records(model, state, results, world, vehicle, remaining, True)
     records.ego[world, vehicle] = ego
     records.truth[world, vehicle] = truth
-
-
-for _kernel in (step_results, write_records):
-    _kernel.options = near_inlining()  # type: ignore[attr-defined]

@@ -352,7 +352,7 @@ def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
     return estimate
 
 
-OPTIONS = {"max_unroll": 1, "inline_threshold": 1000, "optimization_level": 3}
+OPTIONS = {"max_unroll": 1}
 """Of the Warp module; without the first two there is long straight code, which takes long to compile and is no faster;
 with the last one, which is Warp's on a GPU, steps take a twentieth less than with Warp's 2."""
 
