@@ -88,16 +88,11 @@ def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray
     assert_allclose(half_way[0] + half_turn[0] @ half_way[0], way[0], atol=1e-13)
 
 
-def test_angle_to_a_picoradian_everywhere() -> None:
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
+def test_angle_is_accurate_everywhere(dtype: str, tolerance: float) -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(linalg.rotation_angle, "float64", R), angle, atol=1e-12, rtol=0)
-
-
-def test_angle_in_float32() -> None:
-    w, angle = turns(ANGLES)
-    R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(linalg.rotation_angle, "float32", R), angle, atol=1e-6, rtol=0)
+    assert_allclose(call(linalg.rotation_angle, dtype, R), angle, atol=tolerance, rtol=0)
 
 
 def test_angle_between_near_rotations() -> None:

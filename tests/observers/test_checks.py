@@ -35,6 +35,8 @@ LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
         ({"covariance": np.full((6, 6), np.nan)}, "covariance is not a finite array"),
         ({"covariance": np.eye(3)}, r"covariance is not a finite array of shape \(6, 6\)"),
         ({"coordinates": "left"}, "coordinates are 'left', not a member of Coordinates"),
+        ({"covariance": 1e300 * np.eye(6)}, "covariance is not a finite array"),
+        ({"position": np.full(3, 2**62)}, "with numbers up to"),
         ({"nis": float("nan"), "nis_dof": 2}, "nis is not finite"),
         ({"nis": 1.0, "nis_dof": -2}, "nis_dof negative"),
     ],

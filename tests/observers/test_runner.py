@@ -188,22 +188,11 @@ class UnspeakableError(Exception):
         (lambda e: (_ for _ in ()).throw(ValueError("one\nand two")), "ValueError: one and two"),
         (lambda e: None, "AttributeError"),
         (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
-        (lambda e: replace(e, position=1j * e.position), "position is complex"),
-        (lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "covariance is not a finite array"),
-        (lambda e: replace(e, rotation=np.zeros((3, 3))), "rotation is not orthogonal"),
-        (lambda e: replace(e, covariance=-np.eye(6)), "covariance is not positive semidefinite"),
-        (lambda e: replace(e, nis=float("nan")), "nis"),
         (
             lambda e: (_ for _ in ()).throw(UnspeakableError()),
-            "UnspeakableError: says nothing, but raises ZeroDivisionError",
+            "UnspeakableError: no message: its text raises ZeroDivisionError",
         ),
         (lambda e: (_ for _ in ()).throw(ValueError("\x1b[2J" + "a" * 5000)), "ValueError: \\x1b[2Jaaa"),
-        (lambda e: replace(e, coordinates="x"), "coordinates are 'x', not a member of Coordinates"),
-        (lambda e: replace(e, coordinates=None), "coordinates are None"),
-        (lambda e: replace(e, covariance=1e300 * np.eye(6)), "covariance is not a finite array of shape (6, 6) with"),
-        (lambda e: replace(e, covariance=2e18 * np.eye(6)), "with numbers up to 1e+18"),
-        (lambda e: replace(e, position=1e10 + e.position), "with numbers up to 1e+09"),
-        (lambda e: replace(e, position=np.full(3, 2**62)), "with numbers up to 1e+09"),
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
 )
@@ -242,20 +231,10 @@ def test_what_is_no_message_is_told_in_one_line() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "rotation",
-        "translation",
-        "velocity",
-        "angular_velocity",
-        "targets",
-        "bearings",
-        "valid",
-        "landmarks",
-        "lever_arm",
-    ],
-)
+SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", "bearings", "valid", "landmarks")
+
+
+@pytest.mark.parametrize("name", [*SENSED, "lever_arm"])
 def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
     class Vandal(Probe):
         def update(self, tick: Tick) -> Estimate:

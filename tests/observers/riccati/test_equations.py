@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation import linalg
 from coopenv.observers.riccati import equations
 from tests.helpers.warp_calls import Calls
-from tests.oracles import splitting
 from tests.oracles.continuous import skew
 
 
@@ -191,25 +190,6 @@ def test_correction_is_the_frozen_flow(k: float, targets: int) -> None:
     dx, P = corrected(k, h, P0, M, r)
     assert_allclose(dx, end[:6], atol=1e-7)
     assert_allclose(P, end[6:].reshape(6, 6), atol=1e-7)
-
-
-@pytest.mark.parametrize("k", GAINS)
-def test_correction_agrees_with_the_reference(k: float) -> None:
-    for seed in range(20):
-        P, (M, r), h = covariance(seed, 10.0 ** (seed % 5 - 2)), total_information(seed + 50), 1 / 60
-        flow = splitting.frozen_flow(P, M, r, k)
-        dx, after = corrected(k, h, P, M, r)
-        assert_allclose(dx, flow.dx(h), atol=1e-10)
-        assert_allclose(after, flow.covariance(h), atol=1e-10 * np.abs(P).max())
-
-
-def test_unit_gain_is_the_limit_of_its_neighbours() -> None:
-    """k = 1 takes another way through the code."""
-    P, (M, r) = covariance(5), total_information(6)
-    at, P1 = corrected(1.0, 0.02, P, M, r)
-    near, P2 = corrected(1.0 + 1e-9, 0.02, P, M, r)
-    assert_allclose(near, at, atol=1e-7)
-    assert_allclose(P2, P1, atol=1e-11)
 
 
 @pytest.mark.parametrize("k", GAINS)

@@ -125,7 +125,7 @@ def busy_reference() -> continuous.Result:
     return continuous.solve(continuous.busy_intersection(), 50.0)
 
 
-@pytest.mark.parametrize("rate", [30.0, 60.0, 100.0])
+@pytest.mark.parametrize("rate", [30.0, 100.0])
 def test_busy_intersection_settles_like_the_continuous_observer(rate: float) -> None:
     overrides = {"noise.enabled": False, "rates.camera": rate}
     world = start(load_scenario("busy_intersection", overrides))

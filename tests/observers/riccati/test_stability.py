@@ -66,9 +66,35 @@ def watch(world: World, ticks: int, every: int) -> None:
     assert (world.get_state()["tick"] == ticks // every * every).all()
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_stiff_gain_over_minutes_of_random_visibility(dtype: str) -> None:
-    watch(start(circling(k=80.0), range(3), dtype), 12000, 60)
+def alone(origin: np.ndarray, landmarks: int, k: float) -> Scenario:
+    """Return one vehicle near an origin with some landmarks."""
+    motion = constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.3])
+    return scenario(
+        [vehicle(origin, motion=motion, initial_estimate=MIXED_ERRORS[0])],
+        landmarks=[landmark(f"L{i}", (origin + p).tolist()) for i, p in enumerate(LANDMARKS[:landmarks])],
+        noise=NOISE,
+        observer={"k": k, "q": 25.0},
+    )
+
+
+FAR = np.array([1000.0, -500.0, 0.0])
+RUNS: dict[str, tuple[Scenario, int, int]] = {
+    "stiff": (circling(k=80.0), 6000, 60),
+    **{f"almost never a target in view, k={k}": (circling(miss=0.999, k=k), 6000, 30) for k in (1.0, 80.0)},
+    **{f"one landmark, k={k}": (alone(np.zeros(3), 1, k), 3000, 20) for k in (1.0, 80.0)},
+    **{f"P0={P0}": (circling(k=80.0, P0=P0), 300, 1) for P0 in ([1e-6, 1e-6], [1e3, 1e5], [1e-6, 1e4])},
+    "1 km from the origin, condition number of M above 1e12": (alone(FAR, len(LANDMARKS), 80.0), 1800, 10),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_float32_stays_healthy(name: str) -> None:
+    made, ticks, every = RUNS[name]
+    watch(start(made, range(4), "float32"), ticks, every)
+
+
+def test_stiff_gain_in_float64() -> None:
+    watch(start(circling(k=80.0), range(3)), 6000, 60)
 
 
 @pytest.mark.parametrize("k", [0.6, 1.0, 80.0, 1000.0])
@@ -81,16 +107,11 @@ def test_any_gain_over_a_minute_tick_by_tick(k: float) -> None:
 
 
 @pytest.mark.parametrize("k", [1.0, 80.0])
-def test_almost_never_a_target_in_view(k: float) -> None:
-    watch(start(circling(miss=0.999, k=k), range(4), "float32"), 6000, 30)
-
-
-@pytest.mark.parametrize("k", [1.0, 80.0])
 def test_nothing_in_view_then_everything(k: float) -> None:
-    """Ten minutes blind, then every target at once."""
+    """Five minutes blind, then every target at once."""
     world = start(circling(miss=1.0, k=k), range(4), "float32")
-    watch(world, 36000, 6000)
-    growth = 600.0 * np.array([0.1] * 3 + [1.0] * 3)
+    watch(world, 18000, 6000)
+    growth = 300.0 * np.array([0.1] * 3 + [1.0] * 3)
     P = world.get_state()["covariance"]
     np.testing.assert_allclose(
         np.diagonal(P, axis1=-2, axis2=-1), np.broadcast_to([1.0] * 3 + [100.0] * 3 + growth, (4, 3, 6)), rtol=2e-3
@@ -100,32 +121,3 @@ def test_nothing_in_view_then_everything(k: float) -> None:
     for _ in range(300):
         seeing.advance(1)
         assert_healthy(seeing)
-
-
-@pytest.mark.parametrize("k", [1.0, 80.0])
-def test_one_landmark_only(k: float) -> None:
-    """Unobservable for ever: P grows along what one bearing cannot tell."""
-    made = scenario(
-        [vehicle(motion=constant([0.2, 0, 0]), initial_estimate=MIXED_ERRORS[0])],
-        landmarks=[landmark("only", LANDMARKS[0])],
-        noise=NOISE,
-        observer={"k": k, "q": 25.0},
-    )
-    watch(start(made, range(4), "float32"), 3000, 20)
-
-
-def test_tiny_and_huge_initial_covariances() -> None:
-    for p0 in ([1e-6, 1e-6], [1e3, 1e5], [1e-6, 1e4]):
-        watch(start(circling(k=80.0, P0=p0), range(4), "float32"), 300, 1)
-
-
-def test_far_origin_in_float32() -> None:
-    """1 km from the map's origin, where M's condition number passes 1e12."""
-    far = np.array([1000.0, -500.0, 0.0])
-    made = scenario(
-        [vehicle(far, motion=constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.3]), initial_estimate=MIXED_ERRORS[0])],
-        landmarks=[landmark(f"L{i}", (far + p).tolist()) for i, p in enumerate(LANDMARKS)],
-        noise=NOISE,
-        observer={"k": 80.0, "q": 25.0},
-    )
-    watch(start(made, range(4), "float32"), 1800, 10)
