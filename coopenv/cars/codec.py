@@ -1,5 +1,6 @@
 """Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
 
+import math
 from functools import cache
 from typing import Any
 
@@ -228,6 +229,28 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
         return read(payload, kind)
     except Exception as error:  # whatever the library raises at bytes that make no sense
         raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
+
+
+def pose(rotation: Any, position: Any) -> Any:
+    """Return a geometry_msgs/Pose of a rotation (3, 3), body to map, and a position (3,), m."""
+    x, y, z = (float(value) for value in position)
+    place = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    return make("geometry_msgs/msg/Pose", position=place, orientation=quaternion(rotation))
+
+
+def quaternion(rotation: Any) -> Any:
+    """Return the quaternion of a rotation by its largest component; in plain numbers, as there are 200 a second."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    rows = (
+        (1.0 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1.0 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1.0 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1.0 - a - e + i),
+    )  # 4 q q^T
+    largest = max(range(4), key=lambda k: rows[k][k])
+    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[largest])), rows[largest][0] or 1.0)
+    w, x, y, z = (scale * v for v in rows[largest])
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
 @cache

@@ -139,6 +139,9 @@ class Role(StrEnum):
     MANUAL = "manual"  # from the gate to the car
 
 
+VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "odometry": (Role.ODOMETRY,), "wheel": (Role.WHEEL,)}
+"""Sources of body twists, best first."""
+
 GATE_TYPES = {
     Role.COMMAND: "ackermann_msgs/msg/AckermannDriveStamped",
     Role.ARM: "coopenv_msgs/msg/Arm",

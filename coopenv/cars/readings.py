@@ -76,18 +76,12 @@ def detections(message: Any, calibration: Calibration, known: Collection[int] | 
     """
     blocks = _few(message.objects, "objects")
     width, height = calibration.image_size
-    best: dict[int, tuple[int, tuple[float, float, float]]] = {}  # marker to area and ray
+    found = []
     for block in blocks:
         u, v, marker = int(block.center_x), int(block.center_y), int(block.signature)
-        if not (0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0):
-            continue
-        if known is not None and marker not in known:
-            continue
-        area, ray = int(block.width) * int(block.height), ray_of(calibration, u, v)
-        if ray is not None and (marker not in best or area > best[marker][0]):
-            best[marker] = area, ray
-    unit = np.array([best[marker][1] for marker in sorted(best)], dtype=np.float64).reshape(-1, 3)
-    return Detections(tuple(sorted(best)), unit, len(blocks) - len(best))
+        if 0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0:
+            found.append((marker, int(block.width) * int(block.height), ray_of(calibration, u, v)))
+    return _largest(found, len(blocks), known)
 
 
 def bearings(message: Any, calibration: Calibration | None, known: Collection[int] | None) -> Detections:
@@ -115,7 +109,10 @@ def bearings(message: Any, calibration: Calibration | None, known: Collection[in
             pixels = flat * calibration.focal_length + np.asarray(calibration.principal_point)
             rays_, imaged = rays(np.round(pixels, 3), calibration)  # of single precision
             there &= imaged
-    return _frame(table[:, 0].astype(np.int64), rays_, there, -np.arange(len(table), dtype=np.float64), known)
+    found = zip(
+        table[:, 0].astype(int).tolist(), range(0, -len(table), -1), rays_.tolist(), there.tolist(), strict=True
+    )
+    return _largest([(marker, size, ray) for marker, size, ray, valid in found if valid], len(table), known)
 
 
 def _few(entries: Any, field: str) -> Any:
@@ -124,17 +121,15 @@ def _few(entries: Any, field: str) -> Any:
     return entries
 
 
-def _frame(
-    markers: NDArray[np.int64], unit: Array, there: NDArray[np.bool_], size: Array, known: Collection[int] | None
-) -> Detections:
-    """Return a frame with the largest entry of each marker among those that are `there`, in the order of markers."""
-    best: dict[int, int] = {}
-    for i in np.flatnonzero(there):
-        marker = int(markers[i])
-        if (known is None or marker in known) and (marker not in best or size[i] > size[best[marker]]):
-            best[marker] = int(i)
-    chosen = [best[marker] for marker in sorted(best)]
-    return Detections(tuple(sorted(best)), unit[chosen].reshape(-1, 3), len(markers) - len(chosen))
+def _largest(found: list[tuple[int, int, Any]], total: int, known: Collection[int] | None) -> Detections:
+    """Return the largest entry (marker, size, ray or None) of each known marker, of so many entries in all."""
+    best: dict[int, tuple[int, Any]] = {}
+    for marker, size, ray in found:
+        counts = ray is not None and (known is None or marker in known)
+        if counts and (marker not in best or size > best[marker][0]):
+            best[marker] = size, ray
+    unit = np.array([best[marker][1] for marker in sorted(best)], dtype=np.float64).reshape(-1, 3)
+    return Detections(tuple(sorted(best)), unit, total - len(best))
 
 
 LONGEST_MODE = 64  # characters

@@ -16,7 +16,7 @@ from coopenv.backends.mcap import container, read_recording, write_recording
 from coopenv.backends.replay import Replay
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
-from tests.helpers.recordings import differences, simulated
+from tests.helpers.recordings import simulated
 
 pytest.importorskip("mcap", reason="needs the extra 'log'")
 
@@ -34,11 +34,6 @@ def refused(path: Path, why: str) -> str:
     message = str(caught.value)
     assert message.startswith(str(path)) and "\n" not in message and len(message) < 700
     return message
-
-
-def test_editing_changes_nothing_by_itself(written: Path, tmp_path: Path) -> None:
-    edit(written, tmp_path / "copy.mcap")
-    assert differences(read_recording(written), read_recording(tmp_path / "copy.mcap")) == []
 
 
 def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
@@ -59,15 +54,11 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     ("key", "value", "why"),
     [
         ("order", [5, 6, 7, 8, 9], r"order: \(5, 6, 7, 8, 9\) is no order of 0 \.\. 4"),
-        ("order", [], "order: "),
-        ("order", [0], "order: "),
         ("order", [0, 0, 0, 0, 0], "order: "),
         ("order", [-1, 0, 1, 2, 3], "order.0: Input should be greater than or equal to 0"),
-        ("order", [10**6] * 5, "order: "),
         ("order", [10**12] * 5, "order.0: "),
         ("order", [1, 0, 2, 3, 4], "vehicles in another order than recorded"),
         ("dt", 0.0, "dt: 0.0 is not in 1e-05 .. 1000"),
-        ("dt", -1.0, "dt: -1.0 is not in"),
         ("dt", 1e308, r"recording.json: dt: Input should be less than or equal to"),
         ("dt", 0.5, r"scenario: ticks of 0.0166667 s, recorded 0.5 s"),
         ("period", 0, "period: 0 is not in 1 .. 100000"),
@@ -79,8 +70,6 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         ("setups", [], "setups: List should have at least 1 item"),
         ("setups.1.targets", [0, 99], "setups.1.targets: not different targets of 0 .. 7 without 4"),
         ("setups.1.targets", [-5], "setups.1.targets.0"),
-        ("setups.1.targets", [0, 0], "setups.1.targets: not different"),
-        ("setups.1.targets", [4], "setups.1.targets: not different"),
         ("setups.1.targets", [10**9], "setups.1.targets: not different"),
         ("setups.1.targets", [0], "vehicle_2 has other neighbours than in its setup"),
         ("setups.1.vehicle", 7, "setups.1.vehicle: 7 instead of 1"),
@@ -100,9 +89,7 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         ("start_rotation.0", np.diag([1.0, 1.0, -1.0]).tolist(), "start_rotation of vehicle_1: not a rotation"),
         ("start_rotation", [], r"start_rotation: expected an array of shape \(5, 3, 3\) .* got float64"),
         ("start_covariance.3", np.zeros((6, 6)).tolist(), "start_covariance of vehicle_4: not a symmetric"),
-        ("start_covariance.3", (-np.eye(6)).tolist(), "start_covariance of vehicle_4"),
         ("start_covariance.3", np.tri(6).tolist(), "start_covariance of vehicle_4"),
-        ("start_covariance.3", np.ones((6, 6)).tolist(), "start_covariance of vehicle_4"),
         ("start_position.3.1", 1e300, "start_position.3.1: Input should be less than or equal to"),
         ("start_position.3.1", "here", "start_position.3.1: Input should be a valid number, got 'here'"),
         ("scenario.vehicles", [], "scenario|vehicles"),
@@ -118,8 +105,8 @@ def test_headers(key: str, value: Any, why: str, written: Path, tmp_path: Path) 
     refused(path, why)
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
-@pytest.mark.parametrize("key", ["dt", "staleness", "setups.0.gains.k", "setups.0.noise.bearing", "start_position.0.0"])
+@pytest.mark.parametrize("number", ["NaN", "1e999"])
+@pytest.mark.parametrize("key", ["dt", "setups.0.gains.k", "start_position.0.0"])
 def test_numbers_that_are_none(number: str, key: str, written: Path, tmp_path: Path) -> None:
     import json
 
@@ -251,11 +238,6 @@ def test_swapped_and_renamed_channels(written: Path, tmp_path: Path) -> None:
     other = {"/vehicle_1/v2x": "/vehicle_1/increment", "/vehicle_1/increment": "/vehicle_1/v2x"}
     edit(written, path, messages=lambda m: [m._replace(topic=other.get(m.topic, m.topic))])
     refused(path, r"holds .*, expected")
-
-
-def test_a_long_format_is_shortened(written: Path, tmp_path: Path) -> None:
-    edit(written, tmp_path / "hostile.mcap", metadata={"format": 600 * "x"})
-    assert len(refused(tmp_path / "hostile.mcap", r"format 'x+\.\.\.x+' is not known")) < 250 + len(str(tmp_path))
 
 
 # Sizes

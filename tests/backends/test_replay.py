@@ -146,15 +146,6 @@ def test_official_tests(data: Path) -> None:
     state_test(parallel_to_aec(env), env)
 
 
-def test_the_file_and_the_recording_are_the_same_environment(tmp_path: Path, data: Path) -> None:
-    pytest.importorskip("mcap", reason="needs the extra 'log'")
-    for recording in (simulated(v2x__loss=0.3), robots(data)):
-        write_recording(recording, tmp_path / "drive.mcap")
-        env = coopenv.parallel_env(tmp_path / "drive.mcap", dtype="float64")
-        assert same(play(env), play(replayed(recording)))
-        assert env.metadata["name"] == "drive_v0"
-
-
 def test_unknown_truth_stays_out_of_rewards_and_state(data: Path) -> None:
     whole = robots(data)
     position, rotation = whole.truth.position.copy(), whole.truth.rotation.copy()

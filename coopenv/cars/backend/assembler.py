@@ -20,7 +20,7 @@ from coopenv.cars.backend.neighbours import NeighbourInbox
 from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
-from coopenv.cars.profile import Role
+from coopenv.cars.profile import VELOCITY, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, CarPose, Detections, RobustReport, Sample, Twist
 from coopenv.cars.transport.base import Arrival
@@ -209,8 +209,6 @@ WINDOW = 2_000_000_000  # ns over which the least delay is looked for
 
 BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 """Messages between cars."""
-
-VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "wheel": (Role.WHEEL,), "odometry": (Role.ODOMETRY,)}
 
 
 def roles_of(sensors: Sensors, local: bool) -> tuple[Role, ...]:

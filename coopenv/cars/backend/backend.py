@@ -13,7 +13,7 @@ import numpy as np
 from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
-from coopenv.cars.backend.assembler import BROADCAST, VELOCITY, Assembler, Intake
+from coopenv.cars.backend.assembler import BROADCAST, Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind, reset_options
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.neighbours import estimate_message, is_finite, report_message
@@ -23,7 +23,7 @@ from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog
 from coopenv.cars.codec import encode, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
-from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
+from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.zenoh import open_transport
 from coopenv.observers.recording import Sensed
@@ -139,7 +139,7 @@ class Svea:
         Raises:
             CoopenvError: an option is not known, or a condition of arming does not hold.
         """
-        self._stop("reset")
+        self.stop("reset")
         given = reset_options(options)
         self._start.prepare(0 if seed is None else seed)
         self.monitor.begin(self._pacer.now())
@@ -254,9 +254,6 @@ class Svea:
 
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""
-        self._stop(reason)
-
-    def _stop(self, reason: str) -> None:
         if self._armed and reason in EXPECTED:
             self.watchdog.disarm()
             self.gates.end()
@@ -268,7 +265,7 @@ class Svea:
         """Stop, and leave the network. Raises OutputError: what comes and goes could not be written to the end."""
         if not self._closed.acquire(blocking=False):
             return
-        self._stop("closed")
+        self.stop("closed")
         self.watchdog.close()
         try:
             if self.recorder is not None:

@@ -5,12 +5,11 @@ from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.backend.tracks import PlaceTrack
-from coopenv.cars.codec import header, make
+from coopenv.cars.codec import header, make, pose
 from coopenv.cars.profile import Role
 from coopenv.cars.samples import CarPose, RobustReport
 from coopenv.estimation.poses import Array, left_covariance, skew
@@ -45,11 +44,11 @@ def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
     P = left_covariance(sent.rotation.T @ sent.position, sent.covariance)
     turn = np.zeros((6, 6))
     turn[:3, 3:] = turn[3:, :3] = sent.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    pose, covariance = _pose(sent.rotation, sent.position + origin), (turn @ P @ turn.T).ravel()
+    placed, covariance = pose(sent.rotation, sent.position + origin), (turn @ P @ turn.T).ravel()
     return make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=header(stamp, "map"),
-        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=placed, covariance=covariance),
     )
 
 
@@ -62,27 +61,18 @@ def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | N
     if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
         return None
     valid = m.position is not None and m.rotation is not None and m.covariance is not None
-    pose, odometry, covariance, depends_on = _pose(np.eye(3), np.zeros(3)), _pose(np.eye(3), np.zeros(3)), np.eye(6), 0
+    placed, odometry, covariance, depends_on = pose(np.eye(3), np.zeros(3)), pose(np.eye(3), np.zeros(3)), np.eye(6), 0
     if m.position is not None and m.rotation is not None and m.covariance is not None:
-        pose, covariance = _pose(m.rotation, m.position + origin), np.asarray(m.covariance, dtype=np.float64)
-        odometry, depends_on = _pose(*from_six(m.extra["odometry"])), int(m.extra["depends_on"][0])
+        placed, covariance = pose(m.rotation, m.position + origin), np.asarray(m.covariance, dtype=np.float64)
+        odometry, depends_on = pose(*from_six(m.extra["odometry"])), int(m.extra["depends_on"][0])
     return make(
         "coopenv_msgs/msg/RobustReport",
         header=header(stamp, "map"),
         valid=valid,
-        pose=pose,
+        pose=placed,
         covariance=covariance.ravel(),
         odometry=odometry,
         depends_on=depends_on,
-    )
-
-
-def _pose(R: Array, p: Array) -> Any:
-    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat().tolist()
-    return make(
-        "geometry_msgs/msg/Pose",
-        position=make("geometry_msgs/msg/Point", x=float(p[0]), y=float(p[1]), z=float(p[2])),
-        orientation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
     )
 
 
@@ -123,9 +113,9 @@ class NeighbourInbox:
         """Return a value in the coordinates of the scenario's file in those of its map."""
         return value if value.position is None else replace(value, position=value.position - self._origin)
 
-    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: CarPose) -> None:
+    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, value: CarPose) -> None:
         """Take a message of a moving landmark; `age` is its age at reception, ns."""
-        position = message_of(self.on_map(pose), self._markers[landmark]).position
+        position = message_of(self.on_map(value), self._markers[landmark]).position
         if age > self._max_age:
             self._refused["stale message"] += 1
         elif position is not None and self._is_new(landmark, role, stamp):

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.cars.backend.assembler import VELOCITY, Intake
+from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.station import Gates, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import decode, encode, make, stamp_of
 from coopenv.cars.deployment import Deployment, Remote
-from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Role
+from coopenv.cars.profile import RESET_TOPIC, SVEA, VELOCITY, CarProfile, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, CarStatus
 from coopenv.cars.transport.base import Arrival, Transport

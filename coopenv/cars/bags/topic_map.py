@@ -1,6 +1,6 @@
 """The map of a bag: the environment of its cars, their topics, and the treatment of its clocks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
-from coopenv.cars.profile import PREFIX, Number, Positive, Role, load_profile
+from coopenv.cars.profile import PREFIX, VELOCITY, Number, Positive, Role, load_profile
 from coopenv.cars.readings import READERS
 
 READ = (
@@ -186,8 +186,6 @@ def load_map(path: str | Path) -> TopicMap:
     return made.model_copy(update={"path": path})
 
 
-VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "odometry": (Role.ODOMETRY,), "wheel": (Role.WHEEL,)}
-"""Where body twists may come from, best first."""
 CAMERA = (Role.DETECTIONS, Role.BEARINGS)
 PLACE = (Role.ESTIMATE, Role.POINT)
 
@@ -225,39 +223,71 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
 
     Args:
         given: the map.
-        topics: type of every topic that there is.
+        topics: type of every topic of the bag.
         where: names the bag in errors.
 
     Raises:
-        DataError: one that is needed is not there, or holds messages that cannot be read in the role of the map.
+        DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
     """
-    chosen = []
-    for car in given.cars:
-        there = _there(given, car, topics, where)
-        roles = _place(car, there, given, topics, where) if car.landmark else _needed(car, there, given, topics, where)
-        chosen += [
-            Chosen(there[role], car.name, role, car.landmark is not None) for role in (*roles, *_of_use(car, there))
-        ]
-    return chosen
+    return [chosen for car in given.cars for chosen in _CarTopics(given, car, topics, where).chosen()]
 
 
-def _there(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> dict[Role, str]:
-    """Return the topics of a car that the bag has, by role; one that the map itself names has to be there."""
-    found = {}
-    for role, names in candidates(given, car).items():
-        for name in names:
-            if name in topics:
-                found[role] = name
-                break
-    for role, name in car.topics.given.items():
-        if name not in topics:
-            hint = "; without this key the environment's calibration counts" if role is Role.CAMERA_INFO else ""
-            raise DataError(f"{given.path.name}: cars.{car.name}.topics.{role}: {_absent(name, topics, where)}{hint}")
-    for role, name in found.items():
-        if topics[name] not in READERS[role]:
-            kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
-            raise DataError(f"{where}: topic {name} of {car.name} holds {kinds}")
-    return found
+class _CarTopics:
+    """The topics of one car in a bag."""
+
+    def __init__(self, given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> None:
+        self._given, self._car, self._topics, self._where = given, car, topics, where
+        self._names = candidates(given, car)
+        self._found = self._present()
+
+    def chosen(self) -> list[Chosen]:
+        """Return those that are read; a moving landmark has a position alone."""
+        car, found = self._car, self._found
+        if car.landmark:  # motion capture is its position where it publishes none
+            roles: tuple[Role, ...] = self._first("position", [(role,) for role in (*PLACE, Role.TRUTH)])
+        else:
+            twists = [VELOCITY[self._given.odometry]] if self._given.odometry != "auto" else [*VELOCITY.values()]
+            cameras = [Role(self._given.camera)] if self._given.camera != "auto" else [*CAMERA]
+            roles = (
+                *self._first("odometry", twists),
+                *self._first("camera", [(role,) for role in cameras]),
+                *(role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in found),
+            )
+        return [Chosen(found[role], car.name, role, car.landmark is not None) for role in roles]
+
+    def _present(self) -> dict[Role, str]:
+        """Return the topics that the bag has, by role; one that the map itself names has to be there."""
+        car, topics = self._car, self._topics
+        listed_names = {
+            role: next((name for name in names if name in topics), "") for role, names in self._names.items()
+        }
+        found = {role: name for role, name in listed_names.items() if name}
+        for role, name in car.topics.given.items():
+            if name not in topics:
+                hint = "; without this key the environment's calibration counts" if role is Role.CAMERA_INFO else ""
+                raise DataError(f"{self._given.path.name}: cars.{car.name}.topics.{role}: {self._absent(name)}{hint}")
+        for role, name in found.items():
+            if topics[name] not in READERS[role]:
+                kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
+                raise DataError(f"{self._where}: topic {name} of {car.name} holds {kinds}")
+        return found
+
+    def _first(self, what: str, choices: Sequence[tuple[Role, ...]]) -> tuple[Role, ...]:
+        """Return the first choice of roles of which the bag has all topics."""
+        for roles in choices:
+            if all(role in self._found for role in roles):
+                return roles
+        missing = dict.fromkeys(role for roles in choices for role in roles if role not in self._found)
+        names = [name for role in missing for name in self._names.get(role, ())]
+        if not names:
+            kinds = listed([role.value for role in missing])
+            where = f"{self._given.path.name}: cars.{self._car.name}.topics"
+            raise DataError(f"{where}: names no topic of its {what} ({kinds})")
+        raise DataError(f"{self._car.name} has no {what}: {self._absent(names[0])}")
+
+    def _absent(self, name: str) -> str:
+        known = listed(sorted(self._topics)) or "none at all"
+        return f"{self._where} has no topic {name}{suggest(name, self._topics)}; it has {known}"
 
 
 def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
@@ -267,51 +297,3 @@ def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
         for role, patterns in patterns_of(given.names, given.path.parent).items()
     }
     return scheme | {role: (name,) for role, name in car.topics.given.items()}
-
-
-def _needed(
-    car: BagCar, there: Mapping[Role, str], given: TopicMap, topics: Mapping[str, str], where: str
-) -> list[Role]:
-    """Return the roles of the odometry and the camera of a vehicle."""
-    ways = [VELOCITY[given.odometry]] if given.odometry != "auto" else list(VELOCITY.values())
-    way = next((way for way in ways if all(role in there for role in way)), None)
-    if way is None:
-        raise _missing(
-            "odometry", car, [role for way in ways for role in way if role not in there], given, topics, where
-        )
-    eyes = [Role(given.camera)] if given.camera != "auto" else list(CAMERA)
-    eye = next((role for role in eyes if role in there), None)
-    if eye is None:
-        raise _missing("camera", car, eyes, given, topics, where)
-    return [*way, eye]
-
-
-def _place(
-    car: BagCar, there: Mapping[Role, str], given: TopicMap, topics: Mapping[str, str], where: str
-) -> list[Role]:
-    """Return the role with the position of a moving landmark; motion capture if there is no other."""
-    for role in (*PLACE, Role.TRUTH):
-        if role in there:
-            return [role]
-    raise _missing("position", car, [*PLACE, Role.TRUTH], given, topics, where)
-
-
-def _of_use(car: BagCar, there: Mapping[Role, str]) -> list[Role]:
-    """Return the roles that are read where they are there."""
-    return [] if car.landmark else [role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in there]
-
-
-def _missing(
-    what: str, car: BagCar, roles: list[Role], given: TopicMap, topics: Mapping[str, str], where: str
-) -> DataError:
-    """Return the error about a car of which the bag has nothing of a kind."""
-    names = [name for role in dict.fromkeys(roles) for name in candidates(given, car).get(role, ())]
-    if not names:
-        kinds = listed([role.value for role in dict.fromkeys(roles)])
-        return DataError(f"{given.path.name}: cars.{car.name}.topics: names no topic of its {what} ({kinds})")
-    return DataError(f"{car.name} has no {what}: {_absent(names[0], topics, where)}")
-
-
-def _absent(name: str, topics: Mapping[str, str], where: str) -> str:
-    known = listed(sorted(topics)) or "none at all"
-    return f"{where} has no topic {name}{suggest(name, topics)}; it has {known}"

@@ -1,13 +1,12 @@
 """Measurements of a fake car as the messages of real ones; stamps in ns."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import encode, header, make
+from coopenv.cars.codec import encode, header, make, pose, quaternion
 from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, CarSensors, Pixy, bearings_of
 from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.profile import CarProfile, Role
@@ -83,7 +82,7 @@ def imu(stamp: int, car: str, turn_rates: Array, variance: float) -> Any:
     return make(
         "sensor_msgs/msg/Imu",
         header=header(stamp, f"{car}/imu"),
-        orientation=_quaternion(np.eye(3)),
+        orientation=quaternion(np.eye(3)),
         orientation_covariance=unknown,
         angular_velocity=_vector(turn_rates),
         angular_velocity_covariance=(variance * np.eye(3)).ravel(),
@@ -92,13 +91,13 @@ def imu(stamp: int, car: str, turn_rates: Array, variance: float) -> Any:
     )
 
 
-def odometry(stamp: int, frames: tuple[str, str], pose: tuple[Array, Array], twist: tuple[Array, Array]) -> Any:
+def odometry(stamp: int, frames: tuple[str, str], placed: tuple[Array, Array], twist: tuple[Array, Array]) -> Any:
     """Return an Odometry: pose (rotation, position) in the first frame, twist (velocity, turn rate) in the second."""
     return make(
         "nav_msgs/msg/Odometry",
         header=header(stamp, frames[0]),
         child_frame_id=frames[1],
-        pose=_pose_with_covariance(*pose),
+        pose=_pose_with_covariance(*placed),
         twist=_twist_with_covariance(*twist, np.zeros((6, 6))),
     )
 
@@ -141,25 +140,7 @@ def _twist_with_covariance(linear: Any, angular: Any, covariance: Array) -> Any:
 
 
 def _pose_with_covariance(rotation: Array, position: Array) -> Any:
-    x, y, z = (float(value) for value in position)
-    place = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    pose = make("geometry_msgs/msg/Pose", position=place, orientation=_quaternion(rotation))
-    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
-
-
-def _quaternion(rotation: Array) -> Any:
-    """Return the quaternion of a rotation by its largest component; in plain numbers, as there are 200 a second."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    rows = (
-        (1.0 + a + e + i, h - f, c - g, d - b),
-        (h - f, 1.0 + a - e - i, b + d, c + g),
-        (c - g, b + d, 1.0 - a + e - i, f + h),
-        (d - b, c + g, f + h, 1.0 - a - e + i),
-    )  # 4 q q^T
-    largest = max(range(4), key=lambda k: rows[k][k])
-    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[largest])), rows[largest][0] or 1.0)
-    w, x, y, z = (scale * v for v in rows[largest])
-    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose(rotation, position), covariance=np.zeros(36))
 
 
 def _vector(values: Any) -> Any:

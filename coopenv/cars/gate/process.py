@@ -14,14 +14,20 @@ from typing import TYPE_CHECKING, Any
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.cars.gate.codec import write_bool
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode
-from coopenv.cars.keys import LONGEST_IDENTITY, Signer, is_identity
+from coopenv.cars.keys import (
+    LONGEST_IDENTITY,
+    Signer,
+    Verifier,
+    check_known,
+    is_identity,
+    load_signer,
+    load_verifier,
+)
 from coopenv.cars.profile import SVEA, USUAL, CarProfile, Limits, Role, presence_of
 from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
 
 if TYPE_CHECKING:
     from coopenv.cars.deployment import Deployment
-    from coopenv.cars.keys import Signer, Verifier
-    from coopenv.cars.transport.base import Transport
 
 CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz
@@ -194,8 +200,6 @@ class GateSettings:
         """Return what signs as the car and what knows the station. Raises CoopenvError: a key is missing or unsafe."""
         if self.keys is None:
             return None, None
-        from coopenv.cars.keys import check_known, load_signer, load_verifier
-
         own = None if self.fleet is None else self.fleet.security.keys
         if self.fleet is not None and own is not None and self.keys == self.fleet.folder / own:
             verifier = load_verifier(self.fleet.keys or self.keys)  # which names the field where there is none

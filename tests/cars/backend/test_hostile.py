@@ -23,7 +23,7 @@ from coopenv.scenario import load_scenario
 
 CARS = [Car(name="svea7", marker=7), Car(name="svea1", marker=6)]
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
-COUNT = 20_000
+COUNT = 10_000
 
 
 def binding(only: str | None = None) -> Binding:

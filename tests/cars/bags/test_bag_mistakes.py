@@ -20,11 +20,9 @@ from coopenv.backends.sources import SourceKind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.log import TopicRow
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.samples import Detections
 from coopenv.cli import main
-from coopenv.cli.run import _print
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
 from tests.helpers.bags import MAP
@@ -185,20 +183,6 @@ def test_a_folder_that_is_no_bag_is_told_so(tmp_path: Path, capsys: pytest.Captu
     for command in ("run", "import"):
         assert main([command, str(tmp_path / "empty"), "--map", str(tmp_path / "topics.toml")]) == 2
         assert "empty: a folder without metadata.yaml, which a bag of ROS 2 has" in capsys.readouterr().err
-
-
-def test_tables_of_topics_are_folded_and_not_cut(capsys: pytest.CaptureFixture[str]) -> None:
-    name = "/fleet/" + "a_car_with_a_long_name/" * 4 + "mavros/wheel_odometry/velocity"
-    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-    for row in (
-        TopicRow(name, kind, 12345, 59.9),
-        TopicRow(name, kind, 12345, 59.9, "a_car", "detections", 12300, 1.2, 3, 0.1),
-    ):
-        _print([row], False)
-        lines = capsys.readouterr().out.splitlines()
-        assert max(map(len, lines)) <= 100
-        assert "".join(line[:20] for line in lines[2:]).replace(" ", "").startswith("─" * 20 + name[:20])
-        assert sum(line.count("a_car_with") for line in lines) >= 2 and "…" not in "".join(lines)
 
 
 def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:

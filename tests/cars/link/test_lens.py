@@ -9,7 +9,6 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from scipy.optimize import root
 
 from coopenv.cars.readings import rays
 from coopenv.cars.samples import Calibration
@@ -38,12 +37,6 @@ def undistort_all(lens: Lens, points: wp.array(dtype=wp.vec2d), found: wp.array(
     found[i] = wp.vec2d(x, y)
 
 
-def by_root(point: np.ndarray, distortion: Any) -> np.ndarray:
-    solved = root(lambda x: distort(x[None], distortion)[0] - point, point, tol=1e-12)
-    assert solved.success
-    return np.asarray(solved.x)
-
-
 coordinates = st.floats(-0.7, 0.7)
 
 
@@ -55,13 +48,6 @@ def test_undistorted_points_are_imaged_where_they_were(points: list[tuple[float,
     found, there = undistort(distort(true, distortion), distortion)
     assert there.all()
     assert_allclose(found, true, atol=1e-8)
-
-
-def test_a_root_finder_finds_the_same() -> None:
-    points = np.random.default_rng(1).uniform(-0.5, 0.5, (30, 2))
-    found, there = undistort(points, PIXY)
-    assert there.all()
-    assert_allclose(found, [by_root(point, PIXY) for point in points], atol=1e-9)
 
 
 def test_the_simulator_undistorts_alike() -> None:
