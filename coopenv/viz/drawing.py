@@ -153,11 +153,14 @@ LEAST = 4.5
 """Of text, as WCAG 2 asks for at level AA."""
 
 
+def linear_light(part: np.ndarray) -> np.ndarray:
+    """Return the linear intensities of sRGB components, both 0 to 1."""
+    return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+
+
 def luminance(colour: Colour) -> float:
     """Return the relative luminance of a colour, 0 (black) to 1 (white)."""
-    part = np.asarray(to_rgb(colour), float)
-    linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
-    return float(linear @ (0.2126, 0.7152, 0.0722))
+    return float(linear_light(np.array(to_rgb(colour))) @ (0.2126, 0.7152, 0.0722))
 
 
 def contrast(colour: Colour, background: Colour = "white") -> float:

@@ -23,6 +23,8 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import error_coordinates, position_covariance
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
+from coopenv.viz.camera_image import Lens, camera_image
+from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
 from coopenv.viz.topview_geometry import (
@@ -82,6 +84,10 @@ def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
     assert before.keys() == after.keys()
     for key in before.keys() - {"highway"}:  # objects of highway-env
         np.testing.assert_array_equal(before[key], after[key], err_msg=key)
+    stage, frame = Stage(env.scenario), Frame.of(env.engine)
+    for i in range(stage.vehicles):
+        image, (width, height) = camera_image(stage, frame, i), Lens(stage, frame, i).size
+        assert image.shape == (height, width, 3) and image.std() > 1.0
 
 
 def test_vehicles_move_over_a_ground_that_stays(start: Any) -> None:
@@ -126,10 +132,17 @@ def test_a_map_alone_has_time_and_error_above_it(start: Any) -> None:
     assert extent.x0 > 0.4 * MAP_WIDTH  # left of it is room for an agent's name
 
 
-def test_the_legend_speaks_of_bodies_since_landmarks_have_them_too() -> None:
-    view = TopView(load_scenario("crossing_path"))
-    shown = {text.get_text() for legend in view._figure.legends for text in legend.get_texts()}
-    assert "hidden by a body" in shown and "hidden by a building" not in shown
+def legend_words(name: str, **overrides: Any) -> set[str]:
+    view = TopView(load_scenario(name, overrides))
+    return {text.get_text() for legend in view._figure.legends for text in legend.get_texts()}
+
+
+def test_the_legend_lists_what_occurs() -> None:
+    words = legend_words("crossing_path")  # whose landmarks have bodies
+    assert "hidden by a body" in words and "hidden by a building" not in words
+    for name, gain in (("riccati", True), ("robust", False)):
+        words = legend_words("busy_intersection", **{"observer.name": name})
+        assert ("no 3σ: P is a gain matrix" in words) == gain
 
 
 def test_lines_of_sight_say_who_sees_whom_and_what_is_hidden() -> None:
@@ -439,13 +452,6 @@ def test_the_title_of_a_map_alone_ends_where_the_error_begins() -> None:
     engine.reset([0])
     view.draw(engine)
     assert view._figure.texts[0].get_window_extent().x1 < view._time.get_window_extent().x0
-
-
-def test_the_legend_says_why_there_is_no_sigma() -> None:
-    for name, gain in (("riccati", True), ("robust", False)):
-        view = TopView(load_scenario("busy_intersection", {"observer.name": name}))
-        words = [text.get_text() for part in view._figure.legends for text in part.get_texts()]
-        assert ("no 3σ: P is a gain matrix" in words) == gain
 
 
 def test_names_of_goals_do_not_cover_those_of_landmarks() -> None:

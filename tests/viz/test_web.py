@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source, Stage
-from coopenv.viz.web.actors import placed, quaternions
+from coopenv.viz.web.actors import placed
 from coopenv.viz.web.ground import GAIN, linear, spacing_of
 from coopenv.viz.web.page import has_viser, viser_module, write_replay
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, levels, useful_magnification
@@ -91,16 +90,6 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
     assert not has_viser()
     with pytest.raises(CoopenvError, match=r"pip install '\.\[view\]'"):
         viser_module()
-
-
-def test_quaternions_are_those_of_scipy() -> None:
-    half, diagonal = np.pi * np.eye(3), np.pi * np.array([[0.6, 0.8, 0.0], [0.0, -0.6, 0.8]])
-    random = Rotation.random(500, random_state=1)
-    turns = Rotation.concatenate([random, Rotation.from_rotvec(half), Rotation.from_rotvec(diagonal)])
-    found, expected = quaternions(turns.as_matrix()), turns.as_quat(canonical=True, scalar_first=True)
-    same = np.abs(np.sum(found * expected, axis=-1))
-    np.testing.assert_allclose(same, 1.0, atol=1e-12)
-    assert (found[:, 0] >= 0.0).all()
 
 
 def test_what_is_not_there_has_no_size() -> None:

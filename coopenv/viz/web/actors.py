@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import DARK_BLUE
@@ -54,28 +55,12 @@ def placed(rotation: np.ndarray | None, position: np.ndarray, scale: np.ndarray,
         turned = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(position), 1))
     else:
         good &= np.isfinite(rotation).all(axis=(1, 2))
-        turned = fine(quaternions(np.where(good[:, None, None], rotation, np.eye(3))), turn)
+        whole = Rotation.from_matrix(np.where(good[:, None, None], rotation, np.eye(3)))
+        turned = fine(whole.as_quat(canonical=True, scalar_first=True), turn)
     there = good[:, None]
     return Placed(
         turned, np.where(there, position, 0.0).astype(np.float32), np.where(there, scale, 0.0).astype(np.float32)
     )
-
-
-def quaternions(R: np.ndarray) -> np.ndarray:
-    """Return the quaternions (N, 4), w first and not negative, of rotations (N, 3, 3)."""
-    m = np.asarray(R, float)
-    x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    rows = np.empty((len(m), 4, 4))  # each is the quaternion times four times one of its entries
-    rows[:, 0, 0], rows[:, 1, 1] = 1.0 + x + y + z, 1.0 + x - y - z
-    rows[:, 2, 2], rows[:, 3, 3] = 1.0 - x + y - z, 1.0 - x - y + z
-    for entry, (i, j) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):
-        rows[:, 0, entry] = rows[:, entry, 0] = m[:, i, j] - m[:, j, i]
-        first, second = 1 + min(i, j), 1 + max(i, j)
-        rows[:, first, second] = rows[:, second, first] = m[:, i, j] + m[:, j, i]
-    squares = np.einsum("nii->ni", rows)
-    best = rows[np.arange(len(m)), np.argmax(squares, axis=-1)]  # the largest entry is the safest
-    unit = best / np.sqrt(np.einsum("ni,ni->n", best, best))[:, None]
-    return np.asarray(np.where(unit[:, :1] < 0.0, -unit, unit))
 
 
 def fine(values: np.ndarray, step: float) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
+from coopenv.viz.drawing import linear_light
 from coopenv.viz.scene import Source, Stage
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, vehicle_colour
 from coopenv.viz.topview_geometry import road_corners
@@ -49,9 +50,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 def linear(colours: np.ndarray) -> np.ndarray:
     """Return colours (..., 3) as viser wants those of many things at once: linear in light, uint8."""
-    share = np.asarray(colours, float) / 255.0
-    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.asarray(np.round(255.0 * light), np.uint8)
+    return np.asarray(np.round(255.0 * linear_light(np.asarray(colours, float) / 255.0)), np.uint8)
 
 
 def vehicle_colours(count: int) -> np.ndarray:
