@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import code, links, mirror, not_found, notebooks, pages, paths, pictures, tables, titles  # noqa: E402
+from sitegen import links, markup, mirror, notebooks, pages, tables  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -75,8 +75,8 @@ def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
         found = files.get_file_from_path(mirror.page_of(path))
         return None if found is None or found is page.file else get_relative_url(found.url, page.url)
 
-    html = paths.linked(pictures.linked(html), address)
-    return titles.breakable(code.marked(tables.marked(html)))
+    html = markup.with_linked_paths(markup.with_linked_pictures(html), address)
+    return markup.with_breakable_titles(markup.with_wrapped_code(tables.marked(html)))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
@@ -87,7 +87,7 @@ def on_post_page(output: str, page: Any, config: Any) -> str:
 def on_post_template(output_content: str, template_name: str, config: Any) -> str:
     """Do the same for 404.html, which also opens from disk."""
     text = output_content.replace(SHIM, "/javascripts/iframe-worker.js")
-    return not_found.relative(text) if template_name == "404.html" else text
+    return markup.with_own_addresses(text) if template_name == "404.html" else text
 
 
 def on_post_build(config: Any) -> None:

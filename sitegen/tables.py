@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from sitegen.text import Tag, changed, names
+from sitegen.markup import Tag, changed, names
 
 CELL = re.compile(r"<(t[dh])\b([^>]*)>(.*?)</\1>", re.DOTALL)
 EMPTY_HEAD = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>\s*</thead>\s*")

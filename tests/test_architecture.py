@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (150, 2),
-    "api": (4300, 23),
+    "api": (4280, 23),
     "backends": (3320, 17),
     "base": (1390, 11),
     "bench": (4725, 20),
@@ -99,7 +99,7 @@ LINES_AND_FILES = {
     "runs": (3600, 15),
     "scenario": (2955, 14),
     "training": (1275, 7),
-    "viz": (4925, 21),
+    "viz": (4915, 21),
     "world": (4250, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -12,9 +12,10 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from coopenv.api.engine import Engine
+from coopenv.api.reward import Step
 from coopenv.backends.base import Broadcasting
 from coopenv.base.errors import ActionError, CoopenvError, shown, suggest
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import LEVELS, PARAMETERS
 from coopenv.viz.scene.stage import Frame
@@ -345,53 +346,33 @@ class InfoWriter:
     def __init__(self, engine: Engine, scenario: Scenario) -> None:
         self._engine = engine
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
-        self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
+        self._targets, self._step = scenario.target_names, Step(engine.view, scenario)
         self._outcomes = outcome_words(scenario)
         self._backend = engine.backend if isinstance(engine.backend, Broadcasting) else None
         lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
         self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
-        self._tick_length = 1.0 / scenario.rates.camera
 
     def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:
         """Return one info per agent, always with the same keys."""
-        view = self._engine.view
-        L = self._landmarks
-        R, position = view("rotation")[0, L:].copy(), view("position")[0, L:].copy()
-        v, w = view("velocity")[0, L:].copy(), view("angular_velocity")[0, L:].copy()
-        sensor_errors = {name: view(name)[0].copy() for name in self._lasting}
-        R_hat, p_hat = view("estimate_rotation")[0].copy(), view("estimate_position")[0]
-        position_hat = np.matmul(R_hat, p_hat[..., None])[..., 0]
-        covariance = view("covariance")[0].copy()
-        position_error, orientation_error = view("position_error")[0].tolist(), view("orientation_error")[0].tolist()
-        nees, log_determinant = view("nees")[0].tolist(), view("log_determinant")[0].tolist()
-        position_std = view("position_std")[0].tolist()
-        smallest = view("gramian_min_eigenvalue")[0].tolist()
+        view, step = self._engine.view, self._step
+        truth = {name: values[0].copy() for name, values in step["truth"].items()}
+        truth |= {name: view(name)[0].copy() for name in self._lasting}
+        estimate = {name: values[0].copy() for name, values in step["estimate"].items()}
+        numbers = {name: view(name)[0].tolist() for name in _NUMBERS}
         ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
-        seen: list[list[str]] = [[] for _ in R]
-        vehicle_seen, target_seen = np.nonzero(view("sight")[0] == Sight.VISIBLE)
-        for i, target in zip(vehicle_seen.tolist(), target_seen.tolist(), strict=True):
+        seen: list[list[str]] = [[] for _ in ended]
+        for i, target in zip(*(each.tolist() for each in np.nonzero(step["visible"][0])), strict=True):
             seen[i].append(self._targets[target])
         late, missing = self._engine.world.late.tolist(), self._engine.world.missing.tolist()
-        time = int(view("tick")[0]) * self._tick_length
+        time = float(step["time"][0, 0])
         infos = {}
         for agent in agents:
             i = self._index[agent]
             infos[agent] = {
-                "truth": {
-                    "position": position[i],
-                    "rotation": R[i],
-                    "velocity": v[i],
-                    "angular_velocity": w[i],
-                    **{name: values[i] for name, values in sensor_errors.items()},
-                },
-                "estimate": {"position": position_hat[i], "rotation": R_hat[i], "covariance": covariance[i]},
-                "position_error": position_error[i],
-                "orientation_error": orientation_error[i],
+                "truth": {name: values[i] for name, values in truth.items()},
+                "estimate": {name: values[i] for name, values in estimate.items()},
                 "visible": tuple(seen[i]),
-                "nees": nees[i],
-                "log_determinant": log_determinant[i],
-                "position_std": position_std[i],
-                "gramian_min_eigenvalue": smallest[i],
+                **{name: values[i] for name, values in numbers.items()},
                 "reward_terms": dict(zip(self._engine.reward_terms, terms[i], strict=True)),
                 "time": time,
                 "outcome": self._outcomes[ended[i]],
@@ -402,6 +383,7 @@ class InfoWriter:
         return infos
 
 
+_NUMBERS = ("position_error", "orientation_error", "nees", "log_determinant", "position_std", "gramian_min_eigenvalue")
 PER_AGENT = 12
 """position (3), first two columns of R (6), linear velocity (3), all of truth"""
 PER_VEHICLE = 9
