@@ -48,7 +48,7 @@ def congruent(A: Array, P: Array) -> Array:
 
 @compiled(MATRIX, MATRIX)
 def eliminated(A: Array, B: Array) -> Array:
-    """Return A^-1 B (n, k), by Gaussian elimination with pivots; a LinAlgError says that A (n, n) is singular."""
+    """Return A^-1 B (n, k), by Gaussian elimination with pivots; a LinAlgError means that A (n, n) is singular."""
     A, X, n = A.copy(), B.copy(), len(A)
     for k in range(n):
         pivot = k + np.argmax(np.abs(A[k:, k]))

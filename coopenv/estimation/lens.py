@@ -39,7 +39,7 @@ def undistort(points: Array, distortion: tuple[float, ...]) -> tuple[Array, NDAr
     reach = largest_radius(distortion)
     found = _newton(points, points, distortion)
     there = _images(found, points, distortion, reach)
-    if not there.all():  # far out Newton's method may leave the lens: begin where the radial part alone says
+    if not there.all():  # far out Newton's method may diverge: start from the solution of the radial part
         again = _newton(_radially(points, distortion, reach), points, distortion)
         found = np.where(there[:, None], found, again)
         there = _images(found, points, distortion, reach)

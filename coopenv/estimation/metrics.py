@@ -51,7 +51,7 @@ CONVERGED = SettlingTolerance("converged", 0.1, 1.0)
 _NOT_CONVERGED = "did not converge, no rate to fit"
 _FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
 _FIT_SAMPLES_MIN = 3
-_FLICKER = 31  # ticks of a running median, which tells an error that is above half from one that flickers above it
+_FLICKER = 31  # ticks of a running median, which ignores single errors above half
 
 
 class RateFit(NamedTuple):

@@ -80,7 +80,7 @@ class Observability:
     The default threshold of 1e-4 on `local_eigenvalue` mu: with bearing noise sigma (rad) and n camera ticks
     in the window, least squares leaves a standard deviation of L sigma / sqrt(n mu) in the worst direction, L
     being the rms range of the targets. At mu = 1e-4 that is 100 / sqrt(n) times the lateral error L sigma of
-    one bearing, or 0.6 m at 60 Hz, 3 mrad and 15 m: below it the window tells less than odometry would keep.
+    one bearing, or 0.6 m at 60 Hz, 3 mrad and 15 m: below it the window has less information than odometry keeps.
     Exact degeneracies (two targets, all targets on one line, the vehicle resting on their danger cylinder)
     give rounding, 1e-12 or less; three well-spread targets give 1e-3 to 0.5.
     """

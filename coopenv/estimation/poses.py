@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def solve(A: Array, b: Array) -> Array:
-    """Return A^-1 b; a LinAlgError says that A is singular."""
+    """Return A^-1 b; a LinAlgError means that A is singular."""
     _, _, x, failed = dgesv(A, b)
     if failed:
         raise np.linalg.LinAlgError("singular matrix")
@@ -25,7 +25,7 @@ def solve(A: Array, b: Array) -> Array:
 
 
 def cholesky(A: Array) -> Array:
-    """Return the lower triangular L of A = L L^T; a LinAlgError says that A is not positive definite."""
+    """Return the lower triangular L of A = L L^T; a LinAlgError means that A is not positive definite."""
     factor, failed = dpotrf(A, lower=True)
     if failed:
         raise np.linalg.LinAlgError("not positive definite")
@@ -187,7 +187,7 @@ def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -
     """Return the geodesic angle between rotations (..., 3, 3) in degrees, in [0, 180].
 
     2 atan2(|lambda|, scalar part) keeps its accuracy at both ends, where acos of the trace has none: 1e-12
-    deg is told from zero, and a half turn is 180 deg exactly.
+    deg differs from zero, and a half turn is 180 deg exactly.
     """
     q = quaternion_wxyz(error_rotation(rotation, rotation_estimate))
     return np.asarray(np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0])))

@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao lower bound of a scenario: no observer of the same measurements does better on average.
+"""The posterior Cramer-Rao lower bound of a scenario: the least mean error of any observer of the same measurements.
 
 Source: Tichavsky, Muravchik and Nehorai, Posterior Cramer-Rao bounds for discrete-time nonlinear filtering, IEEE
 Transactions on Signal Processing 46(5), 1998, on the stacked left errors of all vehicles (R = Rhat Exp(theta),
@@ -10,14 +10,13 @@ Noise that is not Gaussian, as the paper's on the image plane, counts with its c
 is linear in the measurements. Without noise of bearings there is none, and every entry is NaN.
 
 The edges are those that were realised, so the bound is conditional on them: average it over seeds. It is first order in
-the orientation, meaningful below about 10 deg, and does not count what "not seen" tells. It bounds the problem in which
-everybody has all data, whatever was delivered.
+the orientation, meaningful below about 10 deg, and does not count the information in missed targets. It bounds the
+problem in which all vehicles have all data, whatever was delivered.
 
-Errors of odometry, cameras and clocks that last, and that observers are told of, are states of it, too: see
-`bound_errors`.
+Lasting errors of odometry, cameras and clocks that are declared in the setups are states of it, too.
 
-Counted are the odometry's scale, the gyro's bias, how the camera is mounted, and the clocks. Slips count as if there
-were none, the focal length as if it were known: with them the bound would be higher.
+Counted are the odometry's scale, the gyro's bias, how the camera is mounted, and the clocks. Slips and errors of the
+focal length are left out: with them the bound would be higher.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -54,7 +53,7 @@ class ErrorStates:
 
         Args:
             turned: (..., 3, 3) body at the start to body at the end.
-            step: (..., 3) way, body at the start, m.
+            step: (..., 3) displacement, body at the start, m.
             dt: s.
         """
         made = np.zeros((*step.shape[:-1], 6, self.count))
@@ -87,7 +86,7 @@ class ErrorStates:
 
 
 def error_states(recording: Recording) -> ErrorStates:
-    """Return the errors that the vehicles of a record have been told of."""
+    """Return the declared errors of the vehicles of a record."""
     noises = [setup.noise for setup in recording.setups]
     variance, walk = (np.array([_stacked(noise, walks) for noise in noises]) ** 2 for walks in (False, True))
     ends = np.cumsum([0, *SIZES.values()]).tolist()
@@ -153,8 +152,8 @@ def cramer_rao(recording: Recording, joint: bool = True) -> Bound:
 def cramer_rao_ancestors(recording: Recording) -> Bound:
     """Return, for each vehicle, the joint bound over it and its ancestors: all whose messages can reach it.
 
-    It counts what these vehicles measure and nothing else. A decentralised observer whose messages follow the graph
-    knows no more, whereas the bound over all vehicles also counts what followers could tell their leaders.
+    It counts the measurements of these vehicles alone. A decentralised observer with messages along the graph has no
+    further information, whereas the bound over all vehicles also counts measurements of followers for their leaders.
     """
     N = len(recording.setups)
     blocks = np.empty((recording.ticks, N, 6, 6))
@@ -185,7 +184,7 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
     errors = error_states(recording)
     w = 6 + errors.count
     part = (w * np.asarray(groups)[..., None] + np.arange(w)).reshape(len(groups), -1)
-    who, used = np.asarray(groups), sorted({i for group in groups for i in group})
+    members, used = np.asarray(groups), sorted({i for group in groups for i in group})
     start, Q = _starts(recording, errors), _growths(recording, errors)
     P = np.array([block_diag(*(start[i] for i in group)) for group in groups])
     own = np.arange(part.shape[1]).reshape(-1, w)
@@ -199,16 +198,16 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
         M[~recording.due[ticks.start : ticks.stop]] = 0.0
         for first in range(0, len(ticks), at_once):
             last = min(first + at_once, len(ticks))
-            moved, noise, told = _together(E[first:last], M[first:last], Q) if at_once > 1 else (E[first], Q, M[first])
+            moved, noise, info = _together(E[first:last], M[first:last], Q) if at_once > 1 else (E[first], Q, M[first])
             after = 0.5 * (1.0 - 1.0 / (last - first))  # of the noise, so that the error is of second order
-            P = _moved(P, moved[who])
-            P[:, rows, columns] += (1.0 - after) * noise[who]
-            told = told[part[:, :, None], part[:, None, :]]
-            if told.any():
+            P = _moved(P, moved[members])
+            P[:, rows, columns] += (1.0 - after) * noise[members]
+            info = info[part[:, :, None], part[:, None, :]]
+            if info.any():
                 # (P^-1 + M)^-1 without the inverse of P, which may be ill-conditioned: P (I + M P)^-1
-                P = np.linalg.solve(identity + P @ told, P)
+                P = np.linalg.solve(identity + P @ info, P)
                 P = (P + np.swapaxes(P, -1, -2)) / 2
-            P[:, rows, columns] += after * noise[who]
+            P[:, rows, columns] += after * noise[members]
             k, parts = ticks.start + first, np.linspace(0.0, 1.0, last - first + 1)[1:, None, None, None, None]
             poses = P[:, rows, columns][..., :6, :6]
             blocks[k : ticks.start + last] = blocks[k - 1] + parts * (poses - blocks[k - 1])
@@ -234,13 +233,13 @@ def _together(E: Array, M: Array, Q: Array) -> tuple[Array, Array, Array]:
     count a parallax that the noise hides.
     """
     on = np.broadcast_to(np.eye(Q.shape[-1]), Q.shape)  # from a tick to the last one
-    noise, told, middle = np.zeros_like(Q), M[0], len(E) // 2
+    noise, info, middle = np.zeros_like(Q), M[0], len(E) // 2
     for k in reversed(range(len(E))):
         if k == middle:
-            told = len(E) * _moved(M[k][None], np.swapaxes(np.linalg.inv(on), -1, -2)[None])[0]
+            info = len(E) * _moved(M[k][None], np.swapaxes(np.linalg.inv(on), -1, -2)[None])[0]
         noise += on @ Q @ np.swapaxes(on, -1, -2)
         on = on @ E[k]
-    return on, noise, told
+    return on, noise, info
 
 
 def _stretches(recording: Recording, multiple: int, width: int) -> Iterator[range]:
@@ -300,7 +299,7 @@ def information(
 ) -> Array:
     """Return sum of H^T N^-1 H (k, wN, wN) over the visible edges at each tick, linearised at the truth.
 
-    `joint`: a neighbour's pose is unknown, too; `observers`: whose measurements count, None: everybody's; `ticks`: at
+    `joint`: a neighbour's pose is unknown, too; `observers`: the vehicles that measure, None: all; `ticks`: at
     which ones, None: at all; `errors`: what is unknown beside the poses, for which w = 6.
     """
     ticks = range(recording.ticks) if ticks is None else ticks
@@ -330,7 +329,7 @@ def information(
             known, moved = j < 0 or not joint, np.zeros((K, 3, 0))
             if errors is not None:
                 Hi = np.concatenate([Hi, errors.in_bearings(u, across)], axis=-1)
-            if errors is not None and not known:  # a sender tells where it was at a time of its own clock
+            if errors is not None and not known:  # a report is dated by the sender's clock
                 there = recording.truth.position[:, j] + recording.truth.rotation[:, j] @ marker
                 v = motion_of_points(there, recording.dt, np.array(ticks))
                 moved = errors.of_clock((across @ Rt @ v[..., None])[..., 0])

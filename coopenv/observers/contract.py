@@ -1,4 +1,4 @@
-"""What a researcher's observer reads and writes: one class in NumPy for one vehicle.
+"""The interface of an observer: one class in NumPy for one vehicle, its inputs and outputs.
 
 Frames: positions in the map frame, rotations from body to map, bearings as unit vectors from the camera to the target
 in the BODY frame (the paper's g_ij is the negative).
@@ -92,7 +92,7 @@ class Gains:
 
 @dataclass(frozen=True)
 class Setup:
-    """What one vehicle knows before it starts. Targets are landmarks first, then vehicles."""
+    """The initial data of one vehicle. Targets are landmarks first, then vehicles."""
 
     vehicle: int  # its index, 0 is the first
     name: str  # of the vehicle
@@ -110,9 +110,9 @@ class Setup:
 
 @dataclass(frozen=True)
 class Message:
-    """What a vehicle broadcasts; an observer fills what it wants to send, and `size_bytes` counts that.
+    """A broadcast; an observer sets the fields that it sends, and `size_bytes` counts them.
 
-    `position` is where the others' cameras see the sender (its marker) and `covariance` is the 3x3 covariance of that
+    `position` is that of the sender's marker, which cameras measure, and `covariance` is the 3x3 covariance of that
     point, both in the map frame. `extra` holds anything else, as arrays.
     """
 
@@ -148,7 +148,7 @@ class Received:
 
 @dataclass(frozen=True)
 class Tick:
-    """Everything that one vehicle senses and hears at one camera frame."""
+    """The measurements and received messages of one vehicle at one camera frame."""
 
     index: int  # number of the camera frame, 0 at the start
     time: float  # s since the start
@@ -167,7 +167,7 @@ class Tick:
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
-        """Return (target, bearing, position, message) of every target measured whose position is known or heard.
+        """Return (target, bearing, position, message) of every measured target with a known or received position.
 
         The message is None for a landmark.
         """
@@ -177,14 +177,14 @@ class Tick:
             target = targets[n]
             if target < landmarks:
                 result.append((target, self.bearings[n], self.landmarks[target], None))
-            elif (heard := self.messages.get(target)) is not None and heard.message.position is not None:
-                result.append((target, self.bearings[n], heard.message.position, heard.message))
+            elif (received := self.messages.get(target)) is not None and received.message.position is not None:
+                result.append((target, self.bearings[n], received.message.position, received.message))
         return result
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Where an observer believes its vehicle to be."""
+    """The estimated pose of a vehicle with its covariance."""
 
     rotation: Array  # (3, 3) body to map
     position: Array
@@ -193,7 +193,7 @@ class Estimate:
     """(6, 6) over the error in `coordinates`, rad and m; None: the observer states none."""
     coordinates: Coordinates = Coordinates.LEFT  # of the error that the covariance is about
     nis: float | None = None
-    """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not told."""
+    """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not stated."""
     nis_dof: int = 0  # its degrees of freedom: two per bearing used
 
 
@@ -213,7 +213,7 @@ class Observer(Protocol):
 
 @runtime_checkable
 class JointObserver(Protocol):
-    """An estimator of all vehicles at once that has everybody's measurements: a reference, not deployable.
+    """An estimator of all vehicles at once with all measurements: a reference, not deployable.
 
     Its class has `joint = True`, and it is built as `factory(setups)`, one setup per vehicle.
     """

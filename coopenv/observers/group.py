@@ -185,7 +185,7 @@ class ObserverGroup:
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
         """Return a deep copy of what `get_state` of such a group returned, before or after the start of an episode.
 
-        A CoopenvError says that it is of another group. The observers in it are not checked: they can run any code.
+        A CoopenvError means that it is of another group. The observers in it are not checked: they can run any code.
         """
         try:
             copied = copy.deepcopy(state)

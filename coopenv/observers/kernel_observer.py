@@ -136,7 +136,7 @@ class KernelObserver:
         self._run("start_one")
 
     def update(self, tick: Tick) -> Estimate:
-        """Take one camera tick; a CoopenvError says that the kernels cannot count its time."""
+        """Take one camera tick; a CoopenvError means that the kernels cannot count its time."""
         if self._origin is None:
             self._set_clock(tick.time - tick.dt, tick.dt)
         now = self.units(tick.time - (self._origin or 0.0))

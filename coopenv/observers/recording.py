@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ObserverInit:
-    """What observers are told before the first tick, and how their messages travel."""
+    """The setups of all observers, and the properties of the radio."""
 
     setups: tuple[Setup, ...]
     order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
@@ -80,18 +80,18 @@ class Sensed:
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
-    missing: NDArray[np.bool_] | None = None  # (N,) of whom nothing came; None: of nobody
-    late: NDArray[np.bool_] | None = None  # (N,) whose row came after its deadline; None: nobody's
+    missing: NDArray[np.bool_] | None = None  # (N,) vehicles without data; None: none
+    late: NDArray[np.bool_] | None = None  # (N,) vehicles with data after the deadline; None: none
     truth: Truth | None = None  # of this tick; None: not known
     inbox_tick: NDArray[np.int64] | None = None
     """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
-    its radio delivered; None: the scenario's radio decides. What they say is up to the senders' observers, which keep
-    it for `v2x.delay` ticks (at least one)."""
+    its radio delivered; None: the scenario's radio decides. The contents are those of the senders' observers, which
+    keep it for `v2x.delay` ticks (at least one)."""
     messages: Mapping[tuple[int, int], Received] = field(default_factory=dict)
     """(receiver, sender) to a message that arrived since the last tick from a vehicle that is estimated elsewhere."""
 
     def tick(self, setup: Setup, messages: Mapping[int, Received]) -> Tick:
-        """Return what one vehicle senses, with the messages that it has; nobody can write to it."""
+        """Return the read-only tick of one vehicle with its messages."""
         i = setup.vehicle
         return Tick(
             index=self.index,
@@ -113,14 +113,14 @@ class Sensed:
 
 
 def sealed(view: NDArray[Any]) -> NDArray[Any]:
-    """Return a view that nobody can write to."""
+    """Return a read-only view."""
     view.setflags(write=False)
     return view
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the draws of a simulated episode follow from: who was there, routes and goals, and later routes."""
+    """The keys of the draws of a simulated episode: presence, routes and goals."""
 
     key: int  # of the world's random streams, see `coopenv.base.seeds`
     episode: int
@@ -141,7 +141,7 @@ class Recording:
     bearings: Array  # (K, N, T, 3) camera -> target, body frame, NaN where not measured
     visible: NDArray[np.bool_]  # (K, N, T)
     landmarks: Array  # (K, L, 3) map, m
-    inbox_tick: NDArray[np.int64]  # (K, N receiver, N sender) tick of sending of the last message heard; -1: none
+    inbox_tick: NDArray[np.int64]  # (K, N receiver, N sender) tick of sending of the last received message; -1: none
     period: int  # ticks between messages
     staleness: float  # s
     due: NDArray[np.bool_]  # (K,) whether the scenario's observer rate asks for a correction
@@ -173,7 +173,7 @@ class Recording:
 
     @property
     def observer_init(self) -> ObserverInit:
-        """What observers are told before the first tick."""
+        """The setups of all observers, and the properties of the radio."""
         return ObserverInit(
             self.setups, self.order, self.dt, self.period, self.staleness, self.flight, self.start_covariance
         )

@@ -43,7 +43,7 @@ ZOO = {
     "dead_reckoning": ZooEntry(
         "single_frame:DeadReckoning", "Adds up odometry and sends nothing", "riccati.kernels:DEAD_RECKONING"
     ),
-    # on a plane bearings to three points say more than a pose needs
+    # on a plane, bearings to three points overdetermine the pose
     "p3p": ZooEntry(
         "single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False
     ),
@@ -163,7 +163,7 @@ def _row(observer: Any) -> RegisteredObserver:
 def named(observer: str | Factory) -> str:
     """Return the name of an observer; a class or an import path is registered by the name of the class.
 
-    If another observer has that name, the name of the file or module precedes it: `mine.Riccati`. A CoopenvError says
+    If another observer has that name, the name of the file or module precedes it: `mine.Riccati`. A CoopenvError means
     that the import path has no observer, that it has no name, or that both names are taken.
     """
     if isinstance(observer, str) and not is_reference(observer):

@@ -33,7 +33,7 @@ def from_six(values: Array) -> tuple[Array, Array]:
 
 
 def read(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message into the inbox; a CoopenvError or LookupError says that it is malformed."""
+    """Put a message into the inbox; a CoopenvError or LookupError means that it is malformed."""
     report = observer.memory.inbox[sender]
     report["tick"], report["valid"] = sent, 0
     if message.position is None and not message.extra:  # the sender is searching for its pose
@@ -78,7 +78,7 @@ def write_broadcast(observer: Any) -> Message:
 
 
 def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message into the inbox; a CoopenvError or LookupError says that it is malformed."""
+    """Put a message into the inbox; a CoopenvError or LookupError means that it is malformed."""
     m = observer.memory
     read(observer, sender, message, sent)
     m.inbox[sender]["news"] = 0
