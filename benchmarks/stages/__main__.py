@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.machine import machine
+from benchmarks.stages.ablated_stages import Setting, ablated_settings, stepper
 from benchmarks.stages.against import HERE, Case, Side, compile_seconds
-from benchmarks.stages.peeled import Setting, peeling, stepper
 from benchmarks.stages.rounds import alternate, ratio
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
@@ -98,13 +98,13 @@ def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) 
 
 def stage_table(asked: argparse.Namespace, overrides: dict[str, Any], log: Console) -> Table:
     """Return what the tick of an environment costs with stages switched off, each on top of those before it."""
-    peeled = list(peeling())
-    names = ["report and observation", *(name for name, _ in peeled)]
+    ablated = list(ablated_settings())
+    names = ["report and observation", *(name for name, _ in ablated)]
     with Progress(log, "building", total=len(names) + 1) as progress:
         engine = Engine(load(asked.environment, overrides), asked.worlds, asked.dtype, "cpu", 1)
         engine.reset(range(asked.worlds))
         steps = [stepper(engine.world, WARM_UP, lambda ticks: engine.step(ticks=ticks))]
-        for name, setting in zip(names, (Setting(), *(setting for _, setting in peeled)), strict=True):
+        for name, setting in zip(names, (Setting(), *(setting for _, setting in ablated)), strict=True):
             progress.advance(f"building without {name}")
             world = setting.world(asked.environment, overrides, asked.worlds, asked.dtype)
             steps.append(stepper(world, WARM_UP))

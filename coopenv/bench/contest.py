@@ -1,4 +1,4 @@
-"""Drivers on the same held-out worlds: who takes part, and what came of it."""
+"""Drivers on the same held-out worlds, and their results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +12,7 @@ from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.scenario import Scenario
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
-"""Others are compared with the first; the second is the first one where everybody sees everything."""
+"""Reference of all comparisons, and the name of the same driver under ideal sensing."""
 IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
 
 
@@ -29,7 +29,7 @@ class Entrant:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came of a contest, by the names of the drivers."""
+    """Results of a contest, by the names of the drivers."""
 
     environment: str
     block: int
@@ -37,12 +37,12 @@ class Evaluation:
     episodes: Mapping[str, Episodes]
     results: Mapping[str, Sequence[Result]]
     reference: str
-    """Whom the differences are to."""
+    """Driver that the differences are to."""
     differences: Mapping[str, Sequence[Difference]]
 
     @property
     def worlds(self) -> int:
-        """How many worlds everybody drove in."""
+        """Number of worlds of every driver."""
         return next(iter(self.episodes.values())).worlds
 
     def rows(self) -> list[dict[str, Any]]:

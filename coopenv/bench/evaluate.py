@@ -1,4 +1,4 @@
-"""`coopenv evaluate`: from what the user asked for to tables and files."""
+"""`coopenv evaluate`: from the options to tables and files."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ JSON_FILE = "evaluation.json"
 FIGURES = ("error_along_the_way", "time_against_error", "looking")
 FILMS = ("video.mp4", "video.gif")
 WIDTH = 100
-"""Characters that the tables are wide where no terminal says otherwise."""
+"""Width of the tables without a terminal, characters."""
 
 
 class Request(NamedTuple):

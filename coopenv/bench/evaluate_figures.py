@@ -107,7 +107,7 @@ def pareto_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
 def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
     """Draw how often each driver's camera looked in which direction, 0 being straight ahead along its way.
 
-    Radii are logarithms of the shares: most of the time everybody looks ahead, which would hide the rest.
+    Radii are logarithms of the shares: most views are straight ahead, which would hide the rest.
     """
     columns = min(style.fitting(width or style.PAGE, _PANEL * 0.8, 4), len(evaluation.episodes))
     rows = -(-len(evaluation.episodes) // columns)

@@ -117,7 +117,7 @@ class Ray:
         Raises:
             CoopenvError: Ray is not installed, or the cluster does not answer in time.
         """
-        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is told in one line, here
+        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is one line, printed here
         try:
             import ray
         except ImportError:

@@ -33,11 +33,11 @@ def finished_groups(study: Study, folder: Path) -> dict[Group, list[Run]]:
     return {group: runs for group, runs in done.items() if runs}
 
 
-def is_told(group: Group, runs: Sequence[Run], folder: Path) -> bool:
+def is_reported(group: Group, runs: Sequence[Run], folder: Path) -> bool:
     """Return whether a group has a card that tells of just these finished runs."""
     seeds = agents_cards.read(folder / group.name).get("study", {}).get("seeds", {})
-    told = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
-    return told == {run.seed: _trained(folder / run.folder)["sha256"] for run in runs}
+    found = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
+    return found == {run.seed: _trained(folder / run.folder)["sha256"] for run in runs}
 
 
 def write_cards(study: Study, group: Group, finished: Sequence[Run], folder: Path, judge: Judge) -> None:
@@ -89,11 +89,11 @@ def write_cards(study: Study, group: Group, finished: Sequence[Run], folder: Pat
 
 
 def _trained(place: Path) -> dict[str, Any]:
-    """Return what an agent's folder says of its training."""
+    """Return the training of an agent, from its folder."""
     document = tomllib.loads((place / AGENT_FILE).read_text(encoding="utf-8"))
     training = document["training"]
-    told = {key: training[key] for key in ("steps", "cpu_minutes", "command")}
-    return {"sha256": document["network"]["sha256"], **told}
+    found = {key: training[key] for key in ("steps", "cpu_minutes", "command")}
+    return {"sha256": document["network"]["sha256"], **found}
 
 
 def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:
@@ -159,14 +159,16 @@ def _section(environment: str, found: dict[Group, dict[str, Any]], folder: Path,
         lines.append(_row(f"[`{group.name}`]({group.name}/card.md)", results, errors))
     lines += ["", LEGEND.format(worlds=newest["environments"][environment]["worlds"]), ""]
     for group, card in found.items():
-        told = [f"{name} {percent(changes['e95_m'])}" for name, changes in card["study"]["against"].items()]
-        lines.append(f"- `{group.name}`: e95 against {', '.join(told)}.")
+        others = [f"{name} {percent(changes['e95_m'])}" for name, changes in card["study"]["against"].items()]
+        lines.append(f"- `{group.name}`: e95 against {', '.join(others)}.")
     base = next((group for group in found if group.arm == BASE_ARM), None)
     for group in found:
         if base is not None and group != base:
             best, bases = (folder / g.name / f"seed_{found[g]['study']['best']}" for g in (group, base))
             differences = judge.against(environment, best, bases)
-            change = f"{_told(differences)}; median seed against median seed: {_medians(found[group], found[base])}"
+            change = (
+                f"{_changes_of(differences)}; median seed against median seed: {_medians(found[group], found[base])}"
+            )
             lines.append(f"- `{group.name}` against `{base.name}`: {change}.")
     return "\n".join([*lines, ""])
 
@@ -178,24 +180,24 @@ def _row(name: str, figures: dict[str, Any], errors: str) -> str:
 
 def _medians(card: dict[str, Any], base: dict[str, Any]) -> str:
     """Return how the medians over seeds differ, which no lucky seed moves."""
-    told = []
+    found = []
     for word, metric in (("e50", "e50_m"), ("e95", "e95_m")):
         own, other = (
             median(entry["results"][metric]["mean"] for entry in each["study"]["seeds"].values())
             for each in (card, base)
         )
-        told.append(f"{word} {100 * (own / other - 1):+.0f} %")
-    return ", ".join(told)
+        found.append(f"{word} {100 * (own / other - 1):+.0f} %")
+    return ", ".join(found)
 
 
-def _told(differences: Sequence[Difference]) -> str:
+def _changes_of(differences: Sequence[Difference]) -> str:
     words = {"e50_m": "e50", "e95_m": "e95", "travel_time_s": "travel time"}
     found = {d.metric: d for d in differences}
     return ", ".join(f"{word} {percent(relative(found[metric]))}" for metric, word in words.items())
 
 
 WIDTH = 100
-"""Characters that the table is wide where no terminal says otherwise."""
+"""Width of the table without a terminal, characters."""
 
 
 def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: int, log: Console) -> None:
@@ -222,7 +224,7 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
 
     def judge_finished() -> None:
         finished = finished_groups(study, folder)
-        stale = {group: runs for group, runs in finished.items() if not is_told(group, runs, folder)}
+        stale = {group: runs for group, runs in finished.items() if not is_reported(group, runs, folder)}
         for group, runs in stale.items():
             write_cards(study, group, runs, folder, judge)
         if stale or not (folder / PAGE_FILE).exists():

@@ -11,7 +11,7 @@ from coopenv.api.engine import Engine
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
 from coopenv.base.seeds import world_keys
-from coopenv.bench.cards import dial_text, measure_dial, read_dial
+from coopenv.bench.cards import measure_value_of_sensing, read_value_of_sensing, value_of_sensing_text
 from coopenv.policies import Policy
 from coopenv.runs.live import write_film
 from coopenv.runs.page import index_text, page_text
@@ -24,7 +24,7 @@ FPS, WIDTH = 6.0, 448
 """Of a film: pictures a second, and their width in pixels."""
 _LASTS = 8.0  # s, at most
 _SEED = 0
-_IDLE = "zero"  # the driver where nobody knows the way
+_IDLE = "zero"  # the driver of a scene without a route
 
 
 def film_words(name: str, scenario: Scenario) -> str:
@@ -82,9 +82,9 @@ def prepare(folder: Path, names: list[str]) -> None:
 
 def environment_page(name: str, scenario: Scenario, folder: Path) -> str:
     """Return the page of an environment, with the figures and the film that stand in the folder, if any do."""
-    dial = read_dial(folder / f"{name}.json")
+    value = read_value_of_sensing(folder / f"{name}.json")
     film = film_words(name, scenario) if (folder / f"{name}.webp").is_file() else ""
-    return page_text(name, scenario, "" if dial is None else dial_text(name, scenario, dial), film)
+    return page_text(name, scenario, "" if value is None else value_of_sensing_text(name, scenario, value), film)
 
 
 def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[float], None] | None = None) -> None:
@@ -99,7 +99,7 @@ def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[f
     Raises:
         CoopenvError: the figures that stand in the folder cannot be read.
     """
-    read_dial(folder / f"{name}.json")  # before anything is drawn
+    read_value_of_sensing(folder / f"{name}.json")  # before anything is drawn
     if on_film is not None:
         write_page_film(name, scenario, folder, on_film)
     text = environment_page(name, scenario, folder)
@@ -118,9 +118,9 @@ def write_figures(
     on_progress: Callable[[float, str], None],
 ) -> dict[str, Any]:
     """Measure what sensing is worth in an environment, and write it for the page."""
-    dial = measure_dial(environment, scenario, worlds, on_progress)
-    replace_text(folder / f"{name}.json", json_text(dial))
-    return dial
+    value = measure_value_of_sensing(environment, scenario, worlds, on_progress)
+    replace_text(folder / f"{name}.json", json_text(value))
+    return value
 
 
 def write_index(scenarios: dict[str, Scenario], folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The same scenario over many seeds: who settles, and how accurate the steady state is, with its spread."""
+"""The same scenario over many seeds: settling, and the accuracy of the steady state with its spread."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

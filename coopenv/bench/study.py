@@ -89,8 +89,8 @@ class Study:
         known = (*environments, *arms, *seeds)
         for word in words:
             if word not in known:
-                told = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
-                raise CoopenvError(f"--only: the study has no '{word}'{told}")
+                known_names = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
+                raise CoopenvError(f"--only: the study has no '{word}'{known_names}")
         chosen = [{*words} & {*names} or {*names} for names in (environments, arms, seeds)]
         kept = {g: s for g, s in self.settings.items() if g.environment in chosen[0] and g.arm in chosen[1]}
         return Study(kept, tuple(seed for text, seed in seeds.items() if text in chosen[2]))
@@ -135,7 +135,7 @@ def tasks(study: Study, folder: Path, logs: Path) -> list[Task]:
 
 
 def is_finished(study: Study, run: Run, folder: Path) -> bool:
-    """Return whether a run's agent is there, trained as the study and its environment's file say now."""
+    """Return whether a run's agent is there, trained as in the present study and environment."""
     from coopenv.training.export import scenario_digest  # needs the extra `train`
 
     place, plan = folder / run.folder, study.plan(run)
@@ -153,7 +153,7 @@ def is_finished(study: Study, run: Run, folder: Path) -> bool:
 def perform(task: Task) -> None:
     """Train on one core, going on from a checkpoint where there is one of the same training.
 
-    An agent that is there has been trained otherwise than the study says, and is replaced.
+    An agent that is there has been trained with other settings, and is replaced.
 
     Raises:
         CoopenvError: what `train` raises.

@@ -56,8 +56,8 @@ app.add_typer(svea, name="svea")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    It is 0, or 2 after a mistake in the input or a result that cannot be written, 141 where nobody reads the output any
-    more, 130 after Ctrl-C and 143 after SIGTERM.
+    It is 0, 2 after a mistake in the input or a result that cannot be written, 130 after Ctrl-C, 141 if the output is
+    closed, and 143 after SIGTERM.
     """
     try:
         status = app(args=arguments, standalone_mode=False)
@@ -78,8 +78,8 @@ def failure_status(error: BaseException) -> int:
     """
     if interrupts.received() or isinstance(error, KeyboardInterrupt | typer.Abort):
         return INTERRUPTED
-    told = error.__context__ if isinstance(error, SystemExit) else error  # typer and rich exit by themselves
-    if isinstance(told, BrokenPipeError):
+    cause = error.__context__ if isinstance(error, SystemExit) else error  # typer and rich exit by themselves
+    if isinstance(cause, BrokenPipeError):
         drop_output()
         return PIPE_CLOSED
     if isinstance(error, UsageError):
@@ -98,7 +98,7 @@ def failure_status(error: BaseException) -> int:
 
 
 def drop_output() -> None:
-    """Let nobody try again to write what could not be written."""
+    """Drop output that could not be written, so that it is not written again at exit."""
     with suppress(OSError, ValueError, AttributeError), open(os.devnull, "wb") as nothing:  # noqa: PTH123
         os.dup2(nothing.fileno(), sys.stdout.fileno())
 

@@ -25,7 +25,7 @@ def bench_seeds(
     steady_from: options.SteadyFrom = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Run many seeds at once: who settles, and the steady errors."""
+    """Run many seeds at once: settling, and the steady errors."""
     scenario = options.load(environment, options.parse_overrides(overrides))
     from coopenv.bench.seeds import seed_table, study_seeds
     from coopenv.estimation.metrics import SETTLED, steady_start

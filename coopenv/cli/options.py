@@ -196,7 +196,7 @@ Variant = Annotated[
     str | None, typer.Option("--variant", help="Variant of a data set: landmarks, landmarks+robots or blind.")
 ]
 TopicMap = Annotated[
-    Path | None, typer.Option("--map", help="TOML file that says what the topics of a ROS bag are (docs/bags.md).")
+    Path | None, typer.Option("--map", help="TOML file with the map of a ROS bag's topics (docs/bags.md).")
 ]
 Connect = Annotated[
     str | None,
@@ -217,8 +217,8 @@ OffBoard = Annotated[
 Station = Annotated[
     str | None,
     typer.Option(
-        help="Whose commands count [default: the deployment's security.identity, or station]; that is the car itself "
-        "where it is driven by `coopenv svea run --car`.",
+        help="Station whose commands the car obeys [default: the deployment's security.identity, or station]; the car "
+        "itself where `coopenv svea run --car` drives it.",
         show_default=False,
     ),
 ]
@@ -335,7 +335,7 @@ def print_json(result: Any) -> None:
 
 
 def show(path: Path) -> None:
-    """Open a result with the program that the system has for it, or say that there is none."""
+    """Open a result with the system's program for it, or print that there is none."""
     if not has_display():
         print(f"note: there is no display to show {path} on", file=sys.stderr)
     elif typer.launch(str(path)) != 0:
@@ -343,7 +343,7 @@ def show(path: Path) -> None:
 
 
 def show_page(address: Path | str) -> None:
-    """Open a page in the user's browser, or say that there is none; where there is no display nothing happens."""
+    """Open a page in the user's browser, or print that there is none; without a display nothing happens."""
     import webbrowser
 
     url = address if isinstance(address, str) else address.resolve().as_uri()

@@ -88,7 +88,7 @@ def scene(
     ],
     out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
 ) -> None:
-    """Write a scene that is made to measure as a scenario file, to be kept or changed.
+    """Write a parametric scene as a scenario file, to be kept or changed.
 
     Scenes stand wherever an environment does: coopenv bench observers lane:20. `coopenv list scenes` lists them.
     """
@@ -128,7 +128,9 @@ def page(
     out: Annotated[Path, typer.Option(help="Folder for ENV.md, ENV.png and ENV.webp.")] = Path("out", "pages"),
     measure: Annotated[
         bool,
-        typer.Option("--measure", help="Measure what sensing is worth, for ENV.json; else what is there is shown."),
+        typer.Option(
+            "--measure", help="Measure the value of sensing, for ENV.json; else the file that is there is shown."
+        ),
     ] = False,
     film: Annotated[
         bool,
@@ -136,10 +138,10 @@ def page(
     ] = True,
     worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
 ) -> None:
-    """Write the pages of environments: what they are, a picture, a film, what sensing is worth."""
+    """Write the pages of environments: description, picture, film, value of sensing."""
     from coopenv.base.installation import list_envs
     from coopenv.bench import pages
-    from coopenv.bench.cards import entrants, has_dial
+    from coopenv.bench.cards import entrants, has_value_of_sensing
     from coopenv.runs.console import Progress
 
     if bool(environments) == everything:
@@ -149,7 +151,7 @@ def page(
     if len(stems) < len(names):
         raise CoopenvError("two environments have the same name")
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
-    measured = [name for name in stems if measure and (has_dial(name) or not everything)]
+    measured = [name for name in stems if measure and (has_value_of_sensing(name) or not everything)]
     for name in measured:
         entrants(stems[name])
     pages.prepare(out, list(stems))
@@ -159,10 +161,10 @@ def page(
             progress.update(number, name)
             if name in measured:
 
-                def told(done: float, who: str, number: int = number, name: str = name) -> None:
-                    progress.update(number + done, f"{name}, {who}")
+                def report(done: float, driver: str, number: int = number, name: str = name) -> None:
+                    progress.update(number + done, f"{name}, {driver}")
 
-                pages.write_figures(stems[name], name, scenario, out, worlds, told)
+                pages.write_figures(stems[name], name, scenario, out, worlds, report)
             pages.write_page(name, scenario, out, partial(_filming, progress, number, name) if film else None)
     if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
         pages.write_index(shipped, out)
@@ -170,5 +172,5 @@ def page(
 
 
 def _filming(progress: "Progress", number: int, name: str, share: float) -> None:
-    """Say how far the film of an environment is."""
+    """Show the progress of an environment's film."""
     progress.update(number + share, f"{name}, film")

@@ -86,7 +86,7 @@ def fake(
     ] = True,
     station: options.Station = None,
 ) -> None:
-    """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
+    """Let a fake car drive, see and send until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.fake.faults import fake_fault
@@ -185,7 +185,7 @@ def health(
     off_board: options.OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="s to wait for it.")] = 2.0,
 ) -> None:
-    """Wait for the next word of a car's gate and print it; the exit status is 2 where none comes.
+    """Wait for the next status of a car's gate and print it; the exit status is 2 where none comes.
 
     On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
     """
@@ -200,7 +200,7 @@ def health(
     finally:
         transport.close()
     if status is None:
-        raise CoopenvError(f"{car}: its gate has said nothing for {patience:g} s on {topic}")
+        raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
     refused = sum(int(count) for count in status.counts)
     print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
 
@@ -237,12 +237,11 @@ def keys(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the keys (default: the deployment's security.keys, or keys).")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Make new keys even of those who have some.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing keys.")] = False,
 ) -> None:
-    """Make keys: NAME.pem of each car and of the station, which nobody else may have, and public.toml for all.
+    """Make keys: NAME.pem of each car and of the station, a secret of its owner, and public.toml for all.
 
-    Give each car its own NAME.pem and public.toml, by a channel that you trust, and delete it here. Who has keys
-    already keeps them.
+    Give each car its own NAME.pem and public.toml, by a trusted channel, and delete it here. Existing keys are kept.
     """
     from coopenv.cars.keys import PUBLIC, make_keys
 
@@ -260,7 +259,7 @@ def keys(
         print(f"{folder / f'{name}.pem'}: new, for {name} alone")
     for name in kept:
         print(f"{name}: has a key already, which is kept")
-    print(f"{folder / PUBLIC}: for everybody")
+    print(f"{folder / PUBLIC}: for all")
 
 
 @svea.command()
@@ -270,7 +269,7 @@ def router(
         typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
     ] = None,
 ) -> None:
-    """Run a Zenoh router until it is interrupted; it says so when it can be reached."""
+    """Run a Zenoh router until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.transport.zenoh import open_zenoh
 

@@ -159,9 +159,7 @@ class EvaluateOptions:
     ] = 256
     seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0
     overrides: options.Overrides = None
-    ideal: Annotated[
-        bool, typer.Option("--ideal", help="Also let route_follower drive where everybody sees everything.")
-    ] = False
+    ideal: Annotated[bool, typer.Option("--ideal", help="Also let route_follower drive under ideal sensing.")] = False
     out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None
     figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
     width: options.FigureWidth = None
@@ -234,7 +232,7 @@ class DatasetOptions:
         str,
         typer.Option(
             "--policy",
-            help="Who drives: random, the name of an agent, its folder, or mine.py:Mine.",
+            help="Driver: random, the name of an agent, its folder, or mine.py:Mine.",
             **options.POLICY,
         ),
     ] = "route_follower"

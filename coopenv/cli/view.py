@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Agent = Annotated[
     str | None,
     typer.Option(
-        help="Who drives: zero, random, the name of an agent, its folder, or mine.py:Mine (default: route_follower, "
+        help="Driver: zero, random, the name of an agent, its folder, or mine.py:Mine (default: route_follower, "
         "where it can drive).",
         **options.POLICY,
     ),
@@ -254,7 +254,7 @@ def _announce(url: str, given: ViewOptions, log: "Console") -> None:
     options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
     if given.host not in ("127.0.0.1", "localhost", "::1"):
         log.print(
-            "warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted",
+            "warning: anyone with this address can watch and control the view; it is sent unencrypted",
             soft_wrap=True,
         )
     if not given.no_browser:
@@ -290,7 +290,7 @@ def watch(
     found, log = find_agent(agent), options.console(stderr=True)
     name = environment or next(iter(found.environments), None)
     if name is None:
-        raise CoopenvError(f"{agent} does not say for which environment it was made; name one with --env")
+        raise CoopenvError(f"{agent} names no environment that it was made for; name one with --env")
     scenario = options.load(name, options.parse_overrides(overrides))
     from coopenv.runs import live
 

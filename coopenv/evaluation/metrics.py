@@ -27,10 +27,10 @@ class Statistic(Protocol):
 
     @property
     def worlds(self) -> int:
-        """How many worlds have something to say."""
+        """Number of worlds with a value."""
 
     def resampled(self, counts: np.ndarray) -> np.ndarray:
-        """Return the figure, (R,), for worlds that count so often, (R, W); NaN where none says anything."""
+        """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def score(episodes: Episodes, seed: int = 0) -> list[Result]:
     for name, metric in METRICS.items():
         statistic = metric.of(episodes)
         low, high = interval(statistic.resampled(counts)) if statistic.worlds > 1 else (np.nan, np.nan)
-        if metric.is_share and low == high:  # nothing to resample: all worlds say the same
+        if metric.is_share and low == high:  # nothing to resample: all worlds agree
             low, high = _certain(statistic.value, statistic.worlds)
         results.append(Result(name, statistic.value, low, high, statistic.worlds))
     return results

@@ -57,7 +57,7 @@ def execute(
     """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
     A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `width` is a column
-    of `coopenv.viz.figures`; None: a page's. `describe` says what is shown beside the bar meanwhile.
+    of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar.
 
     Raises:
         NoTruthError: no true poses are known.
@@ -106,15 +106,15 @@ def execute(
 
 
 def figure_words(metrics: Mapping[str, Any], width: str | None) -> dict[str, Any]:
-    """Return what `save_figures` is told of a run: its names, and where they are written.
+    """Return the arguments of `save_figures` that describe a run.
 
     Figures for a column of a journal have them in the metadata alone.
     """
     about = {name: metrics[name] for name in ("environment", "observer", "seed", "policy", "overrides")}
     note = f"{about['environment']}, {about['observer']}, seed {about['seed']}"
-    told = {"coopenv": metrics["versions"]["coopenv"], **about}
+    words = {"coopenv": metrics["versions"]["coopenv"], **about}
     gain = not states_covariance(about["observer"])
-    return {"about": told, "gain": gain, "width": width, "note": note if width is None else ""}
+    return {"about": words, "gain": gain, "width": width, "note": note if width is None else ""}
 
 
 def _simulate(
@@ -141,7 +141,7 @@ def _simulate(
 
 
 def _doing(run: Rollout) -> str:
-    """Return what a run does to its ticks: the backend says where they come from."""
+    """Return the activity of a run by its backend: simulating, replaying or driving."""
     abilities = run.engine.backend.capabilities
     return "replaying" if abilities.recorded else "driving" if abilities.real_time else "simulating"
 

@@ -23,9 +23,9 @@ from coopenv.world.launch import start_warp
 T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
-ENOUGH = 1.0  # s of work from which on its pace can be told
+ENOUGH = 1.0  # s of work from which on its pace can be estimated
 HINT_FROM = 20.0  # s of work left as soon as its pace is known, from which on there is a line at once
-COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; less need not be told
+COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; shorter compilations are not announced
 
 
 class Progress:
@@ -41,7 +41,7 @@ class Progress:
         """Describe the work.
 
         Args:
-            log: where it is told.
+            log: console of the line.
             description: what is done.
             total: the value of `completed` at the end; None where it is not known.
             rate: how much is completed in a second where that is known, as in real time (None: as it turns out).

@@ -203,8 +203,8 @@ def _check_room(place: Path, episodes: Sequence[DrivenEpisode]) -> None:
     needed = 2 * arrays + PER_EPISODE * len(episodes)
     free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
     if free < needed:
-        told = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
-        raise OutputError(f"cannot write to {place.parent}: the dataset may need {told}")
+        sizes = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
+        raise OutputError(f"cannot write to {place.parent}: the dataset may need {sizes}")
 
 
 def _buffers(episodes: Sequence[DrivenEpisode]) -> Iterator[Any]:
@@ -225,7 +225,7 @@ def _buffers(episodes: Sequence[DrivenEpisode]) -> Iterator[Any]:
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari write its datasets to a folder meanwhile, and say nothing of authors."""
+    """Let Minari write its datasets to a folder meanwhile, without its notes on authors."""
     with environment({"MINARI_DATASETS_PATH": str(folder)}), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield

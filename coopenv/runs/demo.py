@@ -43,7 +43,7 @@ def links_line(backend: Svea) -> str:
 
 
 def kept_drive(path: Path | None, backend: Svea) -> str:
-    """Return what is told of a drive's record when the drive is interrupted; empty where there is nothing to replay."""
+    """Return a line on the record of an interrupted drive; empty if there is nothing to replay."""
     if path is None or backend.recorder is None or not backend.recorder.begun:
         return ""
     return f"kept: {path}, the drive up to here: coopenv run {path}"
@@ -249,7 +249,7 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> bool:
 
 
 def _drive_or_keep(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> bool:
-    """Drive; return whether nobody has interrupted it.
+    """Drive; return whether it ended without an interrupt.
 
     Of one that was interrupted what has been driven takes its place, unless an earlier drive stands there.
     """

@@ -36,7 +36,7 @@ class Keys:
         """Listen to a canvas of matplotlib."""
         self.held: set[str] = set()
         self.struck: set[str] = set()
-        """Keys that were pressed since somebody cleared this."""
+        """Keys pressed since the set was cleared."""
         canvas.mpl_connect("key_press_event", self._press)
         canvas.mpl_connect("key_release_event", self._release)
 
@@ -57,7 +57,7 @@ class Keyboard:
     """A policy of one world that drives a vehicle by keys and leaves the others to another policy."""
 
     def __init__(self, scenario: Scenario, vehicle: int, others: Policy, keys: Keys) -> None:
-        """Choose who is driven by whom; `vehicle` is an index."""
+        """Choose the driver of each vehicle; `vehicle` is an index."""
         self.keys, self._vehicle, self._others = keys, vehicle, others
         self._longitudinal = action_fields(scenario, scenario.limits[vehicle])[0]
         self._period = 1.0 / scenario.rates.decision
@@ -124,7 +124,7 @@ class Stage:
     def run(
         self, policy: Policy, seed: int, show: Callable[[np.ndarray], None], clock: Clock, going: Callable[[], bool]
     ) -> None:
-        """Play an episode, and show it while `going` says so."""
+        """Play an episode, and show it while `going` returns True."""
         stride = frame_stride(self.scenario)
         clock.start()
         for tick in play(self.engine, [seed], self.scenario.horizon_ticks, policy, to_the_end=False):
@@ -235,7 +235,7 @@ def vehicle_index(scenario: Scenario, name: str | None) -> int:
 
 
 def others_of(scenario: Scenario, environment: str, name: str | None, seed: int) -> Policy:
-    """Return the policy of the vehicles that nobody drives by hand: the one named, the baseline, or standing still."""
+    """Return the policy of the vehicles without a human driver: the named one, the baseline, or standing still."""
     if name is None:
         name = "route_follower" if "route_follower" in agents_for(environment) else "zero"
     return load_policy(name, scenario, seed)

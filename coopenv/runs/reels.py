@@ -79,7 +79,7 @@ class EngineReel(Reel):
             open_backend: returns the backend.
             name: of what is shown.
             seed: of the episode.
-            driver: says who drives.
+            driver: chooses the policy.
 
         Raises:
             CoopenvError: something of it cannot be.

@@ -119,7 +119,7 @@ class Rollout:
     ) -> None:
         """Build the world; arguments as for `rollout`, but for those of its ticks.
 
-        `backend` is where they come from (None: simulated), and `options` what it is told at the reset.
+        `backend` is where they come from (None: simulated), and `options` those of its reset.
         """
         if steps is not None and steps < 1:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
@@ -240,7 +240,7 @@ RATES = (
 )
 """Keys of the rates that theory tells."""
 
-CARRIED_FOR = 1.0  # s at least, that an estimate is known for, before odometry is said to carry it
+CARRIED_FOR = 1.0  # s at least, that an estimate is known for, before it counts as carried by odometry
 
 
 def vehicle_metrics(

@@ -273,7 +273,7 @@ def _of_errors(s: Scenario) -> Iterator[str]:
 
 
 def _spans(what: str, parts: Sequence[Any], of: Callable[[Any], float], unit: str, kind: str = "") -> Iterator[str]:
-    """Yield one line that says how large a spread is, from the least to the largest of those that are not 0."""
+    """Yield one line on a spread, from the least to the largest value other than 0."""
     values = sorted({float(of(part)) for part in parts} - {0.0})
     if values:
         low, high = number(values[0]), number(values[-1])
@@ -301,9 +301,9 @@ class Listing(NamedTuple):
 
 
 def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Listing]:
-    """Yield the tables of who and what is there; those without rows are left out, as are their empty columns.
+    """Yield the tables of vehicles, routes, landmarks and buildings, without empty tables and empty columns.
 
-    `grouped` says whether landmarks that a group draws have rows of their own.
+    `grouped`: whether landmarks that a group draws have rows of their own.
     """
     marks = landmarks(scenario, grouped)
     tables = (vehicles(scenario), routes(scenario), marks, groups(scenario), motions(scenario), buildings(scenario))

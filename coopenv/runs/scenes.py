@@ -86,7 +86,7 @@ def scene_of(
 
 
 class Onlooker:
-    """Keeps the scene of an episode that somebody else plays: `on_tick` is to be called at every tick."""
+    """Keeps the scene of an episode that another loop plays; `on_tick` is called at every tick."""
 
     def __init__(self, name: str, seed: int, policy: str) -> None:
         """Say what it is of."""
@@ -126,7 +126,7 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
 
 
 def driver_of(name: str | None, scenario: Scenario, environment: str, seed: int) -> tuple[Policy | None, str]:
-    """Return who drives, and its name: what is asked for, else the baseline where it can drive, else nobody.
+    """Return the driver and its name: the given one, else the baseline if it can drive, else none.
 
     Raises:
         CoopenvError: there is no such agent, or it cannot drive here.

@@ -43,7 +43,7 @@ def summary(name: str, scenario: Scenario, recorded: bool = False) -> Iterator[R
 
 
 def facts(scenario: Scenario) -> dict[str, str]:
-    """Return what is to be said about vehicles, sensors, radio, rates, observer, observation, action, reward, end."""
+    """Return a line each on vehicles, sensors, radio, rates, observer, observation, action, reward and end."""
     layout, rates, noise, observer = observation_layout(scenario), scenario.rates, scenario.noise, scenario.observer
     groups = Counter[str]()
     for field in layout.values():
@@ -117,7 +117,7 @@ def _camera(scenario: Scenario) -> str:
 
 
 def _lasting(noise: Noise) -> str:
-    """Return what is to be said about errors of the odometry that last."""
+    """Return the lasting errors of the odometry in words."""
     parts = [f"scale error {number(100 * noise.odometry_scale)} %"] if noise.odometry_scale else []
     bias = np.degrees(np.max(noise.gyro_bias))
     parts += [f"gyro bias {number(bias)} deg/s"] if bias else []
@@ -181,10 +181,12 @@ DRIVEN_SECTIONS = ("dynamics", "action")
 """Sections that matter only where actions drive a vehicle."""
 
 DRAWN_SECTIONS = ("randomisation", "difficulty")
-"""Sections that are shown only where they say something."""
+"""Sections that are shown only if they differ from the default."""
 
 VALUE_WIDTH = 17
-WHOLE_COLUMNS = {"vehicle", "who", "time", "field", "slice", "shape", "unit", "scale"}
+KEY_WIDTH, WHOLE_WIDTH = 31, 24
+"""Characters at most, of a key and of a cell that is not broken into lines."""
+WHOLE_COLUMNS = {"vehicle", "who", "time", "slice", "shape", "unit", "scale"}
 """Columns that are not broken into lines."""
 
 
@@ -217,8 +219,11 @@ def shown_sections(scenario: Scenario) -> list[str]:
 def listing_table(listing: Listing) -> Table:
     """Return a listing as a table."""
     table = _table(*listing.columns, title=listing.title)
-    for name, column in zip(listing.columns, table.columns, strict=True):
-        column.no_wrap = name in WHOLE_COLUMNS
+    for i, (name, column) in enumerate(zip(listing.columns, table.columns, strict=True)):
+        if name in WHOLE_COLUMNS:
+            column.min_width = min(
+                WHOLE_WIDTH, max(len(line) for row in listing.rows for line in row[i].splitlines() or [""])
+            )
     for row in listing.rows:
         table.add_row(*row)
     return table
@@ -228,7 +233,7 @@ def section_table(name: str, part: BaseModel, key_width: int) -> Table:
     """Return one row per setting of a section: key, value, meaning with its unit."""
     doc = " ".join((type(part).__doc__ or "").split())
     table = _table(f"[{name}]", "value", "meaning", title=doc)
-    table.columns[0].width, table.columns[1].width = key_width, VALUE_WIDTH
+    table.columns[0].width, table.columns[1].width = min(key_width, KEY_WIDTH), VALUE_WIDTH
     for key, value, meaning, differs in settings(part):
         table.add_row(f"{key} *" if differs else key, value, meaning, style="bold" if differs else None)
     return table
@@ -236,7 +241,10 @@ def section_table(name: str, part: BaseModel, key_width: int) -> Table:
 
 def _table(*columns: str, title: str | None = None) -> Table:
     look: dict[str, Any] = {"title_justify": "left", "title_style": "italic"}
-    return Table(*columns, title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, **look)
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, **look)
+    for name in columns:
+        table.add_column(name, overflow="fold")
+    return table
 
 
 COLUMNS = {
@@ -250,7 +258,7 @@ COLUMNS = {
 
 
 def environment_rows() -> list[dict[str, Any]]:
-    """Return what `list envs` says of every environment that ships with coopenv."""
+    """Return the rows of `list envs`."""
     from coopenv.scenario import load_scenario
 
     rows = []
@@ -271,12 +279,12 @@ def environment_rows() -> list[dict[str, Any]]:
 
 
 def observer_rows() -> list[dict[str, Any]]:
-    """Return what `list observers` says of every observer."""
+    """Return the rows of `list observers`."""
     return [{"name": name, "about": description(name)} for name in observer_names()]
 
 
 def agent_rows() -> list[dict[str, Any]]:
-    """Return what `list agents` says of every agent."""
+    """Return the rows of `list agents`."""
     return [
         {
             "name": agent.name,

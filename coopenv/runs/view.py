@@ -68,7 +68,7 @@ class Viewer:
         self._panel.pick(vehicle)
 
     def run(self, going: Callable[[], bool] = lambda: True) -> None:
-        """Show frames until `going` says no."""
+        """Show frames until `going` returns False."""
         self._due = monotonic()
         while going():
             changed = self._obey()
@@ -129,7 +129,7 @@ class Viewer:
         self.shown += 1
 
     def _fade(self, now: float) -> None:
-        """Let buildings be seen through that hide the picked vehicle, or any, from somebody who looks."""
+        """Make buildings transparent that hide the picked vehicle, or any, from the viewer."""
         if now - self._faded_at < _FADE_EVERY or not self._stage.buildings:
             return
         self._faded_at = now
@@ -145,7 +145,7 @@ class Viewer:
         self._picture.ground.fade(hidden)
 
     def _welcome(self, client: Any) -> None:
-        """Let somebody with a narrow window begin farther away."""
+        """Start farther away in a narrow window."""
         waiting = client.camera.aspect < _NARROW
 
         def once(camera: Any) -> None:
@@ -158,7 +158,7 @@ class Viewer:
         client.camera.on_update(once)
 
     def _obey(self) -> bool:
-        """Do what the user has wished; return whether there was anything. An error is told in the panel."""
+        """Carry out the user's requests; return whether there were any. An error is shown in the panel."""
         any_wish = False
         while not self._panel.wishes.empty():
             name, value = self._panel.wishes.get()
@@ -265,7 +265,7 @@ def serving(host: str, port: int | None) -> AbstractContextManager[tuple[Any, st
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return a port that nobody listens on; arguments and errors as for `serving`."""
+    """Return a free port; arguments and errors as for `serving`."""
     for candidate in (port,) if port is not None else range(PORT, PORT + PORTS):
         reason = _obstacle(host, candidate)
         if not reason:
@@ -276,7 +276,7 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def _obstacle(host: str, port: int) -> str:
-    """Return why nobody can listen on a port; empty: one can. Raises CoopenvError: there is no such address here."""
+    """Return why a port cannot be used; empty: it can. Raises CoopenvError: there is no such address here."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as probe:

@@ -172,7 +172,7 @@ class InitialEstimate(Section):
     """What the observer believes at t = 0, fixed or drawn anew at each reset."""
 
     position: Vector3 | None = None
-    """Believed position in the coordinates of this file, m (default: the true one; an override says so by `true`)."""
+    """Estimated position in the coordinates of this file, m (default: the true one; an override says so by `true`)."""
     position_offset: Vector3 = (0.0, 0.0, 0.0)
     """Added to the believed position, map axes, m."""
     position_radius: NonNegative = 0.0
@@ -210,7 +210,7 @@ class Goal(Section):
 
 
 class Landmark(Section):
-    """A target whose position is known to everybody, static or moving."""
+    """A target whose position all vehicles know, static or moving."""
 
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     position: Vector3

@@ -30,7 +30,7 @@ class ScenarioFields(Section):
     horizon: Positive
     """Length of an episode, s."""
     backend: Literal["simulated", "highway"] = "simulated"
-    """What moves the vehicles: coopenv itself, or highway-env as the section `[highway]` says."""
+    """What moves the vehicles: coopenv itself, or highway-env with the section `[highway]`."""
     highway: Highway | None = None
     map: Map = Map()
     routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
@@ -46,7 +46,7 @@ class ScenarioFields(Section):
     sensing: Literal["sensed", "ideal", "blind"] = "sensed"
     """One switch for studies of what looking is worth; all else stays equal, noise, radio and draws included.
     `ideal`: every neighbour is measured in every frame, whatever the field of view, range, misses and what is in
-    between; `blind`: nothing is ever measured; `sensed`: as `topology.mode` says."""
+    between; `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
     v2x: V2x = V2x()
     faults: Faults = Faults()
     observer: Observer = Observer()
@@ -60,7 +60,7 @@ class ScenarioFields(Section):
 
     @property
     def paced(self) -> bool:
-        """Whether the pace of prescribed motions may differ from what they say."""
+        """Whether the pace of prescribed motions may vary."""
         factors = (*self.randomisation.factors("traffic_pace"), *self.difficulty.factors("traffic_pace"))
         spreads = (*(mark.pace_spread for mark in self.landmarks), *(vehicle.pace_spread for vehicle in self.vehicles))
         return any(factor != 1.0 for factor in factors) or any(spreads)

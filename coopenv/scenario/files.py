@@ -19,7 +19,7 @@ from coopenv.scenario.scenes import scene_text
 from coopenv.scenario.schema import Scenario
 
 DEFAULTS_KEY = "vehicle_defaults"
-"""A table of the file whose entries every vehicle takes over unless it says otherwise."""
+"""A table of the file whose entries hold for every vehicle without its own."""
 
 OVERRIDES = "overrides (--set)"
 """Where a field stands that an override has made wrong."""
@@ -184,7 +184,7 @@ def schema_text() -> str:
     schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
     schema["properties"][DEFAULTS_KEY] = {
         "$ref": "#/$defs/PartialVehicle",
-        "description": "What every vehicle takes over unless it says otherwise.",
+        "description": "Entries of every vehicle without its own.",
     }
     used = _reachable(_references(schema["properties"]), definitions)
     schema["$defs"] = {name: definitions[name] for name in sorted(used)}

@@ -16,7 +16,7 @@ class Highway(Section):
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
     """Its id in Gymnasium's registry, such as `intersection-v0`."""
     config: dict[str, Setting] = Field(default={})
-    """Its own configuration by key; what this file says elsewhere (rates, sizes of actions) is not repeated here."""
+    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
     dynamical: bool = False
     """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
     most_vehicles: int = Field(default=40, ge=0, le=1000)

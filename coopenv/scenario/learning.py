@@ -242,7 +242,7 @@ PARAMETERS: dict[str, tuple[str, float, float]] = {  # name: what it multiplies,
     "odometry_scale": ("the error of the odometry's scale, as drawn, and its walk", 0.0, MOST),
     "gyro_bias": ("the gyro's bias, as drawn, and its walk", 0.0, MOST),
     "slip": ("how often wheels slip", 0.0, MOST),
-    "extrinsics": ("how far cameras, their focal length included, are from what they are said to be", 0.0, MOST),
+    "extrinsics": ("how far cameras, their focal length included, are from their nominal values", 0.0, MOST),
     "initial_error": ("the drawn offset and turn of initial estimates (not a turn over SO(3))", 0.0, MOST),
     "landmark_presence": ("the chance of landmarks to be there (at most 1)", 0.0, MOST),
     "v2x_loss": ("the chance of messages to be lost (at most 1)", 0.0, MOST),
@@ -288,7 +288,7 @@ class Difficulty(_Factors):
     """Factors [at difficulty 0, at difficulty 1], straight between; those that are drawn multiply them."""
 
     level: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["easy", "normal", "hard"] = 0.5
-    """Unless the options of a reset say otherwise; `easy` is 0, `normal` 0.5, `hard` 1."""
+    """Default of the options of a reset; `easy` is 0, `normal` 0.5, `hard` 1."""
 
     @model_validator(mode="after")
     def _level_has_a_meaning(self) -> Self:

@@ -1,4 +1,4 @@
-"""Terms of one's own: made known by name in a program, or by their place in a scenario's file; see docs/terms.md."""
+"""Users' own terms: registered by name in a program, or located in a scenario file; see docs/terms.md."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -152,7 +152,7 @@ def _located(row: Any, folder: Path) -> Any:
 
 
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario with terms of coopenv only, which is what a recording says of it: it must not name code."""
+    """Return a scenario with terms of coopenv only, for recordings, which must not name code."""
     result = dict(raw)
     for section in SECTIONS:
         if not isinstance(result.get(section), dict):
@@ -169,7 +169,7 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _observation_of_coopenv(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the section of an observation without fields of anybody's own."""
+    """Return the section of an observation without a user's own fields."""
     result = dict(part)
     for key in ("scales", "centers"):
         if isinstance(of_field := result.get(key), dict):

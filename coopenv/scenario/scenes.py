@@ -12,7 +12,7 @@ LANDMARKS = {"SL1": (-4.0, 5.0, 3.0), "SL2": (4.0, 4.0, 5.0), "SL3": (4.0, -3.0,
 """Name to position, m; as in busy_intersection."""
 
 TARGETS = 3
-"""Bearings with which a pose is observable; who measures fewer vehicles measures landmarks besides."""
+"""Bearings with which a pose is observable; a vehicle with fewer neighbours measures landmarks besides."""
 
 NORTH, EAST = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
@@ -131,7 +131,7 @@ def ring(vehicles: int, seen: int) -> list[Placed]:
 
 
 MOST_VEHICLES = 64
-"""Identities fit the 64 bits in which messages of `robust` say on whom they depend."""
+"""Identities fit the 64 bits of the dependence mask in messages of `robust`."""
 
 
 class Option(NamedTuple):
@@ -202,7 +202,7 @@ class Request(NamedTuple):
 
 
 def scene_rows() -> list[dict[str, str]]:
-    """Return what `list scenes` says of every kind."""
+    """Return the rows of `list scenes`."""
     return [
         {"name": f"{kind}:N", "options": ", ".join(map(_briefly, scene.options.items())), "about": scene.about}
         for kind, scene in SCENES.items()
@@ -215,7 +215,7 @@ def _briefly(option: tuple[str, Option]) -> str:
 
 
 def read_request(text: str) -> Request:
-    """Return what a name asks for; what it does not say is as usual.
+    """Return the scene of a name; missing options have their defaults.
 
     Raises:
         UnknownEnvironmentError: no such scene or option, or a number that is not allowed.
@@ -256,7 +256,7 @@ description = \"\"\"
 {about}
 Starts are up to 10 deg and 1 m off; bearings have the noise of busy_intersection_tracking.\"\"\"
 source = "made by: coopenv scene {name}"
-horizon = 50.0 # of at most {longest:g} s, after which those who drive to and fro stand still
+horizon = 50.0 # of at most {longest:g} s, after which vehicles that drive to and fro stand still
 
 [rates]
 camera = 60.0

@@ -88,7 +88,7 @@ class Camera(Section):
 
     @property
     def is_misplaced(self) -> bool:
-        """Whether the true camera is not as observers believe it to be."""
+        """Whether the true camera differs from the nominal one."""
         return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
 
 
@@ -180,7 +180,7 @@ class Noise(Section):
 
 
 class Topology(Section):
-    """Who may measure and hear whom."""
+    """Which targets a vehicle measures, and whose messages it receives."""
 
     mode: Literal["fixed", "sensed"] = "fixed"
     """`fixed`: every neighbour at every tick; `sensed`: those in the field of view and not occluded."""
@@ -302,7 +302,7 @@ class Faults(Section):
 
     @property
     def alters(self) -> bool:
-        """Whether any message says something else than its sender believes."""
+        """Whether any message differs from its sender's estimate."""
         return self.lie.kind != "none" or self.corruption.probability > 0.0
 
     @property

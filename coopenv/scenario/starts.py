@@ -1,4 +1,4 @@
-"""Initial poses and estimates, and who may measure and receive whom."""
+"""Initial poses and estimates, and the neighbours that each vehicle measures and receives."""
 
 import warnings
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Terms: what an observation holds, what a reward weighs, what ends a vehicle's episode; a row each.
 
-A row says what a term is and names the function that computes it. From the rows come the layout of an observation, the
+A row describes a term and names the function that computes it. From the rows come the layout of an observation, the
 weights that a scenario may set, the kernel (`coopenv.api.terms`), and the tables of `coopenv describe`.
 """
 
@@ -156,7 +156,7 @@ of each of the landmarks that are nearest by the vehicle's own estimate."""
 
 
 class Row(Section):
-    """What every term says of itself; a text alone is its function."""
+    """Entries of every term; a text alone is its function."""
 
     function: str | SkipJsonSchema[Callable[..., Any]]
     """`file.py:name`, the file relative to the scenario's, or `package.module:name`."""
@@ -276,7 +276,7 @@ def check_privilege(kind: Registry[Term], used: Mapping[str, float], part: Any) 
     """Check that a part of a scenario, which has `custom` and `privileged`, declares its use of the truth.
 
     Raises:
-        ValueError: a term whose weight or switch in `used` is on uses the truth, and nothing says so.
+        ValueError: a term whose weight or switch in `used` is on uses the truth without being declared privileged.
     """
     known = kind.known(part.custom)
     for name, weight in used.items():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.cards import has_dial
+from coopenv.bench.cards import has_value_of_sensing
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
@@ -23,7 +23,7 @@ KNOWN = {name: load_scenario(name) for name in coopenv.list_envs()}
 ENVIRONMENTS = [
     name
     for name, s in KNOWN.items()
-    if s.driven and s.backend == "simulated" and s.observer.name == "robust" and has_dial(name)
+    if s.driven and s.backend == "simulated" and s.observer.name == "robust" and has_value_of_sensing(name)
 ]
 """Not the laboratory's experiments: hardly anything varies in them, which are there to be driven by cars."""
 EXCEPTIONS = {

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from coopenv.base.installation import list_envs
-from coopenv.bench.cards import DRIVERS, METRICS, SETTINGS, dial_text, fingerprint, has_dial
+from coopenv.bench.cards import DRIVERS, METRICS, SETTINGS, fingerprint, has_value_of_sensing, value_of_sensing_text
 from coopenv.bench.pages import environment_page
 from coopenv.cli import main
 from coopenv.runs.page import index_text
@@ -42,7 +42,7 @@ def small(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", list_envs())
 def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
-    page, measure = PAGES / f"{name}.md", " --measure" if has_dial(name) else ""
+    page, measure = PAGES / f"{name}.md", " --measure" if has_value_of_sensing(name) else ""
     again = f"run: coopenv page {name} --out docs/environments"
     assert page.is_file(), again + measure
     assert page.read_text(encoding="utf-8") == environment_page(name, load_scenario(name), PAGES), again
@@ -127,18 +127,18 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
 
 def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:
     assert main(["page", "facade", "--measure", "--worlds", "2", "--out", str(tmp_path)]) == 0
-    dial = json.loads((tmp_path / "facade.json").read_text())
-    assert {(row["sensing"], row["agent"]) for row in dial["rows"]} == {
+    value = json.loads((tmp_path / "facade.json").read_text())
+    assert {(row["sensing"], row["agent"]) for row in value["rows"]} == {
         (how, who) for how in SETTINGS for who in DRIVERS
     }
-    e95 = {(row["sensing"], row["agent"]): row["mean"] for row in dial["rows"] if row["metric"] == "e95_m"}
+    e95 = {(row["sensing"], row["agent"]): row["mean"] for row in value["rows"] if row["metric"] == "e95_m"}
     assert e95["ideal", "route_follower"] < e95["blind", "route_follower"]
     text = (tmp_path / "facade.md").read_text()
     assert f"{100 * e95['blind', 'peek']:.0f} [" in text.split("| blind | peek |")[1]
     assert (tmp_path / "README.md").read_text().count("](") == 1
 
 
-def made_up_dial(scenario: Scenario) -> dict[str, object]:
+def made_up_value_of_sensing(scenario: Scenario) -> dict[str, object]:
     rows = [
         {"sensing": how, "agent": who, "metric": metric, "mean": 0.5, "ci_low": 0.25, "ci_high": 0.75, "n": 2}
         for how, who, metric in product(SETTINGS, DRIVERS, METRICS)
@@ -148,11 +148,13 @@ def made_up_dial(scenario: Scenario) -> dict[str, object]:
 
 def test_figures_that_are_older_than_the_environment_are_marked() -> None:
     scenario = load_scenario("facade")
-    dial = made_up_dial(scenario)
-    assert "has changed since" not in dial_text("facade", scenario, dial)
-    assert "| sensed | peek | 50 [25, 75] |" in dial_text("facade", scenario, dial)
-    assert "has changed since" not in dial_text("facade", load_scenario("facade", {"title": "Another"}), dial)
-    assert "has changed since" in dial_text("facade", load_scenario("facade", {"camera.range": 5.0}), dial)
+    value = made_up_value_of_sensing(scenario)
+    assert "has changed since" not in value_of_sensing_text("facade", scenario, value)
+    assert "| sensed | peek | 50 [25, 75] |" in value_of_sensing_text("facade", scenario, value)
+    assert "has changed since" not in value_of_sensing_text(
+        "facade", load_scenario("facade", {"title": "Another"}), value
+    )
+    assert "has changed since" in value_of_sensing_text("facade", load_scenario("facade", {"camera.range": 5.0}), value)
 
 
 @pytest.mark.parametrize(

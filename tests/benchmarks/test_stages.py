@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.stages.__main__ import main
+from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_settings
 from benchmarks.stages.against import HERE
-from benchmarks.stages.peeled import NEVER, STAGES, Setting, peeling
 from benchmarks.stages.rounds import alternate, ratio
 
 
@@ -32,7 +32,7 @@ def test_one_bad_round_moves_no_ratio() -> None:
 
 
 def test_each_stage_is_switched_off_on_top_of_those_before() -> None:
-    settings = list(peeling())
+    settings = list(ablated_settings())
     assert [name for name, _ in settings] == [name for name, _ in STAGES]
     last = settings[-1][1]
     assert not (last.visibility or last.sending or last.gramian) and last.overrides == {"noise.enabled": False}

@@ -163,7 +163,7 @@ def test_a_film_in_place_of_the_window(
         (["play", "busy_intersection"], "all motion here is prescribed, there is nothing to drive"),
         (["play", "urban_crossing", "--vehicle", "mine"], "--vehicle mine: no such driven vehicle; known: vehicle_1, "),
         (["watch", "nobody"], "unknown agent 'nobody'"),
-        (["watch", "statistics:mean"], "does not say for which environment it was made; name one with --env"),
+        (["watch", "statistics:mean"], "names no environment that it was made for; name one with --env"),
     ],
 )
 def test_mistakes_are_one_line(options: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

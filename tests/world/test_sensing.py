@@ -1,4 +1,4 @@
-"""The dial of sensing: what is measured changes, and nothing else does."""
+"""The key `sensing`: measurements change, all else stays."""
 
 from __future__ import annotations
 

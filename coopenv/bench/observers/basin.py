@@ -73,7 +73,7 @@ class Basin:
     failed: int
     """Draws in which the observer failed; they count as not converged."""
     failure: str
-    """Who failed in the first of them, when and why; empty where there is none."""
+    """The vehicle that failed in the first of them, when and why; empty where there is none."""
 
 
 def with_start(recording: Recording, rotations: Array, positions: Array, covariance: ArrayLike) -> Recording:
@@ -156,17 +156,19 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
         vehicles = len({draw.vehicle for draw in own})
         converged = np.array([draw.converged for draw in own]).reshape(-1, vehicles)
         times = np.array([draw.convergence_time_s for draw in own]).reshape(-1, vehicles)
-        everybody = converged.all(axis=1)
+        all_vehicles = converged.all(axis=1)
         failures = [draw.failure for draw in own[::vehicles] if draw.failure]
         basins.append(
             Basin(
                 environment=environment,
                 observer=name,
                 draws=len(converged),
-                converged_fraction=float(everybody.mean()),
-                interval=wilson_interval(int(everybody.sum()), len(converged)),
+                converged_fraction=float(all_vehicles.mean()),
+                interval=wilson_interval(int(all_vehicles.sum()), len(converged)),
                 by_vehicle=tuple(converged.mean(axis=0).tolist()),
-                convergence_time_s=float(np.median(times[everybody].max(axis=1))) if everybody.any() else float("nan"),
+                convergence_time_s=float(np.median(times[all_vehicles].max(axis=1)))
+                if all_vehicles.any()
+                else float("nan"),
                 failed=len(failures),
                 failure=failures[0] if failures else "",
             )

@@ -1,4 +1,4 @@
-"""`coopenv bench observers`: from what the user asked for to tables and files."""
+"""`coopenv bench observers`: from the options to tables and files."""
 
 import io
 import math
@@ -61,7 +61,7 @@ class Request(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What came of a request."""
+    """The results of a request."""
 
     comparison: Comparison
     draws: list[Draw]
@@ -116,7 +116,7 @@ def _compare(request: Request, executor: Executor, log: Console) -> Found:
 
 
 def print_tables(found: Found, printed: Console) -> None:
-    """Print the tables of the comparison and of the basins, and who failed."""
+    """Print the tables of the comparison and of the basins, and the failures."""
     printed.print(found.comparison)
     if found.basins:
         printed.print()

@@ -122,9 +122,9 @@ class Comparison(Leaderboard):
         return drawn
 
     def _about(self, variant: str | None) -> dict[str, object]:
-        """Return what files of figures say of themselves."""
-        told = {"environment": self.environment, "observers": ", ".join(self.observers), "variant": variant or "all"}
-        return {**told, "seeds": ", ".join(map(str, self.seeds))}
+        """Return the metadata of files of figures."""
+        about = {"environment": self.environment, "observers": ", ".join(self.observers), "variant": variant or "all"}
+        return {**about, "seeds": ", ".join(map(str, self.seeds))}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         return tables.everything(self, options.max_width)
@@ -170,8 +170,8 @@ def compare(
         steady_from: start of the steady state, s; None: after 70 % of the run.
         windows: edges of stretches of the run that are judged one by one, s; None: 5, 10, 20 and 35, of recorded
             robots none.
-        data: folder of recorded data sets; None: what COOPENV_DATA says.
-        topics: TOML file that says what the topics of a ROS bag are.
+        data: folder of recorded data sets; None: the variable COOPENV_DATA.
+        topics: TOML file with the map of a ROS bag's topics.
         faults: further variants with parameters, such as "vehicle_2:lie=drift:0.05@10", see docs/observers.md.
         policy: agent or policy that drives in the records of an environment; None: action zero.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
@@ -252,7 +252,7 @@ class Plan:
 
     @property
     def work(self) -> str:
-        """What there is to do, for people who wait."""
+        """The work to do, for the progress bar."""
         parts = {"observer": self.observers, "variant": self.variants, "seed": self.seeds}
         return ", ".join(f"{len(part)} {word}{'s' if len(part) > 1 else ''}" for word, part in parts.items())
 
@@ -271,8 +271,8 @@ class Plan:
         judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
         order = list(product(self.variants, self.observers))
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
-        told = {variant: self.source.variants[variant] for variant in self.variants}
-        return Comparison(self.source.name, self.observers, told, used, samples)
+        summaries = {variant: self.source.variants[variant] for variant in self.variants}
+        return Comparison(self.source.name, self.observers, summaries, used, samples)
 
 
 def _observers(observers: Iterable[str | Factory] | None, source: Source) -> tuple[str, ...]:

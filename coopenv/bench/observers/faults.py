@@ -181,7 +181,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
     ),
     "lie": RecordFault(
         "KIND[:AMOUNT]",
-        "jump or collude (m), drift (m/s), replay (s): what a vehicle broadcasts in place of its pose",
+        "a vehicle broadcasts another pose: jump or collude (m), drift (m/s), replay (s)",
         words={"jump": 5.0, "drift": 0.05, "replay": 1.0, "collude": 5.0},
         start=True,
         options=("std",),
@@ -265,7 +265,8 @@ class FaultVariant:
 
 def _in_words(fault: Fault) -> str:
     kind = FAULTS[fault.name]
-    return f"{kind.value.lower()} {kind.meaning}".strip()
+    meaning = kind.meaning.partition(": ")[0]
+    return meaning if kind.words else f"{kind.value.lower()} {meaning}".strip()
 
 
 def variant_of(text: str, name: str = "") -> FaultVariant:

@@ -156,7 +156,7 @@ def _share_axes(axes: np.ndarray, columns: int, t: np.ndarray) -> None:
 def variant_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
     """Draw a heat map of the mean position RMSE: a row per observer, a column per variant (all of them).
 
-    None where there is one variant only, or everybody failed.
+    None where there is one variant only, or every observer failed.
     """
     variants, names = list(board.variants), board.ranked
     table = np.array([[board.totals[variant, name].rmse.value for variant in variants] for name in names])

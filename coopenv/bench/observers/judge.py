@@ -1,4 +1,4 @@
-"""One record, judged: what every observer makes of it, against the truth and the bounds."""
+"""One record, judged: the errors of every observer against the truth and the bounds."""
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
@@ -57,7 +57,7 @@ def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[
 
 @dataclass(frozen=True)
 class Scene:
-    """What belongs to the record and not to an observer; arrays (N,), NaN where unknown."""
+    """Properties of the record, the same for all observers; arrays (N,), NaN where unknown."""
 
     vehicles: tuple[str, ...]
     bound_mse: Array  # m^2 in the steady state: joint over all vehicles,
@@ -193,7 +193,7 @@ RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory
 
 @dataclass(frozen=True)
 class Task:
-    """One record and who runs on it; small, so that it travels to a worker."""
+    """One record and its observers; small, so that it travels to a worker."""
 
     source: Source
     variant: str
@@ -229,7 +229,7 @@ def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, r
 def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Array]:
     """Return the figures of a run that did not fail; m and deg and their squares, s, 1/s; NIS summed over time."""
     steady = result.t > scene.steady_from
-    told = np.where(steady[:, None], result.nis_dof, 0)
+    known = np.where(steady[:, None], result.nis_dof, 0)
     vehicles = range(len(scene.vehicles))
     relative = np.array([_relative(recording, result, i) for i in vehicles]).T
     windows = [window.ticks(result.t) for window in scene.windows]
@@ -239,8 +239,8 @@ def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Arra
         "anees": result.mean(result.nees, steady) / result.nees_dof,
         "window_mse": np.array([result.mean(result.position_error**2, ticks) for ticks in windows]).T,
         "window_anees": np.array([result.mean(result.nees, ticks) for ticks in windows]).T / result.nees_dof,
-        "nis": np.where(told > 0, result.nis, 0.0).sum(axis=0),
-        "nis_dof": told.sum(axis=0).astype(float),
+        "nis": np.where(known > 0, result.nis, 0.0).sum(axis=0),
+        "nis_dof": known.sum(axis=0).astype(float),
         "settle_time": np.array([_settling(result, i, SETTLED) for i in vehicles]),
         "converge_time": np.array([_settling(result, i, CONVERGED) for i in vehicles]),
         "rate": np.array([_rate(result, i) for i in vehicles]),

@@ -54,7 +54,7 @@ class Row:
     settle_time_s: float = _column("median over these seeds of the time from which on they do, s")
     bytes_per_s: float = _column("payload that the vehicle broadcasts, bytes per second")
     us_per_update: float = _column("median time of an update with its message, microseconds; depends on the machine")
-    failure: str = _column("who failed first, when and why; empty where nobody did")
+    failure: str = _column("first vehicle that failed, when and why; empty without a failure")
     bound_ancestors_m: float = _column("the bound joint over the vehicle and all whose messages can reach it, m")
     bound_single_m: float = _column("the bound of the vehicle alone, as if its neighbours' poses were known, m")
     ratio_to_bound: float = _column("position_rmse_m / bound_m")
@@ -253,14 +253,14 @@ def checked_edges(given: Iterable[float] | str) -> tuple[float, ...]:
         CoopenvError: they are not increasing times.
     """
     words = [] if given in ("", "none") else given.split(",") if isinstance(given, str) else list(given)
-    said = given if isinstance(given, str) else ",".join(map(str, words))
+    text = given if isinstance(given, str) else ",".join(map(str, words))
     try:
         edges = tuple(float(word) for word in words)
     except (TypeError, ValueError):
-        raise CoopenvError(f"--windows {shown(said)}: {EXPECTED}") from None
+        raise CoopenvError(f"--windows {shown(text)}: {EXPECTED}") from None
     times = all(0.0 <= edge < math.inf for edge in edges) and all(b > a for a, b in pairwise(edges))
     if not times or len(edges) == 1 or len(edges) > MOST_EDGES:
-        raise CoopenvError(f"--windows {shown(said)}: {EXPECTED}")
+        raise CoopenvError(f"--windows {shown(text)}: {EXPECTED}")
     return edges
 
 
@@ -294,7 +294,7 @@ ERRORS = {
 
 
 class Spread(NamedTuple):
-    """What a figure comes to over all vehicles: the middle one, and the worst with its standard error and owner."""
+    """A figure over all vehicles: its median, and the worst with its standard error and vehicle."""
 
     median: float
     worst: float

@@ -62,7 +62,7 @@ class Source(ABC):
 
     @property
     def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane, which some observers are for and others are not."""
+        """Whether its vehicles are robots on a plane; observers suit either these or vehicles in space."""
         return False
 
     @abstractmethod
@@ -99,7 +99,7 @@ class Simulated(Source):
 
     scenario: Scenario
     policy: str = "zero"
-    """Who drives the driven vehicles, as for `coopenv.runs.recorder.record`."""
+    """Policy of the driven vehicles, as for `coopenv.runs.recorder.record`."""
     seeded: ClassVar[bool] = True
 
     def recording(self, variant: str, seed: int) -> Recording:
@@ -121,7 +121,7 @@ class Robots(Source):
     """A sub-dataset of MR.CLAM."""
 
     data: Path | None
-    """The folder with the data; None: as the environment variable COOPENV_DATA says."""
+    """The folder with the data; None: the environment variable COOPENV_DATA."""
     named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
     usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
     friendly: ClassVar[str] = (
@@ -138,7 +138,7 @@ class Robots(Source):
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the robots' record."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # `check` has told
+            warnings.simplefilter("ignore", DataWarning)  # `check` has warned
             return open_recording(self.name, self.data, variant)
 
     def check(self) -> None:
@@ -191,7 +191,7 @@ class Bags(Source):
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the bag as a record, with a fault."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # `check` has told
+            warnings.simplefilter("ignore", DataWarning)  # `check` has warned
             recording = record(self._backend(), seed)
         for made in self.added:
             check_recorded(made, recording)
@@ -238,7 +238,7 @@ def find_source(
         data: folder of recorded data sets.
         topics: what the topics of a ROS bag are.
         faults: variants with parameters, see `coopenv.bench.observers.faults`.
-        policy: who drives in a simulated environment; None: action zero.
+        policy: of the driven vehicles of a simulated environment; None: action zero.
 
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
@@ -249,7 +249,7 @@ def find_source(
         worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
         return Simulated(Path(text).stem, scenario, _checked_policy(policy, scenario), added=worlds)
     if policy is not None:
-        raise CoopenvError(f"--policy {policy}: {text} is recorded, nobody can drive in it")
+        raise CoopenvError(f"--policy {policy}: {text} is recorded, its vehicles cannot be driven")
     if faults and kind is SourceKind.DATASET:
         raise CoopenvError(
             f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"

@@ -1,4 +1,4 @@
-"""What a comparison of observers holds: the samples, and what comes of them."""
+"""The samples of a comparison of observers, and its tables."""
 
 import csv
 import re
@@ -134,7 +134,7 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
 
 
 def headline(board: Leaderboard) -> list[str]:
-    """Return in a few sentences what the first variant says: who is best, by how much, and who settles."""
+    """Summarise the first variant in a few sentences: the best observer, its lead, and the observers that settle."""
     first = next(iter(board.variants))
     names = [name for name in board.ranked if not any(row.failure for row in board.rows_in(first, name))]
     if not names:
@@ -151,8 +151,8 @@ def headline(board: Leaderboard) -> list[str]:
     if len(names) > 1:
         lines[0] += f"; {names[1]} follows with {_words(board.totals[first, names[1]].rmse)} m"
     always = [name for name in names if quality(board, first, name)["settled"].value == 100.0]
-    told = ", ".join(always) if always else "none"
-    return [lines[0] + ".", f"Every vehicle settles below {SETTLED.text} in every seed with: {told}."]
+    winners = ", ".join(always) if always else "none"
+    return [lines[0] + ".", f"Every vehicle settles below {SETTLED.text} in every seed with: {winners}."]
 
 
 def _words(measured: Measured) -> str:
@@ -177,7 +177,7 @@ def _measured(each: Array) -> Measured:
     return Measured(float(each.mean()), standard_error(each))
 
 
-MOST_OBSERVERS = 4  # of whom every vehicle is shown
+MOST_OBSERVERS = 4  # with a column per vehicle
 NAMES, COLUMN = 26, 9  # characters on a line: of observer and window, and of each vehicle
 
 
@@ -212,7 +212,7 @@ def by_vehicle(board: Leaderboard, variant: str, heading: str, column: str) -> T
     for name in board.ranked:
         for n, window in enumerate(board.windows):
             cells = [_cell(row, column) for row in board.windows_in(variant, name, window)]
-            table.add_row(short_name(name) if n == 0 else "", window.name, *_told(board, variant, name, cells))
+            table.add_row(short_name(name) if n == 0 else "", window.name, *_or_failed(board, variant, name, cells))
     return table
 
 
@@ -234,11 +234,11 @@ def summary(board: Leaderboard, variant: str) -> Table:
                 _who(ratio),
             ]
             cells += [number(anees.median, 2), _worst_window(anees), _who(anees)]
-            table.add_row(short_name(name) if n == 0 else "", window.name, *_told(board, variant, name, cells))
+            table.add_row(short_name(name) if n == 0 else "", window.name, *_or_failed(board, variant, name, cells))
     return table
 
 
-def _told(board: Leaderboard, variant: str, name: str, cells: list[str]) -> list[str]:
+def _or_failed(board: Leaderboard, variant: str, name: str, cells: list[str]) -> list[str]:
     failed = any(row.failure for row in board.rows_in(variant, name))
     return [FAILED] * len(cells) if failed else cells
 
@@ -256,12 +256,12 @@ def _who(found: Spread) -> str:
 
 
 WIDTH = 80
-WIDE = 100  # where no terminal says how many characters fit: vehicles are shown one by one
+WIDE = 100  # without a terminal: vehicles have columns of their own
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 
 
 def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
-    """Yield errors, ratios, quality and windows of each variant, of faults one only; then variants, and who failed.
+    """Yield errors, ratios, quality and windows of each variant, of faults one only; then variants and failures.
 
     `width`: characters that fit on a line.
     """
@@ -320,13 +320,13 @@ def ratio_table(board: Leaderboard, variant: str) -> Table:
 
 
 def honest_line(rows: Sequence[Row]) -> str:
-    """Return where the ANEES of an honest filter lies, empty where nobody states a covariance."""
+    """Return the range of the ANEES of a consistent filter; empty without any covariance."""
     known = (f"{row.anees_low:.2f} to {row.anees_high:.2f}" for row in rows if np.isfinite(row.anees_low))
     return next((f"ANEES of an honest filter: 1 ({ends} at 95 % of instants)." for ends in known), "")
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
-    """Return, of one variant over all vehicles: who settles, consistency (1 is honest) and costs."""
+    """Return, of one variant over all vehicles: shares that settle, consistency (1: consistent) and costs."""
     headings = ["settled", "converged", "diverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
     table = number_table(["observer"], headings, gap=0)
     for name in board.ranked:

@@ -68,7 +68,7 @@ def test_a_gate_that_is_not_there_is_not_well() -> None:
         command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--patience", "0.2", "--car"]
         found = CliRunner().invoke(app, [*command, "svea7"])
         assert isinstance(found.exception, CoopenvError)
-        assert "svea7: its gate has said nothing for 0.2 s on fleet/svea7/coopenv/gate" in str(found.exception)
+        assert "svea7: no message of its gate for 0.2 s on fleet/svea7/coopenv/gate" in str(found.exception)
     finally:
         router.close()
 
@@ -81,7 +81,7 @@ def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Pa
     try:
         command = ["svea", "health", str(file), "--patience", "0.2", "--car", "svea7"]
         found = CliRunner().invoke(app, command)
-        assert "svea7: its gate has said nothing" in str(found.exception)  # so it has got there
+        assert "svea7: no message of its gate" in str(found.exception)  # so it has got there
     finally:
         router.close()
     for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):

@@ -87,7 +87,7 @@ class Setting:
         return world
 
 
-def peeling() -> Iterator[tuple[str, Setting]]:
+def ablated_settings() -> Iterator[tuple[str, Setting]]:
     """Yield the stages in the order in which they are switched off, each with what is left then."""
     setting = Setting()
     for stage, change in STAGES:
