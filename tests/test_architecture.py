@@ -97,7 +97,7 @@ LINES_AND_FILES = {
     "observers": (12290, 48),
     "policies": (1315, 7),
     "runs": (3600, 15),
-    "scenario": (2955, 14),
+    "scenario": (2945, 13),
     "training": (1275, 7),
     "viz": (4915, 21),
     "world": (4250, 17),

@@ -1,16 +1,30 @@
 """Every field of a scenario, typed; `schema.Scenario` checks them against one another."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from coopenv.base.sections import Section
-from coopenv.scenario.base import Positive, Text, Vector3, overlaid
+from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlaid
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
-from coopenv.scenario.highway import Highway
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Route
 from coopenv.scenario.sensing import Camera, Faults, Noise, Observer, Rates, Topology, V2x
+
+Setting = bool | int | Number | Word | tuple[Number, ...] | None
+
+
+class Highway(Section):
+    """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
+
+    id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
+    """Its id in Gymnasium's registry, such as `intersection-v0`."""
+    config: dict[str, Setting] = Field(default={})
+    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
+    dynamical: bool = False
+    """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
+    most_vehicles: int = Field(default=40, ge=0, le=1000)
+    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
 
 
 class Map(Section):
