@@ -183,12 +183,13 @@ INLINE_THRESHOLD = 1000
 def compiler_options() -> dict[str, Any]:
     """Return the compiler's options of all kernels; flags that the user has set are kept.
 
-    The same for all modules, because Warp's headers are parsed once for each set of flags.
+    The same for all modules, because Warp's headers are parsed once for each set of flags. LLVM keeps its own depth of
+    vectorisation: Warp's smaller one slows large observers down.
     """
     flags = (wp.config.cpu_compiler_flags or "").split()
     if not any("-inline-threshold" in flag for flag in flags):
         return {}
-    kept = [flag for flag in flags if "-inline-" not in flag]
+    kept = [flag for flag in flags if not flag.startswith("-mllvm")]
     threshold = f"-mllvm=-inline-threshold={INLINE_THRESHOLD}"
     return {"cpu_compiler_flags": " ".join([*kept, threshold]), "optimization_level": 3}
 

@@ -81,7 +81,7 @@ def test_what_is_no_record_stays_a_value() -> None:
 
 
 def test_the_threshold_of_inlining_replaces_that_of_warp(monkeypatch: pytest.MonkeyPatch) -> None:
-    flags = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -O1"
+    flags = "-march=native -mllvm=-inline-threshold=9000 -O1 -mllvm=-slp-recursion-max-depth=4"
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
     monkeypatch.setattr(launch, "INLINE_THRESHOLD", 7)
     assert launch.compiler_options()["cpu_compiler_flags"] == "-march=native -O1 -mllvm=-inline-threshold=7"
