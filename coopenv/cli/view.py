@@ -207,7 +207,7 @@ class ViewOptions(SceneOptions):
 
     def _cars(self) -> "Reel":
         """Return the cars of a deployment, which are observed and not driven."""
-        from coopenv.cars.backend.opening import open_svea
+        from coopenv.cars.backend.backend import open_svea
         from coopenv.runs.reels import EngineReel
 
         deployment = self.deployment

@@ -295,7 +295,7 @@ def test_messages_may_come_from_elsewhere(observer: str, extra: dict[str, np.nda
         engine.step(ticks=1)
     assert (fleet.health.received, fleet.health.rejected) == (4, 0)
     if engine.plugins is not None:
-        heard = engine.plugins.groups[0].mail.heard
+        heard = engine.plugins.groups[0].mail.received
         assert [sorted(h) for h in heard] == [[], [], [0]] and heard[2][0][0] == 6
     if observer == "robust":
         assert engine.world.memory.inbox.numpy()["valid"][0].tolist() == [[0] * 3, [0] * 3, [1, 0, 0]]
@@ -348,7 +348,7 @@ def test_messages_that_cannot_be_read_are_rejected(observer: str, said: dict[str
     engine.step()
     assert (fleet.health.received, fleet.health.rejected) == (2, 2)
     assert (engine.view("inbox_tick") == -1).all()
-    assert engine.plugins is None or not engine.plugins.groups[0].mail.heard[2]
+    assert engine.plugins is None or not engine.plugins.groups[0].mail.received[2]
 
 
 @pytest.mark.parametrize("observer", ["riccati", "mekf"])

@@ -99,7 +99,7 @@ def test_without_the_extra_runs_say_what_is_missing(
         (["film", "overtaking", "--out", "none/film.gif"], "folder none does not exist"),
         (["film", "overtaking", "--out", "others.mcap/film.gif"], "others.mcap/film.gif: others.mcap is not a folder"),
         (["view", "run"], "run: has no scene.npz"),
-        (["export", "run", "--out", "others.mcap/tum"], "what stands above it is not a folder"),
+        (["export", "run", "--out", "others.mcap/tum"], "a part of its path is not a folder"),
         (["figures", "run", "--out", "others.mcap"], "cannot write to others.mcap: it is not a folder"),
         (["export", "cut.mcap", "--format", "foxglove-layout"], "cut.mcap: cut off"),
         (["export", "others.mcap", "--format", "foxglove-layout"], "others.mcap: cut off"),

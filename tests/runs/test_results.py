@@ -81,7 +81,7 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     whole = (folder / "trajectory.npz").read_bytes()
     for broken in (whole[:300], whole[: len(whole) // 2], whole[:400] + bytes(400) + whole[800:]):
         (tmp_path / "other" / "trajectory.npz").write_bytes(broken)
-        assert "trajectory.npz: not a readable trajectory: it is cut off or damaged" in said("other")
+        assert "trajectory.npz: not a readable trajectory: it is cut off, damaged" in said("other")
     with np.load(folder / "trajectory.npz") as data:
         arrays = dict(data)
     for change, why in (

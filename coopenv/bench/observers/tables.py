@@ -322,7 +322,7 @@ def ratio_table(board: Leaderboard, variant: str) -> Table:
 def honest_line(rows: Sequence[Row]) -> str:
     """Return the range of the ANEES of a consistent filter; empty without any covariance."""
     known = (f"{row.anees_low:.2f} to {row.anees_high:.2f}" for row in rows if np.isfinite(row.anees_low))
-    return next((f"ANEES of an honest filter: 1 ({ends} at 95 % of instants)." for ends in known), "")
+    return next((f"ANEES of a consistent filter: 1 ({ends} at 95 % of instants)." for ends in known), "")
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:

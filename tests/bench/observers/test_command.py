@@ -122,7 +122,7 @@ def test_report(folder: Path) -> None:
         assert text.index('id="summary"') < text.index(figure) < text.index("</section>")
     for wanted in ("--seeds 2", "numpy", "seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "viewport"):
         assert wanted in text
-    assert "no landmark is seen for 10 s" in text and "ANEES of an honest filter: 1 (" in text and "×" in text
+    assert "no landmark is visible" in text and "ANEES of a consistent filter: 1 (" in text and "×" in text
     assert "standard error over\nthe 2 seeds" in text
     for name in (f.name for f in fields(Row)):
         assert f"<dt>{name}</dt>" in text
