@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from coopenv.base import lazy_names
 from coopenv.base.errors import (
+    EVALUATION_SEEDS,
     ActionError,
     CoopenvError,
     DataError,
@@ -21,9 +22,9 @@ from coopenv.base.errors import (
     OutputError,
     ScenarioError,
     UnknownEnvironmentError,
+    evaluation_seed,
 )
 from coopenv.base.installation import list_envs
-from coopenv.base.seeds import EVALUATION_SEEDS, evaluation_seed
 
 if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import coopenv
 from coopenv import CoopenvError
-from coopenv.base.seeds import training_seed, world_keys
+from coopenv.base.errors import training_seed, world_keys
 
 NAME = "urban_crossing"
 WORD = 2**32

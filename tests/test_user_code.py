@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.user_code import absolute, is_reference, load
+from coopenv.base.installation import absolute_reference, is_reference, load_reference
 
 SOURCE = """
 from dataclasses import dataclass
@@ -33,30 +33,32 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_class_in_a_file_is_loaded_once_and_imports_its_neighbours(folder: Path) -> None:
     path = list(sys.path)
-    mine = load("mine.py:Mine")
+    mine = load_reference("mine.py:Mine")
     assert dataclasses.is_dataclass(mine) and mine().value == 7
-    assert load(f"{folder}/mine.py:Mine") is mine and load(absolute("mine.py:Mine")) is mine
+    assert (
+        load_reference(f"{folder}/mine.py:Mine") is mine and load_reference(absolute_reference("mine.py:Mine")) is mine
+    )
     assert sys.path == path and "mine" not in sys.modules
 
 
 def test_a_changed_file_is_loaded_again(folder: Path) -> None:
-    before = load("mine.py:Mine")
+    before = load_reference("mine.py:Mine")
     (folder / "mine.py").write_text(SOURCE.replace("VALUE\n\n", "VALUE\n\nVALUE = 9\n\n"))
     os.utime("mine.py", ns=(0, 10**18))
-    after = load("mine.py:Mine")
+    after = load_reference("mine.py:Mine")
     assert after is not before and after().value == 9
 
 
 def test_files_of_one_name_are_two_modules(folder: Path) -> None:
     (folder / "other").mkdir()
     (folder / "other/mine.py").write_text("class Mine: value = 8")
-    assert (load("mine.py:Mine")().value, load("other/mine.py:Mine").value) == (7, 8)
+    assert (load_reference("mine.py:Mine")().value, load_reference("other/mine.py:Mine").value) == (7, 8)
 
 
 def test_modules_are_found_from_here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert load("os.path:join") is os.path.join
+    assert load_reference("os.path:join") is os.path.join
     (folder / "module_found_from_here.py").write_text("class Mine: pass")
-    assert load("module_found_from_here:Mine").__module__ == "module_found_from_here"
+    assert load_reference("module_found_from_here:Mine").__module__ == "module_found_from_here"
     monkeypatch.delitem(sys.modules, "module_found_from_here")
 
 
@@ -79,7 +81,7 @@ def test_mistakes_are_one_line(folder: Path, reference: str, message: str) -> No
     (folder / "leaves.py").write_text("raise SystemExit(3)")
     (folder / "broken.py").write_text("class Mine(")
     with pytest.raises(CoopenvError, match=message) as caught:
-        load(reference)
+        load_reference(reference)
     assert "\n" not in str(caught.value)
 
 
@@ -93,4 +95,4 @@ def test_a_file_that_changes_within_a_second_is_read_again(tmp_path: Path, monke
     for value in (3, 4):
         path.write_text(f"VALUE = {value}\n")
         os.utime(path, ns=(second, second + value))
-        assert load(f"{path}:VALUE") == value
+        assert load_reference(f"{path}:VALUE") == value

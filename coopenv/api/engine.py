@@ -18,8 +18,7 @@ from coopenv.api.terms.results import MEMORY, results_struct, results_table, ste
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
-from coopenv.base.errors import CoopenvError, check_memory, error_text
-from coopenv.base.seeds import training_seed, world_keys
+from coopenv.base.errors import CoopenvError, check_memory, error_text, training_seed, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld

@@ -25,8 +25,7 @@ from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Health
 from coopenv.backends.sources import simulation_of
-from coopenv.base.errors import CoopenvError, shown, suggest
-from coopenv.base.seeds import world_keys
+from coopenv.base.errors import CoopenvError, shown, suggest, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.reset import ABSENT
 

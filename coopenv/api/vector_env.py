@@ -26,8 +26,7 @@ from coopenv.api.arguments import (
 from coopenv.api.engine import Engine
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.base.errors import CoopenvError
-from coopenv.base.seeds import world_keys
+from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.scenario import Scenario
 
 INFO_FIELDS = (

@@ -8,9 +8,9 @@ from typing import Any
 from PIL import Image
 
 from coopenv.api.engine import Engine
+from coopenv.base.errors import world_keys
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
-from coopenv.base.seeds import world_keys
 from coopenv.bench.cards import measure_value_of_sensing, read_value_of_sensing, value_of_sensing_text
 from coopenv.policies import Policy
 from coopenv.runs.live import write_film

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from coopenv.base.files import replacing_file
-from coopenv.base.npz import read_npz
+from coopenv.base.sections import read_npz
 
 
 @dataclass(frozen=True)

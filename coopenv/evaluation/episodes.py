@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.base.seeds import evaluation_seed, world_keys
+from coopenv.base.errors import evaluation_seed, world_keys
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 

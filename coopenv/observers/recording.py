@@ -122,7 +122,7 @@ def sealed(view: NDArray[Any]) -> NDArray[Any]:
 class Drawn:
     """The keys of the draws of a simulated episode: presence, routes and goals."""
 
-    key: int  # of the world's random streams, see `coopenv.base.seeds`
+    key: int  # of the world's random streams, see `coopenv.base.errors`
     episode: int
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
 

@@ -17,7 +17,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError, error_text, shown, suggest
-from coopenv.base.user_code import absolute, is_reference, load
+from coopenv.base.installation import absolute_reference, is_reference, load_reference
 
 if TYPE_CHECKING:
     from coopenv.observers.contract import Factory
@@ -168,7 +168,7 @@ def named(observer: str | Factory) -> str:
     """
     if isinstance(observer, str) and not is_reference(observer):
         return observer
-    place, found = (absolute(observer), _loaded(observer)) if isinstance(observer, str) else ("", observer)
+    place, found = (absolute_reference(observer), _loaded(observer)) if isinstance(observer, str) else ("", observer)
     row = _row(found)
     name = row.embedded.name if row.embedded is not None else place.rpartition(":")[2] or getattr(found, "__name__", "")
     if not (row.embedded or callable(found)) or not NAME.fullmatch(name):
@@ -278,7 +278,7 @@ def _attribute(place: str) -> Any:
 
 
 def _loaded(reference: str) -> Any:
-    found = load(reference)
+    found = load_reference(reference)
     if not (callable(found) or _has_kernels(found)):
         raise CoopenvError(f"observer '{reference}': expected a class, a function or an Embedded, got {found!r:.60}")
     return found

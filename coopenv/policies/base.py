@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from coopenv.base import user_code
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 
 
@@ -24,7 +24,7 @@ def restart(policy: Policy, mask: np.ndarray) -> None:
     """Reset a policy with memory in rows of a mask (rows,), bool, where a new episode begins."""
     reset = getattr(policy, "reset", None)
     if callable(reset):
-        with user_code.blamed("the policy's reset"):
+        with installation.blamed("the policy's reset"):
             reset(mask)
 
 
@@ -34,7 +34,7 @@ def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarr
     Raises:
         CoopenvError: the policy raised something, or returned no numbers, another shape or what is not finite.
     """
-    with user_code.blamed("the policy"):
+    with installation.blamed("the policy"):
         returned = policy(observations)
     try:
         actions = np.asarray(returned, dtype=np.float64)

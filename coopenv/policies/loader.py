@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.base import user_code
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import one_line, read_toml
@@ -110,7 +110,7 @@ class Agent:
         Raises:
             CoopenvError: there is no such code, or it cannot drive this environment.
         """
-        factory: Any = user_code.load(self.entry)
+        factory: Any = installation.load_reference(self.entry)
         if not isinstance(factory, type):
             if self.options or not callable(factory):
                 raise CoopenvError(f"agent '{self.name}': {self.entry} is not a class, nor a function without options")
@@ -167,14 +167,14 @@ def find_agent(name_or_place: str | Path) -> Agent:
         CoopenvError: there is none, or its `agent.toml` is not valid.
     """
     name, names = str(name_or_place), list_agents()
-    if name not in names and user_code.is_reference(name):
-        return Agent(name.rpartition(":")[2], user_code.absolute(name))
+    if name not in names and installation.is_reference(name):
+        return Agent(name.rpartition(":")[2], installation.absolute_reference(name))
     check_agent(name)
     folder = data_directory("agents") / name if name in names else Path(name)
     card = read_card(folder)
-    if not user_code.is_reference(card.entry):
+    if not installation.is_reference(card.entry):
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
-    entry = user_code.absolute(card.entry, folder)
+    entry = installation.absolute_reference(card.entry, folder)
     known = card.model_dump(exclude={"title", "entry", "network", "training", "results"})
     known["environments"] = tuple(
         str(folder / environment) if environment.endswith(".toml") else environment for environment in card.environments
@@ -191,7 +191,7 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
         CoopenvError: there is none, which `what` was to be.
     """
     names = [*others, *list_agents()]
-    if name not in names and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
+    if name not in names and not installation.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
         raise _not_found(what, name, names)
 
 

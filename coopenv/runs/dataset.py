@@ -15,10 +15,9 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, flat_space, observation_layout
-from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.errors import CoopenvError, OutputError, world_keys
 from coopenv.base.files import replacing_folder, writing
 from coopenv.base.installation import environment, environment_id, version
-from coopenv.base.seeds import world_keys
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario

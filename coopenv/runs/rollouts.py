@@ -13,9 +13,8 @@ import warp as wp
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.backends.base import EPISODE_OVER, Backend
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.base.installation import version
-from coopenv.base.seeds import world_keys
 from coopenv.estimation.metrics import CONVERGED, observability_of, summarise
 from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
 from coopenv.estimation.outcomes import Outcome, Sight

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from coopenv.base import user_code
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import one_line
 from coopenv.scenario.terms import (
@@ -146,8 +146,8 @@ def located(raw: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def _located(row: Any, folder: Path) -> Any:
     if isinstance(row, dict) and "function" in row:
         return {**row, "function": _located(row["function"], folder)}
-    if isinstance(row, str) and user_code.is_reference(row):
-        return user_code.absolute(row, folder)
+    if isinstance(row, str) and installation.is_reference(row):
+        return installation.absolute_reference(row, folder)
     return row
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from coopenv.base import user_code
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.base.sections import Section
 from coopenv.scenario.base import Number, Positive, Text
@@ -181,7 +181,7 @@ class Row(Section):
     @field_validator("function")
     @classmethod
     def _names_a_place(cls, function: Any) -> Any:
-        if isinstance(function, str) and not user_code.is_reference(function):
+        if isinstance(function, str) and not installation.is_reference(function):
             raise ValueError(f"expected file.py:name or package.module:name, got {shown(function)}")
         return function
 

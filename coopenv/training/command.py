@@ -8,9 +8,8 @@ from pathlib import Path
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.base import interrupts
-from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
 from coopenv.base.files import check_file, new_folder, replacing_folder
-from coopenv.base.seeds import evaluation_seed
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE

@@ -37,7 +37,7 @@ Options = Mapping[str, Any] | None
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    What is drawn in a world depends on its key alone (`coopenv.base.seeds`): it is bit for bit the single world with
+    What is drawn in a world depends on its key alone (`coopenv.base.errors`): it is bit for bit the single world with
     that key (on the same device).
     """
 

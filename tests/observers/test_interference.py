@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from coopenv.backends.replay import Replay
-from coopenv.base.errors import CoopenvError
-from coopenv.base.seeds import world_keys
+from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.contract import Tick, check_received
 from coopenv.observers.error_state_filters import MekfCovariance

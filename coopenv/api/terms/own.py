@@ -17,7 +17,7 @@ from coopenv.api.reward import check_finite
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth
 from coopenv.api.terms.results import Records, write_records
-from coopenv.base import user_code
+from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
@@ -275,7 +275,7 @@ def _bound(kind: Registry[Any], name: str, row: Row | None, records: tuple[int, 
     if isinstance(function, str):
         linecache.checkcache()  # Warp reads the source of a file that may have changed
         try:
-            function = user_code.load(function)
+            function = installation.load_reference(function)
         except CoopenvError as error:
             raise CoopenvError(f"{title}: {error}") from None
     taken = record_count(title, function, records)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.base.seeds import world_keys
+from coopenv.base.errors import world_keys
 from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
 from tests.helpers.builders import simulate
