@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed,
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
-from coopenv.scenario.fields import Highway
+from coopenv.scenario.schema import Highway
 from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
 
 

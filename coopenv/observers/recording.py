@@ -24,7 +24,7 @@ from coopenv.estimation.validity import (
 )
 from coopenv.observers.contract import Received, Setup, Tick
 from coopenv.scenario.learning import MOST, PARAMETERS
-from coopenv.scenario.starts import neighbour_sets, processing_order
+from coopenv.scenario.schema import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
     from coopenv.observers.interference import Interference

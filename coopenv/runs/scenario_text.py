@@ -26,9 +26,8 @@ from coopenv.scenario.bodies import (
 )
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.scenario.routes import Route
-from coopenv.scenario.schema import Scenario
+from coopenv.scenario.schema import Scenario, neighbour_sets
 from coopenv.scenario.sensing import Camera
-from coopenv.scenario.starts import neighbour_sets
 
 MANY_LANDMARKS = 4  # from this number on, `all landmarks` stands for their names
 

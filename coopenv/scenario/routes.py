@@ -1,17 +1,18 @@
-"""Routes that vehicles follow, and prescribed motions."""
+"""Routes that vehicles follow, prescribed motions, and where agents start."""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import product
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Vector2
-from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, Vehicle, WaypointMotion
+from coopenv.scenario.base import NonNegative, Vector2, rotation_of
+from coopenv.scenario.bodies import ConstantMotion, Landmark, SegmentMotion, Vehicle, WaypointMotion
 
 SPACING = 0.25  # m between the points of a route that is not straight ...
 MOST_POINTS = 64  # ... and how many there are at most
@@ -62,7 +63,7 @@ def route_length(route: Route) -> float:
 
 def point_count(route: Route) -> int:
     """Return how many points describe a route; those of a straight line are its ends."""
-    straight = len(_turns(route)) == 0 and route.wander == 0.0
+    straight = route.wander == 0.0 and not _shape(route).turn.any()
     return 2 if straight else min(MOST_POINTS, math.ceil(route_length(route) / SPACING) + 1)
 
 
@@ -88,43 +89,36 @@ def _direction(heading: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
-def _legs(route: Route) -> tuple[np.ndarray, np.ndarray]:
-    """Return lengths and headings (L,) of the lines between the waypoints."""
+class Shape(NamedTuple):
+    """What is between the L + 1 waypoints of a route, and at them."""
+
+    length: np.ndarray  # (L,) m
+    heading: np.ndarray  # (L,) rad
+    turn: np.ndarray  # (L + 1,) rad, positive to the left; 0 at both ends
+    cut: np.ndarray  # (L + 1,) m before and behind a waypoint, where its arc begins and ends
+
+
+def _shape(route: Route) -> Shape:
     leg = np.diff(np.array(route.waypoints), axis=0)
-    return np.linalg.norm(leg, axis=1), np.arctan2(leg[:, 1], leg[:, 0])
-
-
-def _turns(route: Route) -> dict[int, float]:
-    """Return the turns at the corners by the number of the waypoint, rad, positive to the left."""
-    _, heading = _legs(route)
-    turns = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
-    return {i + 1: float(turn) for i, turn in enumerate(turns) if abs(turn) > STRAIGHT}
-
-
-def _cuts(route: Route) -> Sequence[float]:
-    """Return how far before and behind each waypoint its arc begins and ends, m."""
-    turns = _turns(route)
-    return [route.corner_radius * math.tan(abs(turns.get(i, 0.0)) / 2) for i in range(len(route.waypoints))]
+    heading = np.arctan2(leg[:, 1], leg[:, 0])
+    turn = np.pad((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi, 1)
+    turn[np.abs(turn) <= STRAIGHT] = 0.0
+    return Shape(np.linalg.norm(leg, axis=1), heading, turn, route.corner_radius * np.tan(np.abs(turn) / 2))
 
 
 def _problems(route: Route) -> Iterator[str]:
-    lengths, _ = _legs(route)
-    for i, length in enumerate(lengths):
-        if length < 1e-6:
-            yield f"waypoints.{i + 1}: the same place as the waypoint before"
-    turns = _turns(route)
-    for i, turn in turns.items():
-        if abs(turn) > math.pi - 1e-3:
-            yield f"waypoints.{i}: the route turns back on itself there"
-    cuts = _cuts(route)
-    for i, ((a, b), length) in enumerate(zip(pairwise(cuts), lengths, strict=True)):
-        if a + b > length + 1e-9:
-            corner = i if a > b else i + 1
-            yield (
-                f"corner_radius: {route.corner_radius:g} m is too large for the corner at waypoints.{corner}: its arc "
-                f"does not fit into the {length:g} m between waypoints.{i} and waypoints.{i + 1}"
-            )
-    if turns and route.breadth > 0.0 and route.breadth >= route.corner_radius:
+    length, _, turn, cut = _shape(route)
+    for i in np.flatnonzero(length < 1e-6):
+        yield f"waypoints.{i + 1}: the same place as the waypoint before"
+    for i in np.flatnonzero(np.abs(turn) > math.pi - 1e-3):
+        yield f"waypoints.{i}: the route turns back on itself there"
+    for i in np.flatnonzero(cut[:-1] + cut[1:] > length + 1e-9):
+        corner = i if cut[i] > cut[i + 1] else i + 1
+        yield (
+            f"corner_radius: {route.corner_radius:g} m is too large for the corner at waypoints.{corner}: its arc "
+            f"does not fit into the {length[i]:g} m between waypoints.{i} and waypoints.{i + 1}"
+        )
+    if turn.any() and route.breadth > 0.0 and route.breadth >= route.corner_radius:
         yield (
             f"corner_radius: {route.corner_radius:g} m must be above lateral_spread + wander ({route.breadth:g} m), or "
             "the route would fold in its corners"
@@ -134,18 +128,15 @@ def _problems(route: Route) -> Iterator[str]:
 
 
 def _pieces(route: Route) -> Iterator[Piece]:
-    lengths, headings = _legs(route)
-    turns, cuts = _turns(route), _cuts(route)
-    for i, (length, heading) in enumerate(zip(lengths, headings, strict=True)):
-        ahead = _direction(heading)
-        straight = length - cuts[i] - cuts[i + 1]
+    length, headings, turn, cut = _shape(route)
+    for i, heading in enumerate(headings):
+        ahead, begin, end = _direction(heading), np.array(route.waypoints[i]), np.array(route.waypoints[i + 1])
+        straight = length[i] - cut[i] - cut[i + 1]
         if straight > 1e-9:
-            yield Piece(np.array(route.waypoints[i]) + cuts[i] * ahead, float(heading), 0.0, float(straight))
-        if cuts[i + 1] > 0.0:
-            turn = turns[i + 1]
-            begin = np.array(route.waypoints[i + 1]) - cuts[i + 1] * ahead
-            arc = route.corner_radius * abs(turn)
-            yield Piece(begin, float(heading), math.copysign(1.0 / route.corner_radius, turn), arc)
+            yield Piece(begin + cut[i] * ahead, heading, 0.0, straight)
+        if cut[i + 1] > 0.0:
+            curvature, arc = math.copysign(1.0 / route.corner_radius, turn[i + 1]), abs(turn[i + 1])
+            yield Piece(end - cut[i + 1] * ahead, heading, curvature, route.corner_radius * arc)
 
 
 def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:
@@ -262,3 +253,100 @@ def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray, until: f
     linear = np.linalg.solve(left_jacobian(turn), np.swapaxes(step, 1, 2))[..., 0]
     rest = np.zeros((1, 3))
     return TwistTable(t, np.vstack([linear / h, rest]), np.vstack([turn / h, rest]), rotation, relative)
+
+
+BLOCK = 200_000  # pairs of boxes that are compared at a time; each takes some 400 bytes
+
+
+def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nominal start of an agent: position (3,) in the file's coordinates, rotation (3, 3).
+
+    Of a vehicle with routes it is on the first of them.
+    """
+    if agent.motion.kind == "waypoints":
+        return np.array(agent.motion.waypoints[0].position), rotation_of(path_heading(agent.motion), None)
+    if isinstance(agent, Landmark):
+        return np.array(agent.position), rotation_of(agent.yaw, None)
+    if agent.routes:
+        return _beside(route_points(_routes_of(agent, routes)[0], np.zeros(1))[0], 0.0)
+    pose = agent.initial_pose
+    if pose is None or pose.position is None:  # the backend draws it
+        return np.zeros(3), np.eye(3)
+    return np.array(pose.position), rotation_of(pose.yaw, pose.quaternion_wxyz)
+
+
+def _routes_of(vehicle: Vehicle, routes: Sequence[Route]) -> list[Route]:
+    by_name = {route.name: route for route in routes}
+    return [by_name[name] for name in vehicle.routes]
+
+
+def _beside(point: np.ndarray, aside: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose at a distance (m) to the left of a point of a route, (x, y, heading) in m and rad."""
+    x, y, heading = point
+    position = np.array([x - aside * np.sin(heading), y + aside * np.cos(heading), 0.0])
+    return position, rotation_of(heading, None)
+
+
+class Boxes(NamedTuple):
+    """n boxes; a half size of zero makes a point."""
+
+    center: NDArray[np.float64]  # (n, 3) m
+    rotation: NDArray[np.float64]  # (n, 3, 3)
+    half: NDArray[np.float64]  # (n, 3) half of the edges, m
+
+
+def boxes_overlap(a: Boxes, b: Boxes) -> NDArray[np.bool_]:
+    """Return (n,) which boxes of `a` overlap those of `b` at the same place (separating axis theorem).
+
+    Source: Gottschalk, Lin, Manocha, OBBTree, SIGGRAPH 1996.
+    """
+    A, B = np.swapaxes(a.rotation, 1, 2), np.swapaxes(b.rotation, 1, 2)
+    edges = np.cross(A[:, :, None], B[:, None, :]).reshape(-1, 9, 3)
+    axes = np.concatenate([A, B, edges], axis=1)
+    reach = (np.abs(axes @ a.rotation) @ a.half[..., None] + np.abs(axes @ b.rotation) @ b.half[..., None])[..., 0]
+    apart = np.abs(axes @ (b.center - a.center)[..., None])[..., 0] >= reach
+    parallel = np.linalg.norm(axes, axis=-1) <= 1e-9  # edges without a plane between them
+    return np.asarray(~(apart & ~parallel).any(axis=1))
+
+
+def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
+    """Return the indices (k, 2) of all boxes of `a` and `b` that overlap, in the order of `a`.
+
+    If `b` is `a` itself, each pair of different boxes counts once, the larger index first.
+    """
+    radius_a, radius_b = np.linalg.norm(a.half, axis=1), np.linalg.norm(b.half, axis=1)
+    rows = max(1, BLOCK // max(1, len(b.half)))
+    found = [np.empty((0, 2), np.int64)]
+    for first in range(0, len(a.half), rows):
+        part = slice(first, first + rows)
+        distance = np.linalg.norm(a.center[part, None] - b.center, axis=-1)
+        near = distance <= radius_a[part, None] + radius_b
+        i, j = np.nonzero(np.tril(near, first - 1) if b is a else near)
+        i += first
+        overlap = boxes_overlap(Boxes(*(x[i] for x in a)), Boxes(*(x[j] for x in b)))
+        found.append(np.column_stack([i[overlap], j[overlap]]))
+    return np.concatenate(found)
+
+
+def possible_boxes(vehicle: Vehicle, routes: Sequence[Route]) -> Boxes:
+    """Return the boxes of a vehicle at its nominal start, which comes first, and at the corners of its spread."""
+    nominal = [start_of(vehicle, routes)]
+    for route in _routes_of(vehicle, routes):
+        spread = {0.0, route.lateral_spread, -route.lateral_spread}
+        points = route_points(route, np.array([*{0.0, route.start_spread}]))
+        nominal += [_beside(point, aside) for point in points for aside in spread]
+    parts = [_spread_boxes(vehicle, *pose) for pose in nominal]
+    return Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _spread_boxes(vehicle: Vehicle, position: np.ndarray, rotation: np.ndarray) -> Boxes:
+    pose = vehicle.initial_pose
+    spread = np.array(pose.position_spread if pose else (0.0, 0.0, 0.0))
+    turn = pose.yaw_spread if pose else 0.0
+    corners = [(0, 0, 0, 0), *(product((-1, 1), repeat=4) if spread.any() or turn else ())]
+    signs = np.array(corners, dtype=float)
+    turned = {sign: rotation @ rotation_of(sign * turn, None) for sign in (-1.0, 0.0, 1.0)}
+    rotations = np.array([turned[sign] for sign in signs[:, 3]])
+    positions = position + (signs[:, :3] * spread) @ rotation.T
+    center, size = (vehicle.body.center, vehicle.body.size) if vehicle.body else (np.zeros(3), np.zeros(3))
+    return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(signs), 1)))

@@ -4,16 +4,19 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Self
+from graphlib import CycleError, TopologicalSorter
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.errors import ScenarioWarning, listed, shown, suggest
-from coopenv.scenario.bodies import Landmark
-from coopenv.scenario.fields import ScenarioFields
-from coopenv.scenario.routes import followers
-from coopenv.scenario.starts import check_room, neighbour_sets, processing_order
+from coopenv.base.sections import Section
+from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlaid, rotation_of
+from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
+from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
+from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
+from coopenv.scenario.sensing import Camera, Faults, Noise, Observer, Rates, Topology, V2x
 
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 
@@ -25,16 +28,144 @@ LIMITS = {"max_acceleration", "max_speed", "max_steering", "reverse"}
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
+SAME_PLACE = 1e-6  # m
 
-class Scenario(ScenarioFields):
+Setting = bool | int | Number | Word | tuple[Number, ...] | None
+
+
+class Highway(Section):
+    """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
+
+    id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
+    """Its id in Gymnasium's registry, such as `intersection-v0`."""
+    config: dict[str, Setting] = Field(default={})
+    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
+    dynamical: bool = False
+    """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
+    most_vehicles: int = Field(default=40, ge=0, le=1000)
+    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+
+
+class Map(Section):
+    """The frame in which vehicles know the landmarks."""
+
+    origin: Vector3 = (0.0, 0.0, 0.0)
+    """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
+
+
+class Scenario(Section):
     """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
+
+    title: Text
+    description: Text = ""
+    source: Text = ""
+    """Where the figures come from."""
+    horizon: Positive
+    """Length of an episode, s."""
+    backend: Literal["simulated", "highway"] = "simulated"
+    """What moves the vehicles: coopenv itself, or highway-env with the section `[highway]`."""
+    highway: Highway | None = None
+    map: Map = Map()
+    routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
+    roads: tuple[Road, ...] = Field(default=(), max_length=10_000)
+    obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
+    landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
+    landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
+    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=1_000)
+    camera: Camera = Camera()
+    rates: Rates = Rates()
+    noise: Noise = Noise()
+    topology: Topology = Topology()
+    sensing: Literal["sensed", "ideal", "blind"] = "sensed"
+    """One switch for studies of what looking is worth; all else stays equal, noise, radio and draws included.
+    `ideal`: every neighbour is measured in every frame, whatever the field of view, range, misses and what is in
+    between; `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
+    v2x: V2x = V2x()
+    faults: Faults = Faults()
+    observer: Observer = Observer()
+    dynamics: Dynamics = Dynamics()
+    randomisation: Randomisation = Randomisation()
+    difficulty: Difficulty = Difficulty()
+    observation: Observation = Observation()
+    action: Action = Action()
+    reward: Reward = Reward()
+    termination: Termination = Termination()
+
+    @property
+    def paced(self) -> bool:
+        """Whether the pace of prescribed motions may vary."""
+        factors = (*self.randomisation.factors("traffic_pace"), *self.difficulty.factors("traffic_pace"))
+        spreads = (*(mark.pace_spread for mark in self.landmarks), *(vehicle.pace_spread for vehicle in self.vehicles))
+        return any(factor != 1.0 for factor in factors) or any(spreads)
+
+    @property
+    def vehicle_names(self) -> list[str]:
+        """`vehicle_1`, `vehicle_2`, ... in file order."""
+        return [f"vehicle_{i + 1}" for i in range(len(self.vehicles))]
+
+    @property
+    def target_names(self) -> list[str]:
+        """Landmarks first, then vehicles: the order of the paper's agents and of every target axis."""
+        return [landmark.name for landmark in self.landmarks] + self.vehicle_names
+
+    @property
+    def driven(self) -> bool:
+        """Whether any vehicle is driven by actions."""
+        return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
+
+    @property
+    def has_lasting_errors(self) -> bool:
+        """Whether any vehicle's odometry or camera has errors that last, see `[noise]` and `[camera]`."""
+        noises, cameras = self.noises, self.cameras
+        return any(n.enabled and (n.lasts or c.is_misplaced) for n, c in zip(noises, cameras, strict=True))
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The camera of every vehicle."""
+        return [overlaid(self.camera, vehicle.camera) for vehicle in self.vehicles]
+
+    @property
+    def noises(self) -> list[Noise]:
+        """The noise of every vehicle's sensors."""
+        return [overlaid(self.noise, vehicle.noise) for vehicle in self.vehicles]
+
+    @property
+    def all_faults(self) -> list[Faults]:
+        """What may go wrong with every vehicle."""
+        return [overlaid(self.faults, vehicle.faults) for vehicle in self.vehicles]
+
+    @property
+    def replay_ticks(self) -> int:
+        """The most ticks that a replayed message may be old beyond what the radio takes, over all vehicles."""
+        lies = [faults.lie for faults in self.all_faults]
+        return max(self.ticks_of_replay(lie.age) if lie.kind == "replay" else 0 for lie in lies)
+
+    def ticks_of_replay(self, age: float) -> int:
+        """Return an age in s as ticks: whole periods of the radio, at least one."""
+        return self.v2x.period * max(1, round(age * self.rates.camera / self.v2x.period))
+
+    @property
+    def limits(self) -> list[Dynamics]:
+        """The dynamics of every vehicle."""
+        return [overlaid(self.dynamics, vehicle.dynamics) for vehicle in self.vehicles]
+
+    @property
+    def ticks_per_decision(self) -> int:
+        """Camera ticks between two decisions of the policy."""
+        return round(self.rates.camera / self.rates.decision)
+
+    @property
+    def horizon_ticks(self) -> int:
+        """Camera ticks of an episode."""
+        return max(1, round(self.horizon * self.rates.camera))
 
     @field_validator("landmarks")
     @classmethod
     def _names_are_free(cls, landmarks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:
-        for name, times in Counter(landmark.name for landmark in landmarks).items():
-            if times > 1:
-                raise ValueError(f"landmark name '{name}' is used twice")
+        names = [landmark.name for landmark in landmarks]
+        for name in _twice(names):
+            raise ValueError(f"landmark name '{name}' is used twice")
+        for name in names:
             if re.fullmatch(r"vehicle_\d+", name):
                 raise ValueError(f"landmark name '{name}' is reserved for vehicles")
         return landmarks
@@ -49,13 +180,17 @@ class Scenario(ScenarioFields):
         for problem in (*_misplaced(self), *_problems(self)):
             raise ValueError(problem)
         if self.backend == "simulated":
-            check_room(self)
+            _check_room(self)
         for doubt in _doubts(self, neighbours):
             warnings.warn(doubt, ScenarioWarning, stacklevel=2)
         return self
 
 
-def _misplaced(s: ScenarioFields) -> Iterator[str]:
+def _twice(names: Sequence[str]) -> list[str]:
+    return [name for name, times in Counter(names).items() if times > 1]
+
+
+def _misplaced(s: Scenario) -> Iterator[str]:
     """Yield what does not fit to what moves the vehicles."""
     elsewhere = s.backend == "highway"
     if elsewhere != (s.highway is not None):
@@ -82,7 +217,7 @@ def _misplaced(s: ScenarioFields) -> Iterator[str]:
         yield "vehicles: highway-env needs at least one that is driven"
 
 
-def _problems(s: ScenarioFields) -> Iterator[str]:
+def _problems(s: Scenario) -> Iterator[str]:
     """Yield what of one section does not fit to another."""
     k, q, targets = s.observer.k, s.observer.q, set(s.target_names)
     if isinstance(k, tuple) and len(k) != len(s.vehicles):
@@ -99,7 +234,7 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
     yield from _beyond_limits(s)
 
 
-def _beyond_limits(s: ScenarioFields) -> Iterator[str]:
+def _beyond_limits(s: Scenario) -> Iterator[str]:
     """Yield what of the vehicles' motion and action is beyond their own limits."""
     steering, decision = s.action.steering, 1.0 / s.rates.decision
     for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
@@ -114,22 +249,18 @@ def _beyond_limits(s: ScenarioFields) -> Iterator[str]:
             yield f"action.steering: {steering:g} rad is above {where}.max_steering ({limits.max_steering:g} rad)"
 
 
-def _problems_of_routes(s: ScenarioFields) -> Iterator[str]:
+def _problems_of_routes(s: Scenario) -> Iterator[str]:
     names = [route.name for route in s.routes]
-    for name, times in Counter(names).items():
-        if times > 1:
-            yield f"routes: the name '{name}' is used twice"
+    yield from (f"routes: the name '{name}' is used twice" for name in _twice(names))
     for i, vehicle in enumerate(s.vehicles):
         for key, name in [*(("routes", n) for n in vehicle.routes), *(("next_routes", n) for n in vehicle.next_routes)]:
             if name not in names:
                 yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
 
 
-def _problems_of_draws(s: ScenarioFields) -> Iterator[str]:
+def _problems_of_draws(s: Scenario) -> Iterator[str]:
     groups = [group.name for group in s.landmark_groups]
-    for name, times in Counter(groups).items():
-        if times > 1:
-            yield f"landmark_groups: the name '{name}' is used twice"
+    yield from (f"landmark_groups: the name '{name}' is used twice" for name in _twice(groups))
     for i, mark in enumerate(s.landmarks):
         if mark.group is not None and mark.group not in groups:
             yield f"landmarks.{i}.group: unknown group {shown(mark.group)}; groups make their landmarks themselves"
@@ -141,7 +272,7 @@ def _problems_of_draws(s: ScenarioFields) -> Iterator[str]:
         yield from _problems_of_sequels(s)
 
 
-def _problems_of_sequels(s: ScenarioFields) -> Iterator[str]:
+def _problems_of_sequels(s: Scenario) -> Iterator[str]:
     """Yield where a vehicle arrives and no route goes on."""
     by_name = {route.name: route for route in s.routes}
     for i, vehicle in enumerate(s.vehicles):
@@ -160,7 +291,7 @@ def _problems_of_sequels(s: ScenarioFields) -> Iterator[str]:
             new = {s.routes[k].name for sequels in after.values() for k in sequels} - reached
 
 
-def _doubts(s: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
+def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
     """Yield where the paper's conditions for convergence are not met by construction."""
     lonely = [f"vehicle_{i + 1}" for i, targets in enumerate(neighbours) if len(targets) < 3]
     if (count := len(s.landmarks)) < 3:
@@ -180,3 +311,100 @@ def _doubts(s: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> Iterator[
                 "the scene"
             )
             break
+
+
+def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return nominal start positions (A, 3) in the map frame and rotations (A, 3, 3), landmarks first."""
+    agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    starts = [start_of(agent, scenario.routes) for agent in agents]
+    return np.array([p for p, _ in starts]) - np.array(scenario.map.origin), np.array([R for _, R in starts])
+
+
+def _check_room(s: Scenario) -> None:
+    """Refuse (ValueError) vehicles that may start inside a building or in one another's place; warn of overlaps.
+
+    Vehicles with routes are drawn such that they do not touch, and need not be apart here.
+    """
+    boxes = [possible_boxes(vehicle, s.routes) for vehicle in s.vehicles]
+    if s.obstacles:
+        walls = Boxes(
+            np.array([o.center for o in s.obstacles]),
+            np.array([rotation_of(o.yaw, None) for o in s.obstacles]),
+            np.array([o.size for o in s.obstacles]) / 2,
+        )
+        everywhere = Boxes(*(np.concatenate(parts) for parts in zip(*boxes, strict=True)))
+        whose = np.repeat(np.arange(len(boxes)), [len(part.half) for part in boxes])
+        for box, building in overlapping_pairs(everywhere, walls)[:1].tolist():
+            i, name = int(whose[box]), s.obstacles[building].name
+            raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{name}'")
+    fixed = [i for i, vehicle in enumerate(s.vehicles) if not vehicle.routes]
+    if not fixed:
+        return
+    starts = np.array([start_of(s.vehicles[i], s.routes)[0] for i in fixed])
+    near = np.linalg.norm(starts[:, None] - starts, axis=-1) <= SAME_PLACE
+    for second, first in np.argwhere(np.tril(near, -1))[:1].tolist():
+        raise ValueError(_in_place(fixed[second], fixed[first]))
+    nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*(boxes[i] for i in fixed), strict=True)))
+    overlaps = overlapping_pairs(nominal, nominal)
+    if len(overlaps):
+        more = f" (and those of {len(overlaps) - 1} more pairs)" if len(overlaps) > 1 else ""
+        second, first = (fixed[i] for i in overlaps[0].tolist())
+        warnings.warn(f"{_in_place(second, first)}: their boxes overlap{more}", ScenarioWarning, stacklevel=2)
+
+
+def _in_place(second: int, first: int) -> str:
+    return f"vehicles.{second}.initial_pose: vehicle_{second + 1} starts in the place of vehicle_{first + 1}"
+
+
+def neighbour_sets(scenario: Scenario) -> list[list[int]]:
+    """Return, per vehicle, the indices of the targets that it may measure.
+
+    Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
+    (paper, Assumption 1: N_i within {1, ..., i-1}), otherwise all other vehicles.
+    """
+    landmarks, vehicles = len(scenario.landmarks), len(scenario.vehicles)
+    index = {name: target for target, name in enumerate(scenario.target_names)}
+    result = []
+    for i, vehicle in enumerate(scenario.vehicles):
+        own = landmarks + i
+        if vehicle.neighbours is None:
+            last = own if scenario.topology.acyclic else landmarks + vehicles
+            result.append([*range(own), *range(own + 1, last)])
+            continue
+        where = f"vehicles.{i}.neighbours"
+        for name in vehicle.neighbours:
+            if name not in index:
+                known = f"{suggest(name, index)}; known: {listed([*index])}"
+                raise ValueError(f"{where}: unknown target {shown(name)}{known}")
+            if index[name] == own:
+                raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
+        result.append(sorted({index[name] for name in vehicle.neighbours}))
+    return result
+
+
+def processing_order(scenario: Scenario, neighbours: Sequence[Sequence[int]]) -> list[int]:
+    """Return vehicle indices so that leaders come before their followers, from the scenario's `neighbour_sets`.
+
+    Raises:
+        ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.
+    """
+    landmarks = len(scenario.landmarks)
+    if not scenario.topology.acyclic:
+        return list(range(len(neighbours)))
+    leaders = [[j - landmarks for j in targets if j >= landmarks] for targets in neighbours]
+    sorter = TopologicalSorter(dict(enumerate(leaders)))
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        names = [f"vehicle_{i + 1}" for i in error.args[1]]
+        cycle = " -> ".join(names if len(names) <= 8 else [*names[:6], f"{len(names) - 7} more", names[-1]])
+        raise ValueError(
+            f"topology: the neighbours form a cycle ({cycle}); the paper's Assumption 1 needs an acyclic order "
+            "(or set topology.acyclic = false)"
+        ) from None
+    order: list[int] = []
+    while sorter.is_active():
+        ready = sorted(sorter.get_ready())
+        order += ready
+        sorter.done(*ready)
+    return order

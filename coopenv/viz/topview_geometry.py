@@ -9,8 +9,8 @@ from coopenv.estimation.lens import largest_radius, undistort
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.routes import TwistTable, compile_motion, even_points, left_jacobian
+from coopenv.scenario.schema import agent_starts
 from coopenv.scenario.sensing import Camera
-from coopenv.scenario.starts import agent_starts
 
 SIGMAS = 3.0
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)

@@ -14,8 +14,8 @@ from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
 from coopenv.scenario.routes import compile_motion, even_points, followers, point_count
+from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates
-from coopenv.scenario.starts import agent_starts, neighbour_sets, processing_order
 from coopenv.world.model import (
     BLIND,
     CONTINUE,

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.speed.growth import WORLDS, Sweep, fit_power_law, growth_scenario, summarise, sweeps
 from benchmarks.speed.measure import Result
-from coopenv.scenario.starts import neighbour_sets
+from coopenv.scenario.schema import neighbour_sets
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 2.37])

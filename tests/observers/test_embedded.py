@@ -18,7 +18,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.observers import find, register, run
 from coopenv.observers.registry import find_embedded
 from coopenv.runs import record
-from coopenv.scenario.starts import neighbour_sets
+from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.state import array
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario.starts import BLOCK, Boxes, boxes_overlap, overlapping_pairs
+from coopenv.scenario.routes import BLOCK, Boxes, boxes_overlap, overlapping_pairs
 
 
 def drawn(rng: np.random.Generator, count: int, spread: float) -> Boxes:

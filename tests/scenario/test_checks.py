@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from coopenv.base.errors import ScenarioError, ScenarioWarning
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
-from coopenv.scenario.starts import neighbour_sets, processing_order
+from coopenv.scenario.schema import neighbour_sets, processing_order
 from tests.helpers import builders
 from tests.helpers.builders import errors, landmark, run, start, vehicle
 

@@ -18,7 +18,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.routes import compile_motion
 from coopenv.scenario.scenes import MOST_VEHICLES, SCENES, scene_rows, scene_text
-from coopenv.scenario.starts import neighbour_sets
+from coopenv.scenario.schema import neighbour_sets
 from coopenv.training.files import environment_file
 
 

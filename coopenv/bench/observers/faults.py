@@ -18,8 +18,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.scenario.sensing import LONGEST_REPLAY
-from coopenv.scenario.starts import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
     from coopenv.observers.interference import Interference

@@ -30,7 +30,7 @@ from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.starts import neighbour_sets
+from coopenv.scenario.schema import neighbour_sets
 
 
 @dataclass(frozen=True)

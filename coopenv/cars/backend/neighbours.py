@@ -16,7 +16,7 @@ from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six
 from coopenv.scenario.base import rotation_of
-from coopenv.scenario.starts import neighbour_sets
+from coopenv.scenario.schema import neighbour_sets
 
 
 def message_of(value: CarPose | RobustReport, marker: Array) -> Message:

@@ -20,7 +20,7 @@ from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning, wor
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
 from coopenv.observers.riccati.equations import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
-from coopenv.scenario.starts import neighbour_sets, processing_order
+from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world import launch
 from coopenv.world.camera import VISIBLE, sight_of
 from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, command_of, prescribe, yaw_rate
