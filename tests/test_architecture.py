@@ -97,7 +97,7 @@ LINES_AND_FILES = {
     "observers": (12280, 48),
     "policies": (1315, 7),
     "runs": (3600, 15),
-    "scenario": (2945, 13),
+    "scenario": (2821, 11),
     "training": (1275, 7),
     "viz": (4915, 21),
     "world": (4250, 17),
