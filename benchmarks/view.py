@@ -13,7 +13,7 @@ from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
 from coopenv.base.errors import CoopenvError
-from coopenv.runs.reels import EngineReel
+from coopenv.runs.live import EngineReel
 from coopenv.runs.scenes import driver_of, open_source
 from coopenv.runs.view import Viewer, serving
 

@@ -277,7 +277,7 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
 def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
     monkeypatch.setattr("coopenv.runs.rollouts.Rollout.play", lambda self: pytest.fail("simulated"))
     (Path("there") / name).mkdir(parents=True)
     assert main(["run", "overtaking", "--out", "there", "--video"]) == 2
@@ -309,7 +309,7 @@ def test_the_table_says_what_settling_and_the_steady_state_are(capsys: pytest.Ca
 
 
 def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
     assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--out", "film"]) == 0
     assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
     assert "pip install '.[video]'" in capsys.readouterr().err

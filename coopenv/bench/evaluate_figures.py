@@ -22,8 +22,7 @@ from coopenv.evaluation.metrics import Quantile, interval, resamples
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
 from coopenv.runs.rollouts import play
-from coopenv.runs.scenes import scene_of, write_page
-from coopenv.runs.video import frame_stride, open_film
+from coopenv.runs.scenes import frame_stride, scene_of, video_path, write_page, write_pictures
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle
 from coopenv.viz.scene import Source
@@ -159,13 +158,16 @@ def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
     """Film the first world of an evaluation, one picture per driver, until the last has ended."""
     scenario = evaluation.entrants[0].scenario
     seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
-    film = open_film(folder, scenario.rates.camera / frame_stride(scenario))
-    with film, Progress(log, f"filming {film.path.name}", scenario.horizon_ticks) as progress:
-        for done, pictures in enumerate(_together([pictures_of(entrant, seed) for entrant in evaluation.entrants])):
-            film.add(tiled(pictures))
-            progress.update(done * frame_stride(scenario))
-        film.close()
-    return film.path
+    path, stride = video_path(folder), frame_stride(scenario)
+    with Progress(log, f"filming {path.name}", scenario.horizon_ticks) as progress:
+
+        def whole() -> Iterator[np.ndarray]:
+            for done, pictures in enumerate(_together([pictures_of(entrant, seed) for entrant in evaluation.entrants])):
+                yield tiled(pictures)
+                progress.update(done * stride)
+
+        write_pictures(path, scenario.rates.camera / stride, whole())
+    return path
 
 
 def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:

@@ -13,9 +13,8 @@ from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
 from coopenv.bench.cards import measure_value_of_sensing, read_value_of_sensing, value_of_sensing_text
 from coopenv.policies import Policy
-from coopenv.runs.live import write_film
 from coopenv.runs.page import index_text, page_text
-from coopenv.runs.scenes import driver_of, scene_of
+from coopenv.runs.scenes import driver_of, scene_of, write_film
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import Source
 from coopenv.viz.topview import TopView

@@ -7,6 +7,9 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,10 +17,9 @@ import typer
 from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
-from coopenv.cli import show
+from coopenv.cli import options
 from coopenv.cli.bench import bench
-from coopenv.cli.run import export, figures, import_command, record_command, run
-from coopenv.cli.show import page
+from coopenv.cli.run import export, figures, import_, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
@@ -32,23 +34,158 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("list")(show.list_command)
-app.command()(show.describe)
-app.command()(show.scene)
-app.command()(show.schema)
-app.command()(run)
-app.command()(figures)
-app.command()(export)
-app.command("record")(record_command)
-app.command("import")(import_command)
-app.command()(dataset)
-app.command()(train)
-app.command()(evaluate)
-app.command()(watch)
-app.command()(play)
-app.command()(view)
-app.command()(film)
-app.command()(page)
+Kind = StrEnum("Kind", "envs observers agents variants scenes")
+
+
+@app.command("list")
+def list_command(
+    kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
+) -> None:
+    """List environments, observers, agents, variants or scenes."""
+    from coopenv.bench.observers.faults import variant_rows
+    from coopenv.runs import summary
+
+    with options.warned():
+        rows = summary.list_rows(kind) if kind is not Kind.variants else variant_rows()
+    if as_json:
+        options.print_json(rows)
+    else:
+        options.console().print(summary.list_table(rows, summary.COLUMNS[kind]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DescribeOptions(options.SourceOptions):
+    """Options of `coopenv describe`."""
+
+    everything: Annotated[bool, typer.Option("--all", help="Also every vehicle, setting and field.")] = False
+    as_json: options.AsJson = False
+
+
+@app.command()
+@options.command
+def describe(given: DescribeOptions) -> None:
+    """Print a summary of an environment: vehicles, sensors, observer."""
+    from coopenv.backends.sources import is_recorded, simulation_of
+    from coopenv.runs.summary import describe_scenario, document, summary
+
+    name = Path(given.environment).stem
+    if is_recorded(given.environment) or any((given.data, given.variant, given.topics)):
+        backend = given.open()
+        scenario, recorded = backend.scenario, backend.capabilities.recorded
+    else:
+        scenario, recorded = options.load(given.environment, given.changes), False
+        if scenario.backend != "simulated":  # the roads of highway-env are drawn by highway-env itself
+            scenario = simulation_of(scenario).scenario
+    if given.as_json:
+        options.print_json(document(name, scenario))
+        return
+    out = options.console()
+    for part in describe_scenario(scenario) if given.everything else summary(name, scenario, recorded):
+        out.print(part)
+    if not given.everything:
+        out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
+
+
+@app.command()
+def scene(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENE",
+            help="Kind of scene and how many vehicles, such as lane:20, lane:8,seen=2 or random:12,seed=3.",
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
+) -> None:
+    """Write a parametric scene as a scenario file, to be kept or changed.
+
+    Scenes stand wherever an environment does: coopenv bench observers lane:20. `coopenv list scenes` lists them.
+    """
+    from coopenv.base.files import replace_text
+    from coopenv.scenario.scenes import scene_text
+
+    text = scene_text(name)
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        replace_text(out, text)
+
+
+@app.command()
+def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:
+    """Write the JSON schema of scenario files, for editors."""
+    from coopenv.base.files import replace_text
+    from coopenv.scenario.files import schema_text
+
+    if out is None:
+        sys.stdout.write(schema_text())
+    else:
+        replace_text(out, schema_text())
+
+
+for command in (run, figures, export, record, import_, dataset, train, evaluate, watch, play, view, film):
+    app.command(command.__name__.rstrip("_"))(command)
+
+
+@app.command()
+def page(
+    environments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="ENV...",
+            help="Names of environments or TOML files.",
+            show_default=False,
+            autocompletion=options.environments,
+            callback=options.known_environments,
+        ),
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for ENV.md, ENV.png and ENV.webp.")] = Path("out", "pages"),
+    measure: Annotated[
+        bool,
+        typer.Option(
+            "--measure", help="Measure the value of sensing, for ENV.json; else the file that is there is shown."
+        ),
+    ] = False,
+    film: Annotated[
+        bool,
+        typer.Option("--film/--no-film", help="Film an episode for ENV.webp; else the film that is there is shown."),
+    ] = True,
+    worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
+) -> None:
+    """Write the pages of environments: description, picture, film, value of sensing."""
+    from coopenv.base.installation import list_envs
+    from coopenv.bench import pages
+    from coopenv.bench.cards import entrants, has_value_of_sensing
+    from coopenv.runs.console import Progress
+
+    if bool(environments) == everything:
+        raise CoopenvError("name environments, or give --all for those that ship with coopenv")
+    names = list_envs() if everything else list(environments or ())
+    stems = {Path(text).stem: text for text in names}
+    if len(stems) < len(names):
+        raise CoopenvError("two environments have the same name")
+    scenarios = {name: options.load(text, {}) for name, text in stems.items()}
+    measured = [name for name in stems if measure and (has_value_of_sensing(name) or not everything)]
+    for name in measured:
+        entrants(stems[name])
+    pages.prepare(out, list(stems))
+    log = options.console(stderr=True)
+    with Progress(log, "pages", total=len(stems)) as progress:
+        for number, (name, scenario) in enumerate(scenarios.items()):
+            progress.update(number, name)
+
+            def report(done: float, doing: str = "film", number: int = number, name: str = name) -> None:
+                progress.update(number + done, f"{name}, {doing}")
+
+            if name in measured:
+                pages.write_figures(stems[name], name, scenario, out, worlds, report)
+            pages.write_page(name, scenario, out, report if film else None)
+    if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
+        pages.write_index(shipped, out)
+    options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
+
+
 app.add_typer(bench, name="bench")
 app.add_typer(svea, name="svea")
 

@@ -150,9 +150,7 @@ def bench_observers(given: ObserverOptions) -> None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
     if given.width is not None and given.figures is None:
         raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
-    printed, log = options.console(), options.console(stderr=True)
-    if not printed.is_terminal:
-        printed.width = max(printed.width, WIDE)
+    printed, log = options.console(least=WIDE), options.console(stderr=True)
     with options.warned():
         plan = given.plan()
         if given.basin:
@@ -185,15 +183,12 @@ def bench_learning(
     from coopenv.base.installation import available_cores
     from coopenv.bench.study import read_study
 
-    words = [word.strip() for word in only.split(",") if word.strip()] if only else []
     whole, log = read_study(study), options.console(stderr=True)
-    chosen, folder = whole.only(words), out or study.parent
+    chosen, folder = whole.only(options.words(only)), out or study.parent
     with options.warned():
         for group in chosen.groups:
             options.load(group.environment, chosen.settings[group].scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
-    printed = options.console()
-    if not printed.is_terminal:
-        printed.width = max(printed.width, learning.WIDTH)
+    printed = options.console(least=learning.WIDTH)
     printed.print(learning.results_table(chosen, folder))
     printed.print("Figures of the best seed, with 95 % intervals over worlds. More in every agent's card.md.")

@@ -30,31 +30,35 @@ PLAIN = ("zero", "random")
 """Policies without an agent."""
 
 
-def environments(incomplete: str) -> list[str]:
-    """Return the environments that begin so; the shell completes files itself."""
-    return _matching([*list_envs(), *(f"{kind}:" for kind in SCENES)], incomplete)
+def completion(names: Callable[[], Iterable[str]], several: bool = False) -> Callable[[str], list[str]]:
+    """Return the shell's completion of a name; `several`: of a list of names with commas between."""
+
+    def complete(incomplete: str) -> list[str]:
+        done, comma, last = incomplete.rpartition(",") if several else ("", "", incomplete)
+        left = (name for name in names() if not (several and name in done.split(",")))
+        return [f"{done}{comma}{name}" for name in left if name.startswith(last)]
+
+    return complete
 
 
-def agents(incomplete: str) -> list[str]:
-    """Return the drivers that begin so."""
-    return _matching(list_agents(), incomplete)
-
-
-def agent_lists(incomplete: str) -> list[str]:
-    """Return lists of drivers, names with commas between, that continue this one."""
-    return _lists(list_agents(), incomplete)
-
-
-def policies(incomplete: str) -> list[str]:
-    """Return what `--policy` takes and begins so."""
-    return _matching([*PLAIN, *list_agents()], incomplete)
-
-
-def observers(incomplete: str) -> list[str]:
-    """Return lists of observers, names with commas between, that continue this one."""
+def _observer_names() -> list[str]:
     from coopenv.observers.registry import observer_names
 
-    return _lists(observer_names(), incomplete)
+    return observer_names()
+
+
+def _override_keys() -> Iterator[str]:
+    """Yield the dotted keys of a scenario, each with its `=`."""
+    from coopenv.scenario import Scenario
+
+    return (f"{key}=" for key in dotted_keys(Scenario))
+
+
+environments = completion(lambda: [*list_envs(), *(f"{kind}:" for kind in SCENES)])  # the shell completes files itself
+agents, agent_lists = completion(list_agents), completion(list_agents, several=True)
+policies = completion(lambda: [*PLAIN, *list_agents()])
+observers = completion(_observer_names, several=True)
+override_keys = completion(_override_keys)
 
 
 def known_environment(name: str | None) -> str | None:
@@ -89,22 +93,25 @@ def known_policy(name: str | None) -> str | None:
 
 def known_agents(names: str | None) -> str | None:
     """Return agents with commas between. Raises CoopenvError: there is no such agent."""
-    if names is not None:
+    for name in words(names):
         from coopenv.policies.loader import check_agent
 
-        for name in filter(None, map(str.strip, names.split(","))):
-            check_agent(name)
+        check_agent(name)
     return names
 
 
 def known_observers(names: str | None) -> str | None:
     """Return observers with commas between. Raises CoopenvError: there is no such observer."""
-    if names:
+    for name in names.split(",") if names else ():
         from coopenv.observers.registry import check_known
 
-        for name in names.split(","):
-            check_known(name.strip())
+        check_known(name.strip())
     return names
+
+
+def words(text: str | None) -> list[str]:
+    """Return what stands between commas."""
+    return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
@@ -112,13 +119,6 @@ POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
 OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
 """Completion and check of an argument or option."""
-
-
-def override_keys(incomplete: str) -> list[str]:
-    """Return the dotted keys of a scenario that begin so, each with its `=`."""
-    from coopenv.scenario import Scenario
-
-    return _matching((f"{key}=" for key in dotted_keys(Scenario)), incomplete)
 
 
 def dotted_keys(model: type[Any]) -> Iterator[str]:
@@ -137,15 +137,6 @@ def _models_in(annotation: Any, in_list: bool = False) -> Iterator[tuple[type[An
         yield annotation, in_list
     for argument in get_args(annotation):
         yield from _models_in(argument, in_list or getattr(annotation, "__origin__", None) in (list, tuple, dict))
-
-
-def _matching(names: Iterable[str], incomplete: str) -> list[str]:
-    return [name for name in names if name.startswith(incomplete)]
-
-
-def _lists(names: Iterable[str], incomplete: str) -> list[str]:
-    done, comma, last = incomplete.rpartition(",")
-    return [f"{done}{comma}{name}" for name in _matching(names, last) if name not in done.split(",")]
 
 
 MOST_WORLDS = 1_000_000
@@ -252,9 +243,9 @@ def command(function: Callable[[Options], None]) -> Callable[..., None]:
     """
     [record] = [kind for name, kind in get_type_hints(function).items() if name != "return"]
     kinds = get_type_hints(record, include_extras=True)
-    own_first = sorted(
-        inspect.signature(record).parameters.values(), key=lambda p: p.name not in vars(record)["__annotations__"]
-    )
+    own = [vars(kind).get("__annotations__", {}) for kind in record.__mro__]
+    parameters = inspect.signature(record).parameters.values()
+    own_first = sorted(parameters, key=lambda p: next(depth for depth, names in enumerate(own) if p.name in names))
 
     def run(**given: Any) -> None:
         function(record(**given))
@@ -317,13 +308,15 @@ class SourceOptions:
             return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
 
 
-def console(stderr: bool = False) -> Console:
-    """Return a console that prints scenario texts as they are."""
+def console(stderr: bool = False, least: int = 0) -> Console:
+    """Return a console that prints scenario texts as they are; `least`: columns where there is no terminal."""
     from rich.console import Console
 
     made = Console(stderr=stderr, markup=False, highlight=False, emoji=False)
     if made.width < 1:  # COLUMNS=0
         made.width = 80
+    if not made.is_terminal:
+        made.width = max(made.width, least)
     return made
 
 

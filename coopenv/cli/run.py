@@ -16,12 +16,8 @@ from coopenv.base.errors import CoopenvError, DataWarning, OutputError
 from coopenv.cli import options
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
+    from coopenv.api.engine import Engine
     from coopenv.cars.bags.log import TopicRow
-    from coopenv.observers.recording import Recording
-    from coopenv.runs.scenes import Onlooker
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,69 +101,89 @@ class RecordOptions(options.SourceOptions):
 
 
 @options.command
-def record_command(given: RecordOptions) -> None:
+def record(given: RecordOptions) -> None:
     """Write what vehicles sense to an MCAP file, and beside it a page that plays the episode.
 
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
-    from coopenv.backends.mcap import check_target
-    from coopenv.backends.sources import is_bag, is_recorded
+    from coopenv.backends.sources import is_bag, is_recorded, open_recording
+    from coopenv.runs.console import Progress
+    from coopenv.runs.recorder import record as recorded
     from coopenv.runs.scenes import (
-        Onlooker,
-        check_scene,
+        MOST_SHOWN,
+        Keeper,
         observer_of,
+        open_source,
         pages_can_be_written,
-        scene_of_recording,
+        played_scene,
+        source_of,
+        title_of,
         write_log,
         write_page,
     )
 
-    out, page, observer = given.out, given.out.with_suffix(".html"), given.observer
-    check_target(out)
-    if given.scene:
-        check_scene(observer)
-    elif observer is not None:
-        raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
+    out, page, observer, environment = given.out, given.out.with_suffix(".html"), given.observer, given.environment
+    check_log(out, observer, given.scene)
     for path in (out, *([] if given.no_replay else [page])):
-        if path.exists() and not given.force:
-            raise OutputError(f"{path}: exists already; --force replaces it")
-    log, onlooker = options.console(stderr=True), Onlooker(out.name, given.seed, given.policy)
-    recording = _recording(given, onlooker, log)
-    write_log(recording, out, log, observer, given.scene)
-    facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
-    options.console().print(f"{out}: {facts}", soft_wrap=True)
-    played = None if given.no_replay else onlooker.record()
-    recorded = is_recorded(given.environment) and not is_bag(given.environment, given.topics)
-    if not given.no_replay and recorded and pages_can_be_written(page, log):
-        with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
-            shown_by = observer or observer_of(recording)
-            played = scene_of_recording(given.environment, log, shown_by, given.data, given.variant)
-    if played is not None and write_page(played, page, log) is not None:
-        options.console().print(f"{page}: the episode, to watch in a browser", soft_wrap=True)
-
-
-def _recording(given: RecordOptions, onlooker: Onlooker, log: Console) -> Recording:
-    """Return what vehicles sense, simulated or read."""
-    from coopenv.backends.sources import is_bag, is_recorded, open_recording
-    from coopenv.runs.console import Progress
-    from coopenv.runs.recorder import record
-
-    environment, bag = given.environment, is_bag(given.environment, given.topics)
+        check_new(path, given.force)
+    bag = is_bag(environment, given.topics)
+    replayed = is_recorded(environment) and not bag
     if not bag and given.topics is not None:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
-    if bag or is_recorded(environment):
+    if bag or replayed:
         refuse_for_recordings(environment, given.seed, given.policy)
-    if not bag and is_recorded(environment):
+    log, keepers = options.console(stderr=True), list[Keeper]()
+
+    def keep(engine: Engine, tick: int) -> None:
+        if not keepers:
+            keepers.append(Keeper(engine, source_of(engine, out.name, given.seed, given.policy)))
+        keepers[0].tick(tick)
+
+    if replayed:
         if given.changes:
             raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
         with options.warned():
-            return open_recording(environment, given.data, given.variant)
-    for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
-        if value is not None:
-            raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
-    source = given.open() if bag else options.load(environment, given.changes)
-    with Progress(log, "recording", total=1.0) as progress:
-        return record(source, given.seed, given.policy, progress.update, onlooker.on_tick)
+            recording = open_recording(environment, given.data, given.variant)
+    else:
+        for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
+            if value is not None:
+                raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
+        backend = given.open()
+        with Progress(log, "recording", total=1.0) as progress:
+            recording = recorded(backend, given.seed, given.policy, progress.update, keep)
+    write_log(recording, out, log, observer, given.scene)
+    facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
+    options.console().print(f"{out}: {facts}", soft_wrap=True)
+    if given.no_replay or not pages_can_be_written(page, log):
+        return
+    if keepers:
+        played = keepers[0].record()
+    else:
+        with warnings.catch_warnings(action="ignore", category=DataWarning):  # these have been printed
+            backend = open_source(environment, {}, observer or observer_of(recording), given.data, given.variant)
+            whole = backend.scenario.horizon
+            first = f", first {MOST_SHOWN:g} s of {whole:.0f} s" if whole > MOST_SHOWN else ""
+            played = played_scene(backend, title_of(environment) + first, log, longest=MOST_SHOWN)
+    write_page(played, page, log)
+    options.console().print(f"{page}: the episode, to watch in a browser", soft_wrap=True)
+
+
+def check_log(out: Path, observer: str | None, scene: bool) -> None:
+    """Refuse before any work a log that cannot be written. Raises CoopenvError: its path, the observer, or no SDK."""
+    from coopenv.backends.mcap import check_target
+    from coopenv.runs.scenes import check_scene
+
+    check_target(out)
+    if scene:
+        check_scene(observer)
+    elif observer is not None:
+        raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
+
+
+def check_new(path: Path, force: bool) -> None:
+    """Keep a file that is there. Raises OutputError: there is one, and `force` is not given."""
+    if path.exists() and not force:
+        raise OutputError(f"{path}: exists already; --force replaces it")
 
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
@@ -187,22 +203,12 @@ def figures(
     out: Annotated[Path | None, typer.Option(help="Folder of the figures (default: RUN/figures).")] = None,
 ) -> None:
     """Draw the figures of an earlier run again, for example for a paper."""
-    from coopenv.runs.command import Results, figure_words
+    from coopenv.runs.command import Results
     from coopenv.runs.console import Progress
 
     results, folder = Results.read(run), out or run / "figures"
     with options.warned(), Progress(options.console(stderr=True), "drawing figures"):
-        from coopenv.viz.figures import save_figures
-
-        paths = save_figures(
-            results.trajectory,
-            folder,
-            scenario=results.scenario(),
-            ends=results.ends,
-            steady_from=results.steady_from,
-            file_format=file_format.value,
-            **figure_words(results.metrics, width and width.value),
-        )
+        paths = results.save_figures(folder, file_format.value, width and width.value, results.scenario())
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 
@@ -250,7 +256,7 @@ WIDTH = 100
 """Columns of a table that is not for a terminal."""
 
 
-def import_command(
+def import_(
     bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
     out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
@@ -268,16 +274,18 @@ def import_command(
     if topics is None:
         if out is not None or overrides:
             raise CoopenvError(f"{'--out' if out else '--set'}: needs the map of the bags' topics, --map topics.toml")
-        _print(_topics(bags), as_json)
+        from coopenv.cars.bags.files import BagFile
+        from coopenv.cars.bags.log import rows_of
+
+        with ExitStack() as stack:
+            rows = rows_of([stack.enter_context(BagFile(path)) for path in bags])
+        _print(rows, as_json)
         return
     from coopenv.backends.sources import open_bags
 
     if out is not None:
-        from coopenv.runs.scenes import check_scene
-
-        _check(out, force)
-        if scene:
-            check_scene(observer)
+        check_log(out, observer, scene)
+        check_new(out, force)
     with options.warned():
         bag = open_bags(bags, topics, options.parse_overrides(overrides))
     _print(bag.log.rows, as_json)
@@ -287,62 +295,34 @@ def import_command(
     facts = f"{vehicles} vehicle{'s' * (vehicles > 1)}, {ticks} ticks, {seconds:.4g} s"
     if out is not None:
         from coopenv.runs.console import Progress
-        from coopenv.runs.recorder import record
+        from coopenv.runs.recorder import record as recorded
         from coopenv.runs.scenes import write_log
 
         log = options.console(stderr=True)
         with Progress(log, "recording", total=1.0) as progress:
-            recording = record(bag, seed, on_progress=progress.update)
+            recording = recorded(bag, seed, on_progress=progress.update)
         write_log(recording, out, log, observer, scene)
     if not as_json:
         options.console().print(f"{out or bag.where}: {facts}", soft_wrap=True)
 
 
-def _check(out: Path, force: bool) -> None:
-    from coopenv.backends.mcap import check_target
-
-    check_target(out)
-    if out.exists() and not force:
-        raise OutputError(f"{out}: exists already; --force replaces it")
-
-
-def _topics(bags: Sequence[Path]) -> tuple[TopicRow, ...]:
-    """Return what bags hold, without knowing what it is."""
-    from coopenv.cars.bags.files import BagFile
-    from coopenv.cars.bags.log import rows_of
-
-    with ExitStack() as stack:
-        return rows_of([stack.enter_context(BagFile(path)) for path in bags])
-
-
 def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
+    """Print what bags hold; where it is known, also as what it is read."""
     if as_json:
         options.print_json([*rows])
         return
-    printed = options.console()
-    if not printed.is_terminal:
-        printed.width = max(printed.width, WIDTH)
-    printed.print(_table(rows))
-
-
-def _table(rows: Sequence[TopicRow]) -> Table:
     from coopenv.runs.console import number_table
 
     read = any(row.role for row in rows)
-    names = ["topic", *(["read as"] if read else []), *([] if read else ["type"])]
+    names = ["topic", "read as" if read else "type"]
     numbers = ["messages", "rate\n[Hz]", *(["used", "longest\ngap [s]", "gaps", "clock\n[ms]"] if read else [])]
     table = number_table(names, numbers)
     for column in table.columns[: len(names)]:
         column.no_wrap, column.overflow = False, "fold"
     for row in rows:
-        cells = [row.topic, f"{row.car} {row.role}" if row.role else "" if read else row.type]
-        cells += [str(row.messages), _shown(row.rate, 1)]
-        if read:
-            offset = None if row.offset is None else 1e3 * row.offset
-            cells += [_shown(row.used, 0), _shown(row.gap, 3), _shown(row.gaps, 0), _shown(offset, 1)]
-        table.add_row(*cells)
-    return table
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+        about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
+        offset = None if row.offset is None else 1e3 * row.offset
+        figures = [(row.rate, 1), *([(row.used, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)] if read else [])]
+        shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
+        table.add_row(row.topic, about, str(row.messages), *shown)
+    options.console(least=WIDTH).print(table)

@@ -5,12 +5,11 @@ import os
 import signal
 import sys
 import threading
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from queue import Empty, Full, Queue
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -57,13 +56,13 @@ def demo(
     time kernels are compiled, which takes a minute or two more. The exit status is 3 where the watchdog stopped the
     cars.
     """
-    from coopenv.runs.demo import Demo, run_demo
+    from coopenv.runs.demo import Demo
 
     name = environment if fleet is None else fleet.stem
-    changes, folder = options.parse_overrides(overrides), out or Path("out") / name
-    chosen = Demo(name, folder, policy, seed, changes, seconds, beside, fleet)
+    folder = out or Path("out") / name
+    chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet)
     with options.warned():
-        if not run_demo(chosen, port, options.console(stderr=True), options.console()):
+        if not chosen.run(port, options.console(stderr=True), options.console()):
             raise typer.Exit(STOPPED)
 
 
@@ -95,19 +94,13 @@ def fake(
 
     faults = [fake_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
-    transport = open_transport(load_deployment(deployment, connect))
-
-    def complain(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
-    try:
+    complain = partial(print, file=sys.stderr, flush=True)
+    with closing(open_transport(load_deployment(deployment, connect))) as transport:
         made = make(transport, seed=seed, faults=faults, complain=complain)
         gc.freeze()  # what is there stays, and need not be looked through again and again
         interrupts.note(f"{car} is gone")
         print(f"{car}: fake ready", flush=True)
         run(made, threading.Event())
-    finally:
-        transport.close()
 
 
 Speed = typer.Option(help="Most m/s [default: 0.5].", show_default=False)
@@ -160,8 +153,7 @@ def gate(
     signer, verifier = given.identities()
     if verifier is None:
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
-    transport = given.open()
-    try:
+    with closing(given.open()) as transport:
         decides = Gate(car, given.limits, CLOCK, verifier, given.station, given.profile)
         link = GateConnection(decides, car, transport, signer, given.profile)
         interrupts.note(f"{car} is in neutral")
@@ -169,12 +161,6 @@ def gate(
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
         print(f"{car}: gate ready at {', '.join(given.connect)}", flush=True)
         run(link)
-    finally:
-        transport.close()
-
-
-MOST_WAITING = 16
-"""Messages that are kept until they are read; a gate sends five a second."""
 
 
 @svea.command()
@@ -194,11 +180,9 @@ def health(
 
     given = GateSettings.of(car, deployment).changed({}, connect=connect and (connect,))
     given.check_place(off_board)
-    topic, transport = given.profile.topic_of(given.car, Role.GATE), given.open()
-    try:
+    topic = given.profile.topic_of(given.car, Role.GATE)
+    with closing(given.open()) as transport:
         status = next_status(transport, topic, patience)
-    finally:
-        transport.close()
     if status is None:
         raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
     refused = sum(int(count) for count in status.counts)
@@ -211,19 +195,16 @@ def next_status(transport: "Transport", topic: str, patience: float) -> Any | No
     from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import Arrival
 
-    heard, until = Queue[bytes](MOST_WAITING), monotonic() + patience
+    heard = Queue[Any](1)
 
     def keep(arrival: Arrival) -> None:
         if len(arrival.payload) <= MOST_BYTES:
-            with suppress(Full):
-                heard.put_nowait(arrival.payload)
+            with suppress(CoopenvError, Full):
+                heard.put_nowait(decode(arrival.payload, GATE_TYPES[Role.GATE]))
 
     transport.subscribe(topic, keep)
     with suppress(Empty):
-        while True:
-            payload = heard.get(timeout=max(until - monotonic(), 0.0))
-            with suppress(CoopenvError):
-                return decode(payload, GATE_TYPES[Role.GATE])
+        return heard.get(timeout=patience)
     return None
 
 
@@ -274,13 +255,10 @@ def router(
     from coopenv.cars.transport.zenoh import open_zenoh
 
     endpoints = listen or ["tcp/127.0.0.1:7447"]
-    transport = open_zenoh("router", listen=endpoints)
-    try:
+    with closing(open_zenoh("router", listen=endpoints)):
         interrupts.note("the router is gone")
         print(f"router ready at {', '.join(endpoints)}", flush=True)
         threading.Event().wait()
-    finally:
-        transport.close()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,8 @@ class TrainOptions:
         from coopenv.training.settings import Plan
 
         if not self.resume:
-            return Plan(self.environment, self._settings(), self.seed or 0, self.arm, self._changes)
+            changes = options.parse_overrides(self.overrides)
+            return Plan(self.environment, self._settings(), self.seed or 0, self.arm, changes)
         decided = {"--set": self.overrides}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
@@ -62,10 +63,6 @@ class TrainOptions:
         if plan.environment != self.environment:
             raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {self.environment}")
         return plan
-
-    @property
-    def _changes(self) -> dict[str, Any]:
-        return options.parse_overrides(self.overrides)
 
     def _settings(self) -> Any:
         from coopenv.policies import find_agent
@@ -186,7 +183,7 @@ def evaluate(given: EvaluateOptions) -> None:
     environment, agents, out, log = given.environment, given.agents, given.out, options.console(stderr=True)
     if given.film and out is None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
-    names = [word.strip() for word in agents.split(",") if word.strip()] if agents else []
+    names = options.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
     request = evaluate.Request(
@@ -212,9 +209,7 @@ def evaluate(given: EvaluateOptions) -> None:
     if given.as_json:
         options.print_json(evaluate.document(request, result))
         return
-    printed = options.console()
-    if not printed.is_terminal:
-        printed.width = max(printed.width, evaluate.WIDTH)
+    printed = options.console(least=evaluate.WIDTH)
     evaluate.report(result, printed)
     if out is not None:
         printed.print(f"Files in {out}:", soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coopenv.backends.base import Backend
-    from coopenv.runs.reels import Reel
+    from coopenv.policies import Policy
+    from coopenv.runs.live import Reel
+    from coopenv.scenario import Scenario
     from coopenv.viz.scene import SceneRecord
 
 Agent = Annotated[
@@ -47,22 +48,13 @@ SceneSource = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions:
+class SceneOptions(options.SourceOptions):
     """What is shown: an environment, a record, or a saved scene."""
 
-    source: SceneSource
+    environment: SceneSource
     agent: Agent = None
     observer: ObserverName = None
     seed: options.Seed = 0
-    overrides: options.Overrides = None
-    data: options.DataFolder = None
-    variant: options.Variant = None
-    topics: options.TopicMap = None
-
-    @property
-    def changes(self) -> dict[str, Any]:
-        """The overrides of the scenario, dotted key to value."""
-        return options.parse_overrides(self.overrides)
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
         """Return where the ticks come from; `more` overrides of the scenario win over those that were given.
@@ -70,11 +62,20 @@ class SceneOptions:
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
         """
+        from coopenv.backends.sources import is_bag, is_recorded
         from coopenv.runs.scenes import open_source
 
+        if self.agent is not None and (is_recorded(self.environment) or is_bag(self.environment, self.topics)):
+            raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
         changes = {**self.changes, **(more or {})}
         watching = None if more and "observer.name" in more else self.observer
-        return open_source(self.source, changes, watching, self.data, self.variant, self.topics)
+        return open_source(self.environment, changes, watching, self.data, self.variant, self.topics)
+
+    def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
+        """Return who drives in a scenario, and its name. Raises CoopenvError: it cannot drive here."""
+        from coopenv.runs.scenes import driver_of
+
+        return driver_of(self.agent, scenario, self.environment, self.seed)
 
     def saved(self) -> "SceneRecord | None":
         """Return the scene of an earlier run; None: the source is no such run.
@@ -84,10 +85,10 @@ class SceneOptions:
         """
         from coopenv.runs.scenes import saved_scene
 
-        found = saved_scene(self.source)
+        found = saved_scene(self.environment)
         given = {"agent": self.agent, "observer": self.observer, "set": self.overrides, "seed": self.seed}
         if found is not None and (unfit := next((name for name, value in given.items() if value), None)):
-            raise CoopenvError(f"--{unfit}: {self.source} has been run; name the environment to run it anew")
+            raise CoopenvError(f"--{unfit}: {self.environment} has been run; name the environment to run it anew")
         return found
 
 
@@ -109,14 +110,13 @@ def film(given: FilmOptions) -> None:
     """Film an episode from above: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
-    from coopenv.runs.live import write_film
-    from coopenv.runs.video import film_at
+    from coopenv.runs.scenes import check_film, write_film
 
     out, log = given.out, options.console(stderr=True)
     rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
-    film_at(out, rate)
+    check_film(out)
     check_file(out)
-    record = scene(given, log)
+    record = given.saved() or scene(given, log)
     with Progress(log, f"filming {out.name}", 1.0) as progress:
         pictures = write_film(record, out, rate, given.speed, given.width, not given.map_only, progress.update)
     size = out.stat().st_size / 1e6
@@ -124,34 +124,17 @@ def film(given: FilmOptions) -> None:
 
 
 def scene(given: SceneOptions, log: "Console") -> "SceneRecord":
-    """Return the scene of a source: a saved one, or that of an episode that runs now.
+    """Return the scene of an episode that runs now.
 
     Raises:
         CoopenvError: there is no such source, or an option is not for it.
     """
-    from coopenv.api.engine import Engine
-    from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.scenes import driver_of, scene_of, title_of
-    from coopenv.viz.scene import Source
+    from coopenv.runs.scenes import played_scene, title_of
 
-    saved = given.saved()
-    if saved is not None:
-        return saved
     with options.warned():
         backend = given.open()
-    scenario, recorded = backend.scenario, backend.capabilities.recorded
-    if recorded and given.agent is not None:
-        raise CoopenvError(f"--agent: is for a simulation, {given.source} is recorded")
-    policy, name = (None, "") if recorded else driver_of(given.agent, scenario, given.source, given.seed)
-    engine = Engine(scenario, backend=backend)
-    of = Source.of(title_of(given.source), scenario, policy=name, seed=None if recorded else given.seed)
-    try:
-        with compile_notice(log):
-            engine.load()
-        with Progress(log, "running", total=1.0) as progress:
-            return scene_of(engine, of, policy, progress.update)
-    finally:
-        engine.close()
+    policy, driver = (None, "") if backend.capabilities.recorded else given.driver(backend.scenario)
+    return played_scene(backend, title_of(given.environment), log, given.seed, policy, driver)
 
 
 CARS = "svea"
@@ -162,7 +145,7 @@ CARS = "svea"
 class ViewOptions(SceneOptions):
     """Options of `coopenv view`."""
 
-    source: Annotated[
+    environment: Annotated[
         str,
         typer.Argument(
             metavar="ENV|FILE.mcap|BAG|RUN|svea",
@@ -183,44 +166,39 @@ class ViewOptions(SceneOptions):
     deployment: Annotated[Path | None, typer.Option(help="Of svea: the deployment file of the cars.")] = None
     connect: options.Connect = None
 
+    def open(self, more: Mapping[str, Any] | None = None) -> "Backend":
+        """Return where the ticks come from, of cars as well."""
+        if self.environment != CARS or self.deployment is None:
+            return super().open(more)
+        from coopenv.cars.backend.backend import open_svea
+
+        watching = {} if self.observer is None else {"observer.name": self.observer}
+        return open_svea(self.deployment, None, {**self.changes, **watching, **(more or {})}, connect=self.connect)
+
     def reel(self) -> "Reel":
-        """Return the source of frames.
+        """Return the source of frames; cars are observed and not driven.
 
         Raises:
             CoopenvError: there is no such source, or an option is not for it.
         """
-        from coopenv.backends.sources import is_bag, is_recorded
-        from coopenv.runs.reels import EngineReel, SavedReel
-        from coopenv.runs.scenes import driver_of, title_of
+        from coopenv.runs.live import EngineReel, Reel
+        from coopenv.runs.scenes import title_of
 
-        if self.source == CARS:
-            return self._cars()
+        if self.environment == CARS:
+            if self.deployment is None:
+                raise CoopenvError("--deployment: needed by coopenv view svea, the deployment file of the cars")
+            if self.agent is not None:
+                raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
+            return EngineReel(self.open, self.deployment.stem, self.seed, lambda scenario: (None, ""))
         for option, value in (("--deployment", self.deployment), ("--connect", self.connect)):
             if value is not None:
                 raise CoopenvError(f"{option} {value}: is for coopenv view svea")
-        if (saved := self.saved()) is not None:
-            return SavedReel(saved)
-        if self.agent is not None and (is_recorded(self.source) or is_bag(self.source, self.topics)):
-            raise CoopenvError(f"--agent: is for a simulation, {self.source} is recorded")
-        driver = partial(driver_of, self.agent, environment=self.source, seed=self.seed)
-        return EngineReel(self.open, title_of(self.source), self.seed, driver)
-
-    def _cars(self) -> "Reel":
-        """Return the cars of a deployment, which are observed and not driven."""
-        from coopenv.cars.backend.backend import open_svea
-        from coopenv.runs.reels import EngineReel
-
-        deployment = self.deployment
-        if deployment is None:
-            raise CoopenvError("--deployment: needed by coopenv view svea, the deployment file of the cars")
-        if self.agent is not None:
-            raise CoopenvError("--agent: is for a simulation; coopenv svea run --arm lets an agent drive cars")
-        changes = self.changes | ({} if self.observer is None else {"observer.name": self.observer})
-
-        def opened(more: Mapping[str, Any]) -> Any:
-            return open_svea(deployment, None, {**changes, **more}, connect=self.connect)
-
-        return EngineReel(opened, deployment.stem, self.seed, lambda scenario: (None, ""))
+        saved = self.saved()
+        return (
+            EngineReel(self.open, title_of(self.environment), self.seed, self.driver)
+            if saved is None
+            else Reel.of(saved)
+        )
 
 
 @options.command
@@ -230,7 +208,7 @@ def view(given: ViewOptions) -> None:
     The page loads nothing from other computers. Cars are observed only: they are never armed from here.
     """
     from coopenv.runs.console import compile_notice
-    from coopenv.runs.reels import vehicle_index
+    from coopenv.runs.live import vehicle_index
     from coopenv.runs.view import Viewer, serving
     from coopenv.viz.web.page import viser_module
 
@@ -239,26 +217,19 @@ def view(given: ViewOptions) -> None:
     with options.warned(), compile_notice(log):
         reel = given.reel()
     try:
-        picked = vehicle_index(reel.scenario, given.vehicle)
+        picked = None if given.vehicle is None else vehicle_index(reel.scenario, given.vehicle)
         with serving(given.host, given.port) as (server, url):
             viewer = Viewer(server, reel)
             viewer.pick(picked)
-            _announce(url, given, log)
+            options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
+            if given.host not in ("127.0.0.1", "localhost", "::1"):
+                warning = "warning: anyone with this address can watch and control the view; it is sent unencrypted"
+                log.print(warning, soft_wrap=True)
+            if not given.no_browser:
+                options.show_page(url)
             viewer.run()
     finally:
         reel.close()
-
-
-def _announce(url: str, given: ViewOptions, log: "Console") -> None:
-    """Print the address of the view, and open it in a browser."""
-    options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
-    if given.host not in ("127.0.0.1", "localhost", "::1"):
-        log.print(
-            "warning: anyone with this address can watch and control the view; it is sent unencrypted",
-            soft_wrap=True,
-        )
-    if not given.no_browser:
-        options.show_page(url)
 
 
 def watch(
@@ -292,13 +263,19 @@ def watch(
     if name is None:
         raise CoopenvError(f"{agent} names no environment that it was made for; name one with --env")
     scenario = options.load(name, options.parse_overrides(overrides))
+    from coopenv.base.files import replacing_folder
     from coopenv.runs import live
+    from coopenv.runs.console import Progress
+    from coopenv.runs.scenes import VIDEO_FILES, video_path, write_pictures
 
     policy = found.policy(scenario)
-    if out is not None:
-        stage = live.film(scenario, policy, seed, out, log)
+    if out is None:
+        stage = live.watch(scenario, policy, seed, log, speed=speed)
     else:
-        stage = live.watch(scenario, policy, seed, log, clock=live.Clock(speed))
+        stage = live.Stage(scenario, log)
+        with replacing_folder(out, VIDEO_FILES) as folder, Progress(log, f"filming {video_path(folder).name}"):
+            fps = scenario.rates.camera / stage.stride
+            write_pictures(video_path(folder), fps, stage.pictures(policy, seed))
     for line in stage.outcomes():
         options.console().print(line, soft_wrap=True)
 
@@ -318,9 +295,11 @@ def play(
 ) -> None:
     """Drive a vehicle by the arrow keys."""
     scenario, log = options.load(environment, options.parse_overrides(overrides)), options.console(stderr=True)
+    from coopenv.policies.base import zero_policy
     from coopenv.runs import live
+    from coopenv.runs.scenes import driver_of
 
-    index = live.vehicle_index(scenario, vehicle)
-    policy = live.others_of(scenario, Path(environment).stem, others, seed)
-    stage = live.drive_by_hand(scenario, index, policy, seed, log)
+    index = live.vehicle_index(scenario, vehicle, driven=True)
+    policy, _ = driver_of(others, scenario, environment, seed)
+    stage = live.drive_by_hand(scenario, index, policy or zero_policy(), seed, log)
     options.console().print(stage.outcomes()[index], soft_wrap=True)

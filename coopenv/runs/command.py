@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -16,20 +15,17 @@ from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.estimation.metrics import steady_start
-from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.registry import states_covariance
 from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.scenes import Keeper, write_page
-from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
+from coopenv.runs.scenes import VIDEO_FILES, Keeper, frame_stride, source_of, video_path, write_film, write_page
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz import FIGURE_NAMES, FORMATS
-from coopenv.viz.scene import SceneRecord, Source
 from coopenv.viz.scene.record import SCENE_FILE
 
-METRICS_FILE, TRAJECTORY_FILE, VIDEO_FILES = "metrics.json", "trajectory.npz", ("video.mp4", "video.gif")
-REPLAY_FILE = "replay.html"
+METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "replay.html"
 
 
 def result_names() -> list[str]:
@@ -67,83 +63,41 @@ def execute(
     if run.policy_name not in ("zero", "recorded") and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     steady = steady_start(steady_from, scenario.horizon, run.ticks_planned / scenario.rates.camera)
-    with replacing_folder(out, result_names()) as folder, ExitStack() as films:
+    able = run.engine.backend.capabilities
+    doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
+    with replacing_folder(out, result_names()) as folder:
         with compile_notice(log):
             run.engine.load()
-        film = open_film(folder, scenario.rates.camera / frame_stride(scenario)) if video else None
-        if film is not None:
-            films.enter_context(film)
-        scene = _simulate(name, run, film, log, describe)
+        keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
+        with Progress(log, doing, run.ticks_planned, scenario.rates.camera if able.real_time else None) as progress:
+            for tick in run.play():
+                if keeper.tick(tick):
+                    progress.update(tick, describe() if describe is not None else None)
+        scene = keeper.record()
         trajectory = run.trajectory()
         judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
             raise NoTruthError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
-        rates = theory_rates(run, judged)
-        vehicles = vehicle_metrics(judged, observability, endings, steady, rates)
+        vehicles = vehicle_metrics(judged, observability, endings, steady, theory_rates(run, judged))
         metrics = run_metrics(name, overrides, run, vehicles, steady)
-        replace_text(folder / METRICS_FILE, json_text(metrics))
-        trajectory.save(folder / TRAJECTORY_FILE)
-        scene.save(folder / SCENE_FILE)
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
+        replace_text(paths[0], json_text(metrics))
+        trajectory.save(paths[1])
+        scene.save(paths[2])
         if figures is not None:
             with Progress(log, "drawing figures"):
-                from coopenv.viz.figures import save_figures
-
-                ends = [ending.time for ending in endings]
-                options: dict[str, Any] = {"scenario": scenario, "steady_from": steady, "file_format": figures}
-                options |= figure_words(metrics, width)
-                paths += save_figures(judged, folder, observability, ends=ends, **options)
+                paths += Results(metrics, judged).save_figures(folder, figures, width, scenario, observability)
             page = write_page(scene, folder / REPLAY_FILE, log)
             paths += [] if page is None else [page]
-        if film is not None:
-            with Progress(log, f"finishing {film.path.name}"):
-                film.close()
-            if isinstance(film, GifFilm):
+        if video:
+            paths.append(video_path(folder))
+            with Progress(log, f"filming {paths[-1].name}", 1.0) as progress:
+                fps = scenario.rates.camera / frame_stride(scenario)
+                write_film(scene, paths[-1], fps, width=None, on_progress=progress.update)
+            if paths[-1].suffix == ".gif":
                 log.print("video: written as GIF; for MP4: pip install '.[video]'", soft_wrap=True)
-            paths.append(film.path)
     return {**metrics, "files": [out / path.name for path in paths]}
-
-
-def figure_words(metrics: Mapping[str, Any], width: str | None) -> dict[str, Any]:
-    """Return the arguments of `save_figures` that describe a run.
-
-    Figures for a column of a journal have them in the metadata alone.
-    """
-    about = {name: metrics[name] for name in ("environment", "observer", "seed", "policy", "overrides")}
-    note = f"{about['environment']}, {about['observer']}, seed {about['seed']}"
-    words = {"coopenv": metrics["versions"]["coopenv"], **about}
-    gain = not states_covariance(about["observer"])
-    return {"about": words, "gain": gain, "width": width, "note": note if width is None else ""}
-
-
-def _simulate(
-    name: str, run: Rollout, film: Film | None, log: Console, describe: Callable[[], str] | None
-) -> SceneRecord:
-    """Play a run to its end and return its scene."""
-    view = None
-    if film is not None:
-        from coopenv.viz.topview import TopView
-
-        view = TopView(run.scenario)
-    recorded = run.engine.backend.capabilities.recorded
-    policy = run.policy_name if run.scenario.driven and not recorded else ""
-    source = Source.of(name, run.scenario, seed=None if recorded else run.seed, policy=policy)
-    keeper = Keeper(run.engine, source)
-    rate = run.scenario.rates.camera if run.engine.backend.capabilities.real_time else None
-    with Progress(log, _doing(run), run.ticks_planned, rate) as progress:
-        for tick in run.play():
-            if (frame := keeper.tick(tick)) is not None:
-                if film is not None and view is not None:
-                    film.add(view.paint(frame))
-                progress.update(tick, describe() if describe is not None else None)
-    return keeper.record()
-
-
-def _doing(run: Rollout) -> str:
-    """Return the activity of a run by its backend: simulating, replaying or driving."""
-    abilities = run.engine.backend.capabilities
-    return "replaying" if abilities.recorded else "driving" if abilities.real_time else "simulating"
 
 
 def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:
@@ -181,9 +135,8 @@ _NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_fro
 
 @dataclass(frozen=True)
 class Results:
-    """A folder of `coopenv run`."""
+    """What a run has come to, as in its folder."""
 
-    folder: Path
     metrics: dict[str, Any]
     trajectory: Trajectory
     """Of the vehicles that were estimated, at the ticks at which their truth is known."""
@@ -218,7 +171,7 @@ class Results:
             raise DataError(f"{path}: vehicles are not those of {TRAJECTORY_FILE} ({error})") from None
         if not all(end is None or isinstance(end, float | int) for end in ends):
             raise DataError(f"{path}: ended_at_s: expected numbers")
-        return cls(folder, metrics, whole.of_vehicles(judged).where_truth_is_known())
+        return cls(metrics, whole.of_vehicles(judged).where_truth_is_known())
 
     @property
     def ends(self) -> list[float]:
@@ -236,3 +189,33 @@ class Results:
             return load_scenario(self.metrics["environment"], self.metrics["overrides"])
         except CoopenvError:
             return None
+
+    def save_figures(
+        self,
+        folder: Path,
+        file_format: str,
+        width: str | None,
+        scenario: Scenario | None,
+        observability: Observability | None = None,
+    ) -> list[Path]:
+        """Write the figures to a folder and return their paths; arguments as of `coopenv.viz.figures.save_figures`.
+
+        Figures for a column of a journal have the words that describe the run in the metadata alone.
+        """
+        from coopenv.viz.figures import save_figures
+
+        about = {name: self.metrics[name] for name in ("environment", "observer", "seed", "policy", "overrides")}
+        note = f"{about['environment']}, {about['observer']}, seed {about['seed']}" if width is None else ""
+        return save_figures(
+            self.trajectory,
+            folder,
+            observability,
+            scenario=scenario,
+            ends=self.ends,
+            steady_from=self.steady_from,
+            file_format=file_format,
+            about={"coopenv": self.metrics["versions"]["coopenv"], **about},
+            gain=not states_covariance(about["observer"]),
+            width=width,
+            note=note,
+        )

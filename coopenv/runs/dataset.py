@@ -3,9 +3,9 @@
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from coopenv.base.files import replacing_folder, writing
 from coopenv.base.installation import environment, environment_id, version
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.policies import Policy, decide, restart
+from coopenv.runs.rollouts import Views
 from coopenv.scenario import Scenario
 
 KEPT = ("observation", "reward", "terminated", "truncated", "position_error")
@@ -69,55 +70,42 @@ def drive_vehicles(
     engine = Engine(scenario, worlds)
     view, steps = engine.view, -(-scenario.horizon_ticks // scenario.ticks_per_decision)
     rows, width = view("alive").size, view("actions").shape[-1]
-    kept: dict[str, list[np.ndarray]] = {name: [] for name in KEPT}
-    actions: list[np.ndarray] = []
+    kept, actions = Views(engine, KEPT), list[np.ndarray]()
     with engine.stopping():
         engine.reset(world_keys(seed, worlds))
         there = view("alive").copy()
         restart(policy, np.ones(rows, dtype=bool))
-        _keep(kept, engine)
+        kept.take()
         for step in range(steps):
-            chosen = decide(policy, kept["observation"][-1].reshape(rows, -1), width)
+            chosen = decide(policy, view("observation").reshape(rows, -1).copy(), width)
             actions.append(chosen.reshape(view("actions").shape).astype(np.float32))
             engine.step(actions[-1])
-            _keep(kept, engine)
+            kept.take()
             on_progress((step + 1) / steps)
             if view("over").all():
                 break
     engine.close()
-    record = {name: np.stack(values) for name, values in kept.items()}
-    return list(_episodes(scenario, record, np.stack(actions), there))
-
-
-def _keep(kept: dict[str, list[np.ndarray]], engine: Engine) -> None:
-    for name, values in kept.items():
-        values.append(engine.view(name).copy())
-
-
-def _episodes(
-    scenario: Scenario, record: dict[str, np.ndarray], actions: np.ndarray, there: np.ndarray
-) -> Iterator[DrivenEpisode]:
-    """Yield the episodes in a record of (K + 1, W, N, ...), world by world."""
+    record = {name: kept[name] for name in KEPT}
     terminated, truncated = (record[name][1:].astype(bool) for name in ("terminated", "truncated"))
-    ended = terminated | truncated
-    for world in range(there.shape[0]):
-        for vehicle in driven_vehicles(scenario):
-            if not there[world, vehicle]:
-                continue
+    driven, ended, episodes = np.stack(actions), terminated | truncated, []
+    for world, vehicle in product(range(worlds), driven_vehicles(scenario)):
+        if there[world, vehicle]:
             ends = np.flatnonzero(ended[:, world, vehicle])
             length = int(ends[0]) + 1 if len(ends) else len(actions)
-            place = slice(None, length), world, vehicle
-            whole = slice(None, length + 1), world, vehicle
-            yield DrivenEpisode(
-                world=world,
-                vehicle=scenario.vehicle_names[vehicle],
-                observations=record["observation"][whole],
-                actions=actions[place],
-                rewards=record["reward"][1:][place].astype(float),
-                terminations=terminated[place],
-                truncations=truncated[place],
-                position_error=record["position_error"][whole].astype(float),
+            part, whole = ((slice(None, count), world, vehicle) for count in (length, length + 1))
+            episodes.append(
+                DrivenEpisode(
+                    world=world,
+                    vehicle=scenario.vehicle_names[vehicle],
+                    observations=record["observation"][whole],
+                    actions=driven[part],
+                    rewards=record["reward"][1:][part].astype(float),
+                    terminations=terminated[part],
+                    truncations=truncated[part],
+                    position_error=record["position_error"][whole].astype(float),
+                )
             )
+    return episodes
 
 
 FILES = ("main_data.hdf5", "metadata.json")
@@ -170,61 +158,47 @@ def write_dataset(
     Raises:
         OutputError: it cannot be written.
     """
-    with writing(place):
-        _check_room(place, episodes)
+    arrays = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
+    needed = 2 * arrays + PER_EPISODE * len(episodes)
+    with writing(place):  # HDF5 ends the process where the disk has no room (seen with h5py 3.16)
+        free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
+        if free < needed:
+            sizes = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
+            raise OutputError(f"cannot write to {place.parent}: the dataset may need {sizes}")
         place.parent.mkdir(parents=True, exist_ok=True)
-    with replacing_folder(place, FILES) as new, _datasets_in(new), writing(place):
+    with (
+        replacing_folder(place, FILES) as new,
+        environment({"MINARI_DATASETS_PATH": str(new)}),
+        warnings.catch_warnings(action="ignore", category=UserWarning),  # notes on authors
+        writing(place),
+    ):
         import minari
+        from minari.data_collector import EpisodeBuffer
 
         register_all()
-        spaces = {"observation_space": flat_space(observation_layout(scenario)), "action_space": action_space(scenario)}
+        buffers: list[Any] = [
+            EpisodeBuffer(
+                id=number,
+                options={"world": episode.world, "vehicle": int(episode.vehicle.rpartition("_")[2])},
+                observations=episode.observations,
+                actions=episode.actions,
+                rewards=episode.rewards,
+                terminations=episode.terminations,
+                truncations=episode.truncations,
+                infos={"position_error": episode.position_error},
+            )
+            for number, episode in enumerate(episodes)
+        ]
         minari.create_dataset_from_buffers(
             dataset_id=identity,
-            buffer=list(_buffers(episodes)),
+            buffer=buffers,
             env=gymnasium.spec(environment_id(name)) if name else None,
             requirements=[f"coopenv=={version()}"],
             data_format="hdf5",
-            **spaces,
+            observation_space=flat_space(observation_layout(scenario)),
+            action_space=action_space(scenario),
             **facts,
         )
         for file in FILES:
             (new / identity / "data" / file).rename(new / file)
         shutil.rmtree(new / identity.split("/")[0])
-
-
-def _check_room(place: Path, episodes: Sequence[DrivenEpisode]) -> None:
-    """Make sure that the disk has room: HDF5 ends the process where it has none (seen with h5py 3.16).
-
-    Raises:
-        OutputError: it has not.
-    """
-    arrays = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
-    needed = 2 * arrays + PER_EPISODE * len(episodes)
-    free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
-    if free < needed:
-        sizes = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
-        raise OutputError(f"cannot write to {place.parent}: the dataset may need {sizes}")
-
-
-def _buffers(episodes: Sequence[DrivenEpisode]) -> Iterator[Any]:
-    from minari.data_collector import EpisodeBuffer
-
-    for number, episode in enumerate(episodes):
-        yield EpisodeBuffer(
-            id=number,
-            options={"world": episode.world, "vehicle": int(episode.vehicle.rpartition("_")[2])},
-            observations=episode.observations,
-            actions=episode.actions,
-            rewards=episode.rewards,
-            terminations=episode.terminations,
-            truncations=episode.truncations,
-            infos={"position_error": episode.position_error},
-        )
-
-
-@contextmanager
-def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari write its datasets to a folder meanwhile, without its notes on authors."""
-    with environment({"MINARI_DATASETS_PATH": str(folder)}), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield

@@ -88,48 +88,38 @@ def truth_report(backend: Svea) -> str:
     return "no true poses are known, so there are no errors to show: " + "; ".join(parts)
 
 
-class Episodes:
-    """What the episodes on one backend come to, one after the other."""
-
-    def __init__(self, steady_from: float) -> None:
-        """Say when the steady state begins, s."""
-        self._steady_from = steady_from
-        self._rows: list[list[dict[str, Any]]] = []
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def add(self, run: Rollout) -> None:
-        """Take an episode that is over."""
-        trajectory = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known()
-        ends = [ending.time for ending in run.endings()]
-        static = np.array([k for k in range(len(run.scenario.landmarks)) if not trajectory.target_moving[k]])
-        rows = summarise(trajectory, self._steady_from, ends)
-        for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(rows), ends)):
-            seen = trajectory.visible[1:ticks, vehicle][:, static]
-            rows[vehicle]["hidden_share"] = float(1.0 - seen.all(axis=-1).mean()) if len(seen) else np.nan
-        self._rows.append(rows)
-
-    def values(self, vehicle: int, name: str) -> np.ndarray:
-        """Return (S,) a figure of a vehicle, per episode."""
-        return np.array([rows[vehicle][name] for rows in self._rows], dtype=float)
+Rows = list[dict[str, Any]]
+"""Figures of an episode, a dict per vehicle."""
 
 
-def side_by_side(vehicles: list[str], backends: Mapping[str, Episodes]) -> Table:
+def judged(run: Rollout) -> Rows:
+    """Return the figures of an episode that is over."""
+    trajectory = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known()
+    ends = [ending.time for ending in run.endings()]
+    rows = summarise(trajectory, STEADY_FROM, ends)
+    static = ~trajectory.target_moving[: len(run.scenario.landmarks)]
+    for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(rows), ends)):
+        seen = trajectory.visible[1:ticks, vehicle, : len(static)][:, static]
+        rows[vehicle]["hidden_share"] = float(1.0 - seen.all(axis=-1).mean()) if len(seen) else np.nan
+    return rows
+
+
+def side_by_side(vehicles: list[str], backends: Mapping[str, list[Rows]]) -> Table:
     """Return a row per vehicle and backend, of all episodes: the last settling; means with standard errors."""
     headings = ("\nseeds", "settles\nby [s]", "RMSE [m]\nmean±SE", "RMSE [deg]\nmean±SE", "hidden [%]\nmean±SE")
     table = number_table(("\nvehicle", "\non"), headings)
     for i, vehicle in enumerate(vehicles):
         for name, episodes in backends.items():
-            table.add_row(
-                vehicle,
-                name,
-                str(len(episodes)),
-                *seconds([float(episodes.values(i, "settle_time_s").max())]),
-                _mean(episodes.values(i, "steady_position_rmse_m"), 4),
-                _mean(episodes.values(i, "steady_orientation_rmse_deg"), 2),
-                _mean(100.0 * episodes.values(i, "hidden_share"), 1),
-            )
+            settled = float(np.max([rows[i]["settle_time_s"] for rows in episodes]))  # NaN where one never does
+            means = [
+                _mean(np.array([factor * rows[i][key] for rows in episodes]), digits)
+                for key, factor, digits in (
+                    ("steady_position_rmse_m", 1, 4),
+                    ("steady_orientation_rmse_deg", 1, 2),
+                    ("hidden_share", 100, 1),
+                )
+            ]
+            table.add_row(vehicle, name, str(len(episodes)), *seconds([settled]), *means)
     return table
 
 
@@ -144,9 +134,9 @@ FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"
 """Deployment files of the experiments, in `examples/fleet`."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Demo:
-    """What is shown."""
+    """An experiment, its options, and how well time was kept in it."""
 
     environment: str
     out: Path
@@ -159,6 +149,12 @@ class Demo:
     """Whether the same seeds are simulated, too, and stand beside."""
     deployment: Path | None = None
     """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
+    time: float = field(default=0.0, init=False)
+    """s driven."""
+    decisions: int = field(default=0, init=False)
+    missed: int = field(default=0, init=False)
+    delays: list[float] = field(default_factory=list, init=False)
+    """s, of each tick."""
 
     @property
     def fleet(self) -> Path:
@@ -170,136 +166,105 @@ class Demo:
             raise CoopenvError(f"--environment {self.environment}: has no fleet of fakes{known}")
         return data_directory("examples/fleet") / FLEETS[self.environment]
 
-    @property
-    def drive(self) -> Path:
-        """Where all that comes and goes is recorded."""
-        return self.out.with_name(f"{self.out.name}.mcap")
+    def run(self, port: int | None, log: Console, out: Console) -> bool:
+        """Start everything, drive, report, and end everything. Return whether the cars drove without being stopped.
 
+        Of a drive that is interrupted what has been driven takes its place, unless an earlier drive stands there.
 
-@dataclass
-class Punctuality:
-    """How well time was kept, over all episodes."""
+        Args:
+            port: of the router (None: a free one).
+            log: progress.
+            out: results.
 
-    time: float = 0.0  # s driven
-    decisions: int = 0
-    missed: int = 0
-    delays: list[float] = field(default_factory=list)  # s, of each tick
+        Raises:
+            CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be
+                written, or no true poses are known; the drive is kept in the last case.
+        """
+        library()
+        fleet, drive = self.fleet, self.out.with_name(f"{self.out.name}.mcap")
+        driven: list[Rows] = []
+        no_truth, interrupted = None, False
+        with writing(drive.parent):
+            drive.parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            with compile_notice(log), Progress(log, "starting a router and fake cars"):
+                router = stack.enter_context(fakes(fleet, port, self.seed))
+            record = stack.enter_context(replacing_file(drive))
+            environment = None if self.deployment else self.environment
+            backend = open_svea(fleet, environment, self.overrides, record=record, connect=router)
+            stack.callback(backend.close)
+            try:
+                self._drive(backend, driven, log, out)
+            except NoTruthError:
+                no_truth = CoopenvError(f"{self.environment}: {truth_report(backend)}")
+            except KeyboardInterrupt:
+                if drive.exists() or backend.recorder is None or not backend.recorder.begun:
+                    raise
+                also_kept(lambda: f"the drive up to here: coopenv run {drive}" if drive.exists() else "")
+                interrupted = True
+        if interrupted:
+            raise KeyboardInterrupt
+        backends = {"fakes": driven}
+        if self.beside and driven:
+            backends["simulation"] = self._simulate(backend.scenario, len(driven), log)
+        if len(driven) > 1 or "simulation" in backends:
+            out.print()
+            out.print(side_by_side(backend.scenario.vehicle_names, backends))
+            out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")
+            out.print("Hidden: frames in which a static landmark is not seen.")
+        late = 1e3 * float(np.quantile(self.delays, 0.99)) if self.delays else 0.0
+        out.print(
+            f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed, "
+            f"wake-up lateness p99 {late:.2f} ms over {len(self.delays)} ticks",
+            soft_wrap=True,
+        )
+        out.print(f"The drive, bit for bit: coopenv run {drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
+        if no_truth is not None:
+            raise no_truth
+        return backend.watchdog.trip is None
 
-    def count(self, backend: Svea, run: Rollout, known: bool = True) -> None:
-        """Add the episode that is over; all its deadlines are missed where no true pose is known in time."""
+    def _drive(self, backend: Svea, driven: list[Rows], log: Console, out: Console) -> None:
+        """Drive seed after seed, and append the figures of each; the first one is reported as a run."""
+        run = Rollout(backend.scenario, self.seed, policy=self.policy, backend=backend, options={"arm": True})
+        watched, changes = partial(links_line, backend), dict(self.overrides)
+        try:
+            result = execute(self.environment, run, self.out, log, changes, STEADY_FROM, "png", False, watched)
+        except NoTruthError:
+            self._count(backend, run, known=False)
+            links_report(backend, out)
+            raise
+        self._count(backend, run)
+        report(run, result, self.out, out)
+        links_report(backend, out)
+        while backend.watchdog.trip is None:
+            driven.append(judged(run))
+            if self.time >= self.seconds:
+                return
+            run.seed += 1
+            with Progress(log, f"seed {run.seed}") as progress:
+                for tick in run.play():
+                    progress.update(tick, f"seed {run.seed}: {watched()}")
+            self._count(backend, run)
+            ends = ", ".join(f"{ending.outcome} at {ending.time:.1f} s" for ending in run.endings())
+            out.print(f"seed {run.seed}: {ends}", soft_wrap=True)
+            if backend.watchdog.trip is not None:
+                out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+
+    def _count(self, backend: Svea, run: Rollout, known: bool = True) -> None:
+        """Add the time of an episode; all its deadlines are missed where no true pose is known in time."""
         self.time += run.ticks_recorded / run.scenario.rates.camera
         decisions = -(-run.ticks_recorded // run.scenario.ticks_per_decision)
         self.decisions += decisions
         self.missed += backend.link.missed if known else decisions
         self.delays.extend(backend.delays)
 
-    def line(self) -> str:
-        """Return it in words."""
-        late = 1e3 * float(np.quantile(self.delays, 0.99)) if self.delays else 0.0
-        return (
-            f"{self.time:.1f} s driven, {self.missed} of {self.decisions} deadlines missed, "
-            f"wake-up lateness p99 {late:.2f} ms over {len(self.delays)} ticks"
-        )
-
-
-def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> bool:
-    """Start everything, drive, report, and end everything. Return whether the cars drove without being stopped.
-
-    Args:
-        demo: what is shown.
-        port: of the router (None: a free one).
-        log: progress.
-        out: results.
-
-    Raises:
-        CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be
-            written, or no true poses are known; the drive is kept in the last case.
-    """
-    library()
-    fleet, kept, driven = demo.fleet, Punctuality(), Episodes(STEADY_FROM)
-    no_truth: CoopenvError | None = None
-    with writing(demo.drive.parent):
-        demo.drive.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        with compile_notice(log), Progress(log, "starting a router and fake cars"):
-            router = stack.enter_context(fakes(fleet, port, demo.seed))
-        record = stack.enter_context(replacing_file(demo.drive))
-        environment = None if demo.deployment else demo.environment
-        backend = open_svea(fleet, environment, demo.overrides, record=record, connect=router)
-        stack.callback(backend.close)
-        try:
-            whole = _drive_or_keep(demo, backend, kept, driven, log, out)
-        except NoTruthError:
-            whole, no_truth = True, CoopenvError(f"{demo.environment}: {truth_report(backend)}")
-    if not whole:
-        raise KeyboardInterrupt
-    backends = {"fakes": driven}
-    if demo.beside and driven:
-        backends["simulation"] = _simulate(demo, backend.scenario, len(driven), log)
-    if len(driven) > 1 or "simulation" in backends:
-        out.print()
-        out.print(side_by_side(backend.scenario.vehicle_names, backends))
-        out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")
-        out.print("Hidden: frames in which a static landmark is not seen.")
-    out.print(kept.line(), soft_wrap=True)
-    out.print(f"The drive, bit for bit: coopenv run {demo.drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
-    if no_truth is not None:
-        raise no_truth
-    return backend.watchdog.trip is None
-
-
-def _drive_or_keep(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> bool:
-    """Drive; return whether it ended without an interrupt.
-
-    Of one that was interrupted what has been driven takes its place, unless an earlier drive stands there.
-    """
-    try:
-        _drive(demo, backend, kept, driven, log, out)
-    except KeyboardInterrupt:
-        if demo.drive.exists() or backend.recorder is None or not backend.recorder.begun:
-            raise
-        also_kept(lambda: f"the drive up to here: coopenv run {demo.drive}" if demo.drive.exists() else "")
-        return False
-    return True
-
-
-def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> None:
-    """Drive seed after seed; the first one is reported as a run."""
-    run = Rollout(backend.scenario, demo.seed, policy=demo.policy, backend=backend, options={"arm": True})
-    watched = partial(links_line, backend)
-    name, changes = demo.environment, dict(demo.overrides)
-    try:
-        result = execute(name, run, demo.out, log, changes, STEADY_FROM, "png", False, watched)
-    except NoTruthError:
-        kept.count(backend, run, known=False)
-        links_report(backend, out)
-        raise
-    kept.count(backend, run)
-    report(run, result, demo.out, out)
-    links_report(backend, out)
-    while backend.watchdog.trip is None:
-        driven.add(run)
-        if kept.time >= demo.seconds:
-            return
-        run.seed += 1
-        with Progress(log, f"seed {run.seed}") as progress:
-            for tick in run.play():
-                progress.update(tick, f"seed {run.seed}: {watched()}")
-        kept.count(backend, run)
-        ends = ", ".join(f"{ending.outcome} at {ending.time:.1f} s" for ending in run.endings())
-        out.print(f"seed {run.seed}: {ends}", soft_wrap=True)
-        if backend.watchdog.trip is not None:
-            out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
-
-
-def _simulate(demo: Demo, scenario: Scenario, episodes: int, log: Console) -> Episodes:
-    """Return the same seeds under the same policy in the simulation."""
-    run = Rollout(scenario, demo.seed, policy=demo.policy)
-    simulated = Episodes(STEADY_FROM)
-    with compile_notice(log), Progress(log, "the same seeds in the simulation", episodes) as progress:
-        for run.seed in range(demo.seed, demo.seed + episodes):
-            for _ in run.play():
-                pass
-            simulated.add(run)
-            progress.advance()
-    return simulated
+    def _simulate(self, scenario: Scenario, episodes: int, log: Console) -> list[Rows]:
+        """Return the figures of the same seeds under the same policy in the simulation."""
+        run, simulated = Rollout(scenario, self.seed, policy=self.policy), []
+        with compile_notice(log), Progress(log, "the same seeds in the simulation", episodes) as progress:
+            for run.seed in range(self.seed, self.seed + episodes):
+                for _ in run.play():
+                    pass
+                simulated.append(judged(run))
+                progress.advance()
+        return simulated

@@ -1,27 +1,26 @@
-"""Episodes in a window, driven by an agent or from the keyboard, and films."""
+"""Episodes that are watched while they run: in a window, driven from the keyboard, or as frames of the live view."""
 
 import time
-from collections.abc import Callable
-from contextlib import closing
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from rich.console import Console
 
 from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_fields
-from coopenv.base.errors import CoopenvError
-from coopenv.base.files import replacing_file, replacing_folder
-from coopenv.policies import Policy, agents_for, load_policy, restart
-from coopenv.runs.console import Progress, compile_notice
+from coopenv.backends.base import Backend
+from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.observers.registry import available_names
+from coopenv.policies import Policy, restart
+from coopenv.runs.console import compile_notice
 from coopenv.runs.rollouts import play
-from coopenv.runs.video import film_at, frame_stride, open_film
+from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import SceneRecord
+from coopenv.viz.scene import Frame, SceneRecord, Source
 from coopenv.viz.topview import TopView, Window
+from coopenv.viz.web.panel import Abilities
 
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
 HELP = "Arrow keys: faster, slower, left, right. r: again. Escape: leave."
@@ -38,15 +37,12 @@ class Keys:
         self.struck: set[str] = set()
         """Keys pressed since the set was cleared."""
         canvas.mpl_connect("key_press_event", self._press)
-        canvas.mpl_connect("key_release_event", self._release)
+        canvas.mpl_connect("key_release_event", lambda event: self.held.discard(event.key))
 
     def _press(self, event: Any) -> None:
         if event.key is not None:
             self.held.add(event.key)
             self.struck.add(event.key)
-
-    def _release(self, event: Any) -> None:
-        self.held.discard(event.key)
 
     def direction(self, plus: str, minus: str) -> float:
         """Return 1, -1 or 0 by which of two keys is held."""
@@ -89,51 +85,45 @@ class Keyboard:
         return actions
 
 
-FILMS = ("video.mp4", "video.gif")
-
-
-class Clock:
-    """Lets simulated time pass as fast as real time, or as many times as fast."""
-
-    def __init__(self, speed: float = 1.0) -> None:
-        self._speed, self._begin = speed, 0.0
-
-    def start(self) -> None:
-        """Begin at 0 s."""
-        self._begin = time.monotonic()
-
-    def wait_until(self, moment: float) -> None:
-        """Sleep until a moment of simulated time, s."""
-        time.sleep(max(0.0, self._begin + moment / self._speed - time.monotonic()))
-
-
 class Stage:
     """One world, drawn as it runs."""
 
     def __init__(self, scenario: Scenario, log: Console) -> None:
         self.scenario, self.engine = scenario, Engine(scenario)
-        self.view = TopView(self.engine.backend.scenario)  # which may know of roads
+        self.stride = frame_stride(scenario)
+        """Camera ticks between pictures."""
+        self._view = TopView(self.engine.backend.scenario)  # which may know of roads
         with compile_notice(log):
             self.engine.load()
 
-    def first(self, seed: int) -> np.ndarray:
-        """Return the picture of the start."""
-        self.engine.reset([seed])
-        return self.view.draw(self.engine)
-
-    def run(
-        self, policy: Policy, seed: int, show: Callable[[np.ndarray], None], clock: Clock, going: Callable[[], bool]
-    ) -> None:
-        """Play an episode, and show it while `going` returns True."""
-        stride = frame_stride(self.scenario)
-        clock.start()
+    def pictures(self, policy: Policy, seed: int) -> Iterator[np.ndarray]:
+        """Play an episode and yield its pictures; the last one is of the end."""
         for tick in play(self.engine, [seed], self.scenario.horizon_ticks, policy, to_the_end=False):
-            if tick % stride == 0:
-                show(self.view.draw(self.engine))
-                if not going():
-                    return
-                clock.wait_until((tick + stride) / self.scenario.rates.camera)
-        show(self.view.draw(self.engine))
+            if tick % self.stride == 0:
+                yield self._view.draw(self.engine)
+        yield self._view.draw(self.engine)
+
+    def window(self, seed: int, window: Window | None, instead: str = "") -> Window:
+        """Return a window that shows the start of an episode; `instead` names what works without a display.
+
+        Raises:
+            CoopenvError: there is no display.
+        """
+        self.engine.reset([seed])
+        window = window or Window(self.scenario.title)
+        window.show(self._view.draw(self.engine))
+        if not window.is_open:
+            raise CoopenvError(f"there is no display to open a window on{instead}")
+        return window
+
+    def run(self, policy: Policy, seed: int, window: Window, speed: float, going: Callable[[], bool]) -> None:
+        """Show an episode at a multiple of real time while `going` returns True."""
+        begin, period = time.monotonic(), self.stride / self.scenario.rates.camera / speed
+        for number, picture in enumerate(self.pictures(policy, seed), start=1):
+            window.show(picture)
+            if not going():
+                return
+            time.sleep(max(0.0, begin + number * period - time.monotonic()))
 
     def outcomes(self) -> list[str]:
         """Return a line per vehicle: how it has ended so far, and how well it knows its place."""
@@ -145,47 +135,17 @@ class Stage:
         ]
 
 
-def opened(
-    scenario: Scenario, seed: int, log: Console, window: Window | None, instead: str = ""
-) -> tuple[Stage, Window]:
-    """Return a world and the window that shows its start; `instead` says what can be done where there is none.
-
-    Raises:
-        CoopenvError: there is no display.
-    """
-    stage, window = Stage(scenario, log), window or Window(scenario.title)
-    window.show(stage.first(seed))
-    if not window.is_open:
-        raise CoopenvError(f"there is no display to open a window on{instead}")
-    return stage, window
-
-
 def watch(
-    scenario: Scenario,
-    policy: Policy,
-    seed: int,
-    log: Console,
-    window: Window | None = None,
-    clock: Clock | None = None,
+    scenario: Scenario, policy: Policy, seed: int, log: Console, window: Window | None = None, speed: float = 1.0
 ) -> Stage:
-    """Show an episode in a window until it ends or the window is closed.
+    """Show an episode in a window until it ends or the window is closed, at a multiple of real time.
 
     Raises:
         CoopenvError: there is no display.
     """
-    stage, window = opened(scenario, seed, log, window, "; --out DIR writes a film instead")
-    stage.run(policy, seed, window.show, clock or Clock(), lambda: window.is_open)
-    return stage
-
-
-def film(scenario: Scenario, policy: Policy, seed: int, folder: Path, log: Console) -> Stage:
-    """Write an episode as a film to a folder."""
     stage = Stage(scenario, log)
-    with replacing_folder(folder, FILMS) as new:
-        made = open_film(new, scenario.rates.camera / frame_stride(scenario))
-        with made, Progress(log, f"filming {made.path.name}"):
-            stage.run(policy, seed, made.add, Clock(np.inf), lambda: True)
-            made.close()
+    shown = stage.window(seed, window, "; --out DIR writes a film instead")
+    stage.run(policy, seed, shown, speed, lambda: shown.is_open)
     return stage
 
 
@@ -196,99 +156,171 @@ def drive_by_hand(
     seed: int,
     log: Console,
     window: Window | None = None,
-    clock: Clock | None = None,
+    speed: float = 1.0,
 ) -> Stage:
     """Let the user drive a vehicle by the arrow keys, as often as wanted.
 
     Raises:
         CoopenvError: there is no display.
     """
-    stage, window = opened(scenario, seed, log, window)
+    stage = Stage(scenario, log)
+    shown = stage.window(seed, window)
     log.print(HELP)
-    keys = Keys(window.canvas)
+    keys = Keys(shown.canvas)
     policy = Keyboard(scenario, vehicle, others, keys)
-
-    def going() -> bool:
-        return window.is_open and not keys.struck & (LEAVE | AGAIN)
-
     while True:
         keys.struck.clear()
-        stage.run(policy, seed, window.show, clock or Clock(), going)
+        stage.run(policy, seed, shown, speed, lambda: shown.is_open and not keys.struck & (LEAVE | AGAIN))
         if not keys.struck & AGAIN:
             return stage
         seed += 1
 
 
-def vehicle_index(scenario: Scenario, name: str | None) -> int:
-    """Return the index of a driven vehicle by its name; of the first one without a name.
+def vehicle_index(scenario: Scenario, name: str | None, driven: bool = False) -> int:
+    """Return the index of a vehicle by its name or by f1, f2, ...; of the first without a name.
+
+    `driven`: of those alone that actions drive.
 
     Raises:
-        CoopenvError: there is no such driven vehicle.
+        CoopenvError: there is no such vehicle.
     """
-    pairs = zip(scenario.vehicle_names, scenario.vehicles, strict=True)
-    driven = [known for known, vehicle in pairs if vehicle.motion.kind == "driven"]
-    if not driven:
+    pairs = enumerate(zip(scenario.vehicle_names, scenario.vehicles, strict=True))
+    known = {own: i for i, (own, vehicle) in pairs if not driven or vehicle.motion.kind == "driven"}
+    if not known:
         raise CoopenvError("all motion here is prescribed, there is nothing to drive")
-    if name is not None and name not in driven:
-        raise CoopenvError(f"--vehicle {name}: no such driven vehicle; known: {', '.join(driven)}")
-    return scenario.vehicle_names.index(name or driven[0])
-
-
-def others_of(scenario: Scenario, environment: str, name: str | None, seed: int) -> Policy:
-    """Return the policy of the vehicles without a human driver: the named one, the baseline, or standing still."""
     if name is None:
-        name = "route_follower" if "route_follower" in agents_for(environment) else "zero"
-    return load_policy(name, scenario, seed)
+        return min(known.values())
+    found = known | {f"f{i + 1}": i for i in known.values()}
+    if name not in found:
+        kind = "driven vehicle" if driven else "vehicle"
+        raise CoopenvError(f"--vehicle {name}: no such {kind}{suggest(name, known)}; known: {listed([*known])}")
+    return found[name]
 
 
-def write_film(
-    record: SceneRecord,
-    path: Path,
-    fps: float,
-    speed: float = 1.0,
-    width: int = 896,
-    panel: bool = True,
-    on_progress: Callable[[float], None] = lambda share: None,
-) -> int:
-    """Write a film of a scene; return how many pictures it has.
+class Reel:
+    """Frames, one after the other; those that have been are kept. Nothing can be changed in those of a kept scene."""
 
-    Args:
-        record: the scene.
-        path: of the film, which is replaced as a whole; its suffix is the format.
-        fps: pictures a second; frames of the scene are repeated where it has fewer.
-        speed: times real time.
-        width: of the pictures, pixels, at most.
-        panel: table and legend beside the map.
-        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
+    def __init__(self, scenario: Scenario, source: Source, length: float, coming: Iterable[Frame]) -> None:
+        """Begin with none; `length` is that of the episode, s."""
+        self.scenario, self.source, self.length, self._coming = scenario, source, length, iter(coming)
+        self.frames: list[Frame] = []
+        self.real_time = False
+        """Whether frames come when they come."""
 
-    Raises:
-        CoopenvError: unknown format, or it needs an extra.
-        OutputError: the file cannot be written.
-    """
-    film_at(path, fps)  # before anything is drawn
-    chosen = frames_at(record.time, fps, speed)
-    with (
-        replacing_file(path) as new,
-        closing(TopView(record.scenario, panel=panel)) as view,
-        film_at(new, fps) as film,
-    ):
-        for done, k in enumerate(chosen, start=1):
-            film.add(_within(view.paint(record.frame(int(k))), width))
-            on_progress(done / len(chosen))
-        film.close()
-    return len(chosen)
+    @classmethod
+    def of(cls, record: SceneRecord) -> "Reel":
+        """Return the frames of a scene that a run has kept."""
+        return cls(record.scenario, record.source, record.length, map(record.frame, range(len(record))))
 
+    def more(self) -> bool:
+        """Append the next frame; return False where there is none."""
+        frame = next(self._coming, None)
+        if frame is not None:
+            self.frames.append(frame)
+        return frame is not None
 
-def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
-    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
-    count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
-    moments = time[0] + np.arange(count) * speed / fps
-    return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)
+    def abilities(self) -> Abilities:
+        """Return what one can do."""
+        return Abilities()
+
+    def change(self, observer: str | None = None, fault: Mapping[str, Any] | None = None) -> None:
+        """Go through the episode again from its start to the present.
+
+        Args:
+            observer: name of the one that estimates now (None: the same).
+            fault: changes of the scenario's dotted keys in place of those of an earlier fault (None: the same).
+
+        Raises:
+            CoopenvError: that is not valid, or nothing can be changed here; all is as before then.
+        """
+        raise CoopenvError("nothing can be changed here")
+
+    def close(self) -> None:
+        """Let go of everything."""
 
 
-def _within(picture: np.ndarray, width: int) -> np.ndarray:
-    """Return a picture that is no wider than that."""
-    if picture.shape[1] <= width:
-        return picture
-    size = width, round(picture.shape[0] * width / picture.shape[1])
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS))
+class EngineReel(Reel):
+    """The frames of an episode that runs while it is watched."""
+
+    def __init__(
+        self,
+        open_backend: Callable[[Mapping[str, Any]], Backend],
+        name: str,
+        seed: int,
+        driver: Callable[[Scenario], tuple[Policy | None, str]],
+    ) -> None:
+        """Open the backend and build everything.
+
+        Args:
+            open_backend: returns the backend under changes of the scenario's dotted keys.
+            name: of what is shown.
+            seed: of the episode.
+            driver: returns the policy in a scenario, and its name.
+
+        Raises:
+            CoopenvError: something of it cannot be.
+        """
+        self._open, self._name, self._seed, self._driver = open_backend, name, seed, driver
+        self._observer: Mapping[str, Any] = {}
+        self._fault: Mapping[str, Any] = {}
+        self._begin()
+
+    def _begin(self) -> None:
+        """Build everything; no frame is there yet."""
+        backend = self._open({**self._observer, **self._fault})
+        scenario, able = backend.scenario, backend.capabilities
+        policy, driver = (None, "") if able.recorded else self._driver(scenario)
+        self.engine = engine = Engine(scenario, backend=backend)
+        engine.load()
+        ticks = play(engine, [self._seed], scenario.horizon_ticks, policy, to_the_end=False)
+        stride = max(1, round(scenario.rates.camera / MAX_FPS))
+        source = source_of(engine, self._name, None if able.real_time else self._seed, driver)
+        super().__init__(scenario, source, scenario.horizon, (Frame.of(engine) for tick in ticks if tick % stride == 0))
+        self.real_time = able.real_time
+
+    def change(self, observer: str | None = None, fault: Mapping[str, Any] | None = None) -> None:
+        """Build everything anew, and run up to where it was."""
+        before = dict(vars(self))
+        self._observer = self._observer if observer is None else {"observer.name": observer}
+        self._fault = self._fault if fault is None else fault
+        try:
+            self._begin()
+            while len(self.frames) < len(before["frames"]) and self.more():
+                pass
+        except BaseException:
+            failed = self.engine
+            vars(self).update(before)
+            if failed is not self.engine:
+                failed.close()
+            raise
+        before["engine"].close()
+
+    def close(self) -> None:
+        """Close the engine."""
+        self.engine.close()
+
+    def abilities(self) -> Abilities:
+        """Return what one can do."""
+        if self.real_time:
+            return Abilities(pace=False, seek=False)
+        running = self.scenario.observer.name
+        others = [name for name in available_names() if name != running]
+        simulated = not self.engine.backend.capabilities.recorded
+        return Abilities(observers=(running, *others), faults=tuple(FAULTS) if simulated else ())
+
+
+FAULTS: dict[str, Callable[[float, int], dict[str, Any]]] = {
+    "half of the messages corrupted from now on": lambda time, vehicle: {
+        "faults.corruption.probability": 0.5,
+        "faults.corruption.start": time,
+    },
+    "picked vehicle lies by 5 m from now on": lambda time, vehicle: {
+        f"vehicles.{vehicle}.faults": {"lie": {"kind": "jump", "start": time}}
+    },
+    "picked vehicle's computer restarts now": lambda time, vehicle: {
+        f"vehicles.{vehicle}.faults": {"restart": {"chance": 1.0, "time": time}}
+    },
+    "half of the messages lost, whole episode": lambda time, vehicle: {"v2x.loss": 0.5},
+    "half of the detections missed, whole episode": lambda time, vehicle: {"camera.miss_probability": 0.5},
+}
+"""By name: what is changed of the scenario, for a time in s and a vehicle."""

@@ -7,7 +7,7 @@ from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_envs
 from coopenv.runs import scenario_text
 from coopenv.runs.scenario_text import drawn, graded
-from coopenv.runs.summary import facts, shown_sections
+from coopenv.runs.summary import cell_text, environment_rows, facts, shown_sections
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS, Term
 
@@ -148,16 +148,10 @@ def _end(name: str, measured: str) -> Iterator[str]:
 
 def index_text(scenarios: dict[str, Scenario]) -> str:
     """Return the page that lists environments, each with a page beside it."""
+    columns = ("title", "vehicles", "landmarks", "motion", "horizon_s")
     rows = [
-        (
-            f"[`{name}`]({name}.md)",
-            scenario.title,
-            f"{len(scenario.vehicles)}",
-            f"{len(scenario.landmarks)}",
-            "driven" if scenario.driven else "prescribed",
-            number(scenario.horizon),
-        )
-        for name, scenario in scenarios.items()
+        (f"[`{row['name']}`]({row['name']}.md)", *(cell_text(row[key]) for key in columns))
+        for row in environment_rows(scenarios)
     ]
     lines = [
         "# Environments",

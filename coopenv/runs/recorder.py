@@ -1,6 +1,7 @@
 """Recordings of episodes, and trajectories written for other tools."""
 
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -97,14 +98,10 @@ def write_tum(trajectory: Trajectory, folder: str | Path) -> list[Path]:
             "estimate": (trajectory.position_estimate[:, i], trajectory.rotation_estimate[:, i]),
         }
         for kind, (position, rotation) in poses.items():
+            known = np.isfinite(position).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
+            quaternion = quaternion_wxyz(rotation[known])[:, [1, 2, 3, 0]]
+            text = StringIO()
+            np.savetxt(text, np.column_stack([trajectory.t[known], position[known], quaternion]), "%.9f")
             paths.append(folder / f"{name}_{kind}.tum")
-            replace_text(paths[-1], tum_text(trajectory.t, position, rotation))
+            replace_text(paths[-1], text.getvalue())
     return paths
-
-
-def tum_text(t: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> str:
-    """Return poses of times (K,) s, positions (K, 3) m and rotations (K, 3, 3), body to map, as a TUM file."""
-    known = np.isfinite(position).all(axis=1) & np.isfinite(rotation).all(axis=(1, 2))
-    quaternion = quaternion_wxyz(rotation[known])[:, [1, 2, 3, 0]]
-    rows = np.column_stack([t[known], position[known], quaternion])
-    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows.tolist())

@@ -1,31 +1,26 @@
 """The setting of a scenario in words: texts, rows of fields, and what is drawn anew in every episode."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
 
-from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.base.sections import Section
 from coopenv.scenario.bodies import (
-    Body,
     ConstantMotion,
     DrivenMotion,
     InitialEstimate,
     InitialPose,
-    Landmark,
-    LandmarkGroup,
     SegmentMotion,
     TrafficMotion,
     Vehicle,
     WaypointMotion,
 )
 from coopenv.scenario.learning import PARAMETERS
-from coopenv.scenario.routes import Route
 from coopenv.scenario.schema import Scenario, neighbour_sets
 from coopenv.scenario.sensing import Camera
 
@@ -73,6 +68,11 @@ def orientation(yaw: float | None, quaternion_wxyz: Sequence[float] | None) -> s
     return None if quaternion_wxyz is None else f"turned {turn(quaternion_wxyz)}"
 
 
+def lines(*facts: object) -> str:
+    """Return one line per fact that is there."""
+    return "\n".join(str(fact) for fact in facts if fact)
+
+
 def start(vehicle: Vehicle) -> str:
     """Return where a vehicle starts, one line per fact."""
     if isinstance(vehicle.motion, WaypointMotion):
@@ -80,56 +80,27 @@ def start(vehicle: Vehicle) -> str:
     if vehicle.initial_pose is None and not vehicle.routes:
         return "drawn by highway-env"
     pose = vehicle.initial_pose or InitialPose()
-    if pose.position is None:
-        lines = ["start of its route"]
-    else:
-        lines = [vector(pose.position), orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"]
-    if any(pose.position_spread):
-        lines.append(f"+- {vector(pose.position_spread)}")
-    if pose.yaw_spread:
-        lines.append(f"+- {number(math.degrees(pose.yaw_spread))} deg")
-    return "\n".join(lines)
-
-
-def place(landmark: Landmark) -> str:
-    """Return where a landmark stands, one line per fact."""
-    lines = [f"drawn by group {landmark.group}" if landmark.group else vector(landmark.position)]
-    if any(landmark.position_spread):
-        lines.append(f"+- {vector(landmark.position_spread)}")
-    if landmark.presence < 1.0:
-        lines.append(f"there with {number(100.0 * landmark.presence)} %")
-    return "\n".join(lines)
-
-
-def drawn_route(route: Route) -> str:
-    """Return how a route is drawn, one line per fact; empty where it is always the same."""
-    lines = [f"shifted by +- {number(route.lateral_spread)}"] if route.lateral_spread else []
-    lines += [f"wanders by {number(route.wander)}"] if route.wander else []
-    lines += [f"begun along the first {number(route.start_spread)}"] if route.start_spread else []
-    return "\n".join(lines)
-
-
-def areas(group: LandmarkGroup) -> str:
-    """Return where a group draws its landmarks, one line per area."""
-    boxes = [f"{vector(box.center)} +- {vector(box.half)}" for box in group.boxes]
-    return "\n".join([*boxes, *(f"{vector(line.start)} to {vector(line.end)}" for line in group.lines)])
+    return lines(
+        "start of its route" if pose.position is None else vector(pose.position),
+        pose.position and (orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"),
+        any(pose.position_spread) and f"+- {vector(pose.position_spread)}",
+        pose.yaw_spread and f"+- {number(math.degrees(pose.yaw_spread))} deg",
+    )
 
 
 def estimate(belief: InitialEstimate) -> str:
     """Return what the observer believes at t = 0, one line per fact."""
-    lines = ["true position" if belief.position is None else vector(belief.position)]
-    if any(belief.position_offset):
-        lines.append(f"+ {vector(belief.position_offset)}")
-    if belief.position_radius:
-        lines.append(f"within {number(belief.position_radius)} m")
-    lines.append(orientation(belief.yaw, belief.quaternion_wxyz) or "true orientation")
-    if belief.orientation_offset_wxyz != (1.0, 0.0, 0.0, 0.0):
-        lines.append(f"off by {turn(belief.orientation_offset_wxyz)}")
-    if belief.orientation_angle == "uniform":
-        lines.append("turned at random, over SO(3)")
-    elif belief.orientation_angle:
-        lines.append(f"within {number(math.degrees(belief.orientation_angle))} deg")
-    return "\n".join(lines)
+    angle = belief.orientation_angle
+    return lines(
+        "true position" if belief.position is None else vector(belief.position),
+        any(belief.position_offset) and f"+ {vector(belief.position_offset)}",
+        belief.position_radius and f"within {number(belief.position_radius)} m",
+        orientation(belief.yaw, belief.quaternion_wxyz) or "true orientation",
+        belief.orientation_offset_wxyz != (1.0, 0.0, 0.0, 0.0) and f"off by {turn(belief.orientation_offset_wxyz)}",
+        "turned at random, over SO(3)"
+        if isinstance(angle, str)
+        else angle and f"within {number(math.degrees(angle))} deg",
+    )
 
 
 def motion(moves: Any) -> str:
@@ -178,18 +149,15 @@ def twist(linear: Sequence[float], angular: Sequence[float]) -> str:
 
 def vehicle_motion(vehicle: Vehicle) -> str:
     """Return a vehicle's motion and goal in words."""
-    radius = number(vehicle.goal_radius)
-    if vehicle.routes:
-        routes = " or ".join(vehicle.routes)
-        return f"{motion(vehicle.motion)}\ngoal: within {radius} m of the end of its route: {routes}"
-    if vehicle.goal is None or vehicle.goal.position is None:
-        return motion(vehicle.motion)
-    return f"{motion(vehicle.motion)}\ngoal: within {radius} m of {vector(vehicle.goal.position)}"
+    place = f"the end of its route: {' or '.join(vehicle.routes)}" if vehicle.routes else ""
+    if not place and vehicle.goal is not None and vehicle.goal.position is not None:
+        place = vector(vehicle.goal.position)
+    return lines(motion(vehicle.motion), place and f"goal: within {number(vehicle.goal_radius)} m of {place}")
 
 
-def body(box: Body | None) -> str:
-    """Return a body's size, m; empty without one."""
-    return "" if box is None else " x ".join(number(edge) for edge in box.size)
+def size(edges: Sequence[float]) -> str:
+    """Return the size of a box, m."""
+    return " x ".join(map(number, edges))
 
 
 def neighbours(scenario: Scenario) -> list[str]:
@@ -203,17 +171,6 @@ def neighbours(scenario: Scenario) -> list[str]:
     return result
 
 
-def drawn(scenario: Scenario) -> Iterator[str]:
-    """Yield one line per thing that every world draws for itself at every reset."""
-    yield from _of_vehicles(scenario)
-    yield from _of_landmarks(scenario)
-    yield from _of_errors(scenario)
-    for name, (what, _, _) in PARAMETERS.items():
-        low, high = scenario.randomisation.factors(name)
-        if (low, high) != (1.0, 1.0):
-            yield f"a factor of {what}: {number(low)} to {number(high)}"
-
-
 def graded(scenario: Scenario) -> Iterator[str]:
     """Yield one line per thing that grows with the difficulty."""
     for name, (what, _, _) in PARAMETERS.items():
@@ -222,7 +179,8 @@ def graded(scenario: Scenario) -> Iterator[str]:
             yield f"a factor of {what}: {number(low)} at difficulty 0, {number(high)} at 1"
 
 
-def _of_vehicles(s: Scenario) -> Iterator[str]:
+def drawn(s: Scenario) -> Iterator[str]:
+    """Yield one line per thing that every world draws for itself at every reset."""
     if s.highway is not None:
         yield f"roads and traffic, by highway-env's `{s.highway.id}`"
     several = [name for name, v in zip(s.vehicle_names, s.vehicles, strict=True) if len(v.routes) > 1]
@@ -236,32 +194,23 @@ def _of_vehicles(s: Scenario) -> Iterator[str]:
     yield from _spans("a vehicle's start to either side", poses, lambda p: p.position_spread[1], "m", "+- ")
     yield from _spans("a vehicle's start in height", poses, lambda p: p.position_spread[2], "m", "+- ")
     yield from _spans("a vehicle's heading", poses, lambda p: math.degrees(p.yaw_spread), "deg", "+- ")
-    motions = [vehicle.motion for vehicle in s.vehicles]
-    yield from _spans(
-        "a vehicle's first speed", motions, lambda m: getattr(m, "initial_speed_spread", 0.0), "m/s", "+- "
-    )
+    driven = [v.motion for v in s.vehicles if isinstance(v.motion, DrivenMotion)]
+    yield from _spans("a vehicle's first speed", driven, lambda m: m.initial_speed_spread, "m/s", "+- ")
     moving = [*s.vehicles, *s.landmarks]
     yield from _spans("pace of a prescribed motion", moving, lambda m: 100.0 * m.pace_spread, "%", "+- ")
     yield from _absent("a vehicle", s.vehicles)
-
-
-def _of_landmarks(s: Scenario) -> Iterator[str]:
     for group in s.landmark_groups:
         sort, count = ("areas", len(group.boxes)) if group.boxes else ("lines", len(group.lines))
         where = f"{count} {sort}" if count > 1 else f"one {sort.removesuffix('s')}"
         yield f"the places of {group.count} landmarks `{group.name}`, over {where}"
-    spread = [mark for mark in s.landmarks if any(mark.position_spread)]
-    yield from _spans("place of a landmark along an axis", spread, lambda m: max(m.position_spread), "m", "+- ")
+    yield from _spans("place of a landmark along an axis", s.landmarks, lambda m: max(m.position_spread), "m", "+- ")
     yield from _absent("a landmark", s.landmarks)
-
-
-def _of_errors(s: Scenario) -> Iterator[str]:
     beliefs = [vehicle.initial_estimate for vehicle in s.vehicles]
     yield from _spans("offset of an initial estimate", beliefs, lambda b: b.position_radius, "m")
-    if any(belief.orientation_angle == "uniform" for belief in beliefs):
+    angles = {belief.orientation_angle for belief in beliefs}
+    if "uniform" in angles:
         yield "turn of an initial estimate: over SO(3)"
-    turned = [belief for belief in beliefs if belief.orientation_angle != "uniform"]
-    yield from _spans("turn of an initial estimate", turned, lambda b: math.degrees(b.orientation_angle), "deg")
+    yield from _spans("turn of an initial estimate", [*angles - {"uniform"}], math.degrees, "deg")
     noises = [noise for noise in s.noises if noise.enabled]
     cameras = [camera for camera, noise in zip(s.cameras, s.noises, strict=True) if noise.enabled]
     deviation = "standard deviation "
@@ -269,22 +218,28 @@ def _of_errors(s: Scenario) -> Iterator[str]:
     yield from _spans("bias of the gyro", noises, lambda n: math.degrees(np.max(n.gyro_bias)), "deg/s", deviation)
     yield from _spans("turn of a camera", cameras, lambda c: math.degrees(c.extrinsics_error), "deg", deviation)
     yield from _spans("offset of a camera", cameras, lambda c: c.extrinsics_position_error, "m", deviation)
+    for name, (what, _, _) in PARAMETERS.items():
+        low, high = s.randomisation.factors(name)
+        if (low, high) != (1.0, 1.0):
+            yield f"a factor of {what}: {number(low)} to {number(high)}"
 
 
-def _spans(what: str, parts: Sequence[Any], of: Callable[[Any], float], unit: str, kind: str = "") -> Iterator[str]:
+def _spans(
+    what: str, parts: Sequence[Any], of: Callable[[Any], float], unit: str, kind: str = "up to "
+) -> Iterator[str]:
     """Yield one line on a spread, from the least to the largest value other than 0."""
-    values = sorted({float(of(part)) for part in parts} - {0.0})
-    if values:
-        low, high = number(values[0]), number(values[-1])
-        kind = kind or "up to "
-        yield f"{what}: {kind}{high if low == high else f'{low} .. {high}'} {unit}"
+    if values := sorted({float(of(part)) for part in parts} - {0.0}):
+        yield f"{what}: {kind}{_range(values)} {unit}"
 
 
 def _absent(what: str, parts: Sequence[Any]) -> Iterator[str]:
-    chances = sorted({part.presence for part in parts} - {1.0})
-    if chances:
-        low, high = (number(100.0 * chance) for chance in (chances[0], chances[-1]))
-        yield f"whether {what} is there: with {low if low == high else f'{low} .. {high}'} %"
+    if chances := sorted({part.presence for part in parts} - {1.0}):
+        yield f"whether {what} is there: with {_range([100.0 * chance for chance in chances])} %"
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = number(values[0]), number(values[-1])
+    return low if low == high else f"{low} .. {high}"
 
 
 IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
@@ -304,87 +259,65 @@ def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Listing]:
 
     `grouped`: whether landmarks that a group draws have rows of their own.
     """
-    marks = landmarks(scenario, grouped)
-    tables = (vehicles(scenario), routes(scenario), marks, groups(scenario), motions(scenario), buildings(scenario))
-    yield from (_without_empty_columns(table) for table in tables if table.rows)
-
-
-def _without_empty_columns(table: Listing) -> Listing:
-    kept = [i for i in range(len(table.columns)) if any(row[i] for row in table.rows)]
-    rows = [tuple(row[i] for i in kept) for row in table.rows]
-    return Listing(table.title, tuple(table.columns[i] for i in kept), rows)
-
-
-def vehicles(scenario: Scenario) -> Listing:
-    """Return one row per vehicle: start, initial estimate, motion, neighbours."""
+    pairs = zip(scenario.vehicle_names, scenario.vehicles, neighbours(scenario), strict=True)
+    vehicles = ((name, start(v), estimate(v.initial_estimate), vehicle_motion(v), seen) for name, v, seen in pairs)
     columns = ("vehicle", "start", "initial estimate", "motion", "may measure")
-    targets_of = neighbours(scenario)
-    rows = [
-        (name, start(vehicle), estimate(vehicle.initial_estimate), vehicle_motion(vehicle), targets)
-        for name, vehicle, targets in zip(scenario.vehicle_names, scenario.vehicles, targets_of, strict=True)
-    ]
-    return Listing("Vehicles (m)", columns, rows)
-
-
-def routes(scenario: Scenario) -> Listing:
-    """Return one row per route."""
-    rows = []
-    for route in scenario.routes:
-        points = ", ".join(vector(point) for point in route.waypoints)
-        rows.append((route.name, points, f"radius {number(route.corner_radius)}", drawn_route(route)))
-    return Listing("Routes (m)", ("route", "waypoints", "corners", "drawn"), rows)
-
-
-def landmarks(scenario: Scenario, grouped: bool = True) -> Listing:
-    """Return one row per landmark, those of groups included or not."""
-    rows = [
-        (mark.name, place(mark), motion(mark.motion), body(mark.body) or "none")
+    yield from _listing("Vehicles (m)", columns, vehicles)
+    routes = (
+        (
+            *(r.name, ", ".join(map(vector, r.waypoints)), f"radius {number(r.corner_radius)}"),
+            lines(
+                r.lateral_spread and f"shifted by +- {number(r.lateral_spread)}",
+                r.wander and f"wanders by {number(r.wander)}",
+                r.start_spread and f"begun along the first {number(r.start_spread)}",
+            ),
+        )
+        for r in scenario.routes
+    )
+    yield from _listing("Routes (m)", ("route", "waypoints", "corners", "drawn"), routes)
+    landmarks = (
+        (
+            mark.name,
+            lines(
+                f"drawn by group {mark.group}" if mark.group else vector(mark.position),
+                any(mark.position_spread) and f"+- {vector(mark.position_spread)}",
+                mark.presence < 1.0 and f"there with {number(100.0 * mark.presence)} %",
+            ),
+            *(motion(mark.motion), size(mark.body.size) if mark.body else "none"),
+        )
         for mark in scenario.landmarks
         if grouped or mark.group is None
-    ]
-    return Listing("Landmarks (m)", ("landmark", "position", "motion", "body"), rows)
-
-
-def groups(scenario: Scenario) -> Listing:
-    """Return one row per group of landmarks."""
-    rows = [
-        (group.name, str(group.count), areas(group), " to ".join(number(z) for z in group.height))
+    )
+    yield from _listing("Landmarks (m)", ("landmark", "position", "motion", "body"), landmarks)
+    groups = (
+        (
+            *(group.name, str(group.count)),
+            lines(
+                *(f"{vector(box.center)} +- {vector(box.half)}" for box in group.boxes),
+                *(f"{vector(line.start)} to {vector(line.end)}" for line in group.lines),
+            ),
+            " to ".join(map(number, group.height)),
+        )
         for group in scenario.landmark_groups
-    ]
-    return Listing("Groups of landmarks (m)", ("group", "landmarks", "drawn in", "height"), rows)
+    )
+    yield from _listing("Groups of landmarks (m)", ("group", "landmarks", "drawn in", "height"), groups)
+    named = zip(scenario.vehicle_names, scenario.vehicles, strict=True)
+    moving = [*((name, v.motion) for name, v in named), *((mark.name, mark.motion) for mark in scenario.landmarks)]
+    rows = (("" if i else name, *stage) for name, moves in moving for i, stage in enumerate(stages(moves)))
+    yield from _listing("Stages of motion (s)", ("who", "time", "motion"), rows)
+    boxes = (
+        (box.name, vector(box.center), size(box.size), f"{number(math.degrees(box.yaw))} deg")
+        for box in scenario.obstacles
+    )
+    yield from _listing("Buildings (m)", ("building", "centre", "size", "yaw"), boxes)
 
 
-def motions(scenario: Scenario) -> Listing:
-    """Return one row per stage of every motion that is prescribed stage by stage."""
-    moving = [*(v.motion for v in scenario.vehicles), *(m.motion for m in scenario.landmarks)]
-    names = [*scenario.vehicle_names, *(m.name for m in scenario.landmarks)]
-    rows = [
-        ("" if i else name, time, stage)
-        for name, motion in zip(names, moving, strict=True)
-        for i, (time, stage) in enumerate(stages(motion))
-    ]
-    return Listing("Stages of motion (s)", ("who", "time", "motion"), rows)
-
-
-def buildings(scenario: Scenario) -> Listing:
-    """Return one row per building."""
-    rows = []
-    for obstacle in scenario.obstacles:
-        yaw = orientation(obstacle.yaw, None) or ""
-        size = " x ".join(number(edge) for edge in obstacle.size)
-        rows.append((obstacle.name, vector(obstacle.center), size, yaw.removeprefix("yaw ")))
-    return Listing("Buildings (m)", ("building", "centre", "size", "yaw"), rows)
-
-
-def observation(scenario: Scenario) -> Listing:
-    """Return one row per field of the flat observation."""
-    layout, rows = observation_layout(scenario), []
-    for name, field in layout.items():
-        shape, part = "x".join(map(str, field.shape)), f"{field.start}:{field.stop}"
-        meaning = f"{field.meaning}; center {number(field.center)}" if field.center else field.meaning
-        rows.append((name, part, shape, field.unit, number(field.scale), meaning))
-    title = f"Observation: {layout.size} entries per vehicle, each (value - center) / scale, clipped"
-    return Listing(title, ("field", "slice", "shape", "unit", "scale", "meaning"), rows)
+def _listing(title: str, columns: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> Iterator[Listing]:
+    """Yield a table without empty columns; nothing where there are no rows."""
+    kept = [(name, cells) for name, *cells in zip(columns, *rows, strict=True) if any(cells)]
+    if kept:
+        names, *cells = zip(*((name, *column) for name, column in kept), strict=True)
+        yield Listing(title, names, cells)
 
 
 def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str, bool]]:

@@ -1,35 +1,51 @@
-"""Scenes of episodes: kept while they run, or read from what a run has left; and the pages that play them."""
+"""Scenes of episodes, kept while they run or read from what a run has left; the pages, films and logs made of them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from importlib.util import find_spec
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from rich.console import Console
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.mcap import write_recording
 from coopenv.backends.sources import SourceKind, kind_of, open_backend
-from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import list_agents, list_envs
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import replacing_file, writing
+from coopenv.base.installation import list_envs
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, states_covariance
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.rollouts import play
-from coopenv.runs.video import frame_stride
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import Frame, SceneRecord, SceneWriter, Source
+from coopenv.viz.scene import SceneRecord, SceneWriter, Source
 from coopenv.viz.scene.record import SCENE_FILE
 
 BASELINE = "route_follower"
 MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
+MAX_FPS = 20.0
+
+
+def frame_stride(scenario: Scenario) -> int:
+    """Return the camera ticks between pictures: one per decision, but at most `MAX_FPS` a second."""
+    return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
+
+
+def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Source:
+    """Return the heading of a scene; a recording has no seed and no driver, a prescribed motion no driver."""
+    scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
+    driver = policy if scenario.driven and not recorded else ""
+    return Source.of(name, scenario, policy=driver, seed=None if recorded else seed)
 
 
 class Keeper:
@@ -42,12 +58,13 @@ class Keeper:
         self.engine = engine
         self._last = -1
 
-    def tick(self, tick: int) -> Frame | None:
-        """Keep what is there at a tick if it is one that is drawn, and return it; else None."""
-        if tick % self._stride:
-            return None
-        self._last = tick
-        return self._writer.add(self.engine)
+    def tick(self, tick: int) -> bool:
+        """Keep what is there at a tick if it is one that is drawn; return whether it is."""
+        drawn = tick % self._stride == 0
+        if drawn:
+            self._last = tick
+            self._writer.add(self.engine)
+        return drawn
 
     def record(self) -> SceneRecord:
         """Return what has been kept, and what is there now."""
@@ -80,31 +97,29 @@ def scene_of(
     keeper, scenario = Keeper(engine, source), engine.backend.scenario
     ticks = int(min(scenario.horizon_ticks, longest * scenario.rates.camera))
     for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
-        if keeper.tick(tick) is not None:
+        if keeper.tick(tick):
             on_progress(tick / ticks)
     return keeper.record()
 
 
-class Onlooker:
-    """Keeps the scene of an episode that another loop plays; `on_tick` is called at every tick."""
+def played_scene(
+    backend: Backend,
+    name: str,
+    log: Console,
+    seed: int | None = None,
+    policy: Policy | None = None,
+    driver: str = "",
+    longest: float = np.inf,
+) -> SceneRecord:
+    """Play an episode of a backend with progress shown and return its scene; arguments as for `scene_of`.
 
-    def __init__(self, name: str, seed: int, policy: str) -> None:
-        """Say what it is of."""
-        self._name, self._seed, self._policy = name, seed, policy
-        self._keeper: Keeper | None = None
-
-    def on_tick(self, engine: Engine, tick: int) -> None:
-        """Look at the engine."""
-        if self._keeper is None:
-            scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
-            policy = self._policy if scenario.driven and not recorded else ""
-            seed = None if recorded else self._seed
-            self._keeper = Keeper(engine, Source.of(self._name, scenario, seed=seed, policy=policy))
-        self._keeper.tick(tick)
-
-    def record(self) -> SceneRecord | None:
-        """Return what has been seen; None: nothing."""
-        return None if self._keeper is None else self._keeper.record()
+    `name` and `driver` stand in its heading.
+    """
+    with closing(Engine(backend.scenario, backend=backend)) as engine:
+        with compile_notice(log):
+            engine.load()
+        with Progress(log, "replaying" if backend.capabilities.recorded else "running", 1.0) as progress:
+            return scene_of(engine, source_of(engine, name, seed, driver), policy, progress.update, longest)
 
 
 def saved_scene(name: str | Path) -> SceneRecord | None:
@@ -134,19 +149,13 @@ def driver_of(name: str | None, scenario: Scenario, environment: str, seed: int)
     if not scenario.driven:
         return None, ""
     if name is None:
-        known = Path(environment).stem
-        name = BASELINE if BASELINE in agents_for(known) or _can_drive(BASELINE, scenario) else "zero"
+        name = BASELINE
+        if BASELINE not in agents_for(Path(environment).stem):
+            try:
+                find_agent(BASELINE).policy(scenario)
+            except CoopenvError:
+                name = "zero"
     return load_policy(name, scenario, seed), Path(name).name
-
-
-def _can_drive(name: str, scenario: Scenario) -> bool:
-    if name not in list_agents():
-        return False
-    try:
-        find_agent(name).policy(scenario)
-    except CoopenvError:
-        return False
-    return True
 
 
 def open_source(
@@ -164,34 +173,9 @@ def open_source(
     """
     changes = dict(overrides)
     if observer is not None:
-        from coopenv.observers.registry import find, named
-
         changes["observer.name"] = named(observer)
         find(changes["observer.name"])  # before anything is read
     return open_backend(name, None, changes, data, variant, topics=topics)
-
-
-def scene_of_recording(
-    name: str,
-    log: Console,
-    observer: str | None = None,
-    data: Path | None = None,
-    variant: str | None = None,
-) -> SceneRecord:
-    """Return the scene of a log file or a data set, with progress shown: all of it, or its first `MOST_SHOWN` s.
-
-    Raises:
-        CoopenvError: there is no such recording, or the observer fails on it.
-    """
-    backend = open_source(name, {}, observer, data, variant)
-    scenario = backend.scenario
-    first = f", first {MOST_SHOWN:g} s of {scenario.horizon:.0f} s" if scenario.horizon > MOST_SHOWN else ""
-    source = Source.of(title_of(name) + first, scenario)
-    with closing(Engine(scenario, backend=backend)) as engine:
-        with compile_notice(log):
-            engine.load()
-        with Progress(log, "replaying", 1.0) as progress:
-            return scene_of(engine, source, None, progress.update, MOST_SHOWN)
 
 
 def title_of(name: str) -> str:
@@ -220,6 +204,139 @@ def pages_can_be_written(path: Path, log: Console) -> bool:
     if not has_viser():
         log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
     return has_viser()
+
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+"""Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
+VIDEO_FILES = ("video.mp4", "video.gif")
+"""Names of a film in a folder of results, with and without the extra."""
+SMALL = 480
+"""Largest width of a GIF or WebP where none is asked for, pixels: its pictures are held in memory until the end."""
+
+
+def check_film(path: Path) -> None:
+    """Make sure that a film can have the format that its path names.
+
+    Raises:
+        OutputError: no such format.
+        CoopenvError: the format needs an extra.
+    """
+    if path.suffix not in SUFFIXES:
+        raise OutputError(f"{path}: unknown format of a film; known: {', '.join(SUFFIXES)}")
+    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise CoopenvError(f"{path}: MP4 needs an extra: pip install '.[video]'; GIF and WebP do not")
+
+
+def video_path(folder: Path) -> Path:
+    """Return the path of a film in a folder of results: MP4, or GIF without the extra."""
+    return folder / VIDEO_FILES[find_spec("imageio_ffmpeg") is None]
+
+
+def write_film(
+    record: SceneRecord,
+    path: Path,
+    fps: float,
+    speed: float = 1.0,
+    width: int | None = 896,
+    panel: bool = True,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> int:
+    """Write a film of a scene; return how many pictures it has.
+
+    Args:
+        record: the scene.
+        path: of the film, which is replaced as a whole; its suffix is the format.
+        fps: pictures a second; frames of the scene are repeated where it has fewer.
+        speed: times real time.
+        width: as for `write_pictures`.
+        panel: table and legend beside the map.
+        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
+
+    Raises:
+        CoopenvError: unknown format, or it needs an extra.
+        OutputError: the file cannot be written.
+    """
+    from coopenv.viz.topview import TopView
+
+    check_film(path)
+    chosen = frames_at(record.time, fps, speed)
+
+    def pictures() -> Iterator[np.ndarray]:
+        for done, k in enumerate(chosen, start=1):
+            yield view.paint(record.frame(int(k)))
+            on_progress(done / len(chosen))
+
+    with replacing_file(path) as new, closing(TopView(record.scenario, panel=panel)) as view:
+        write_pictures(new, fps, pictures(), width)
+    return len(chosen)
+
+
+def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
+    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
+    count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
+    moments = time[0] + np.arange(count) * speed / fps
+    return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)
+
+
+def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width: int | None = None) -> None:
+    """Write pictures, (H, W, 3) uint8, as they come, as a film in the format that its path names; none: no file.
+
+    Those that are wider than `width` pixels are made smaller (None: MP4 of any width, the others of at most `SMALL`).
+
+    Raises:
+        OutputError: the film cannot be written.
+    """
+    mp4 = path.suffix == ".mp4"
+    widest = width or (None if mp4 else SMALL)
+    images = (_no_wider(Image.fromarray(picture), widest) for picture in pictures)
+    if mp4:
+        _write_mp4(path, fps, images)
+        return
+    quality: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
+    if kept := [image if quality else image.quantize(64) for image in images]:
+        ends = np.round(np.arange(len(kept) + 1) * 100.0 / fps) * 10.0
+        duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second
+        with writing(path):
+            kept[0].save(path, save_all=True, append_images=kept[1:], duration=duration, loop=0, **quality)
+
+
+def _no_wider(image: Image.Image, width: int | None) -> Image.Image:
+    if width is None or image.width <= width:
+        return image
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+
+
+def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
+    """Write H.264 and read it back: ffmpeg's writer does not report a full disk."""
+    import imageio_ffmpeg
+
+    @contextmanager
+    def told() -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError):
+            raise OutputError(f"cannot write to {path}: ffmpeg could not finish it; the disk may be full") from None
+
+    writer, count = None, 0
+    try:
+        for image in images:
+            count += 1
+            width, height = (edge // 2 * 2 for edge in image.size)  # even, as the codec asks for
+            with told():
+                if writer is None:
+                    look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+                    writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
+                    writer.send(None)
+                writer.send(image.crop((0, 0, width, height)).tobytes())
+        with told():
+            if writer is not None:
+                writer.close()
+                if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
+                    raise OSError
+    finally:
+        if writer is not None:
+            with suppress(OSError, RuntimeError):
+                writer.close()
 
 
 _ON_A_PLANE = "planar_robust"

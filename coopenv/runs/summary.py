@@ -20,7 +20,8 @@ from coopenv.observers.registry import description, observer_names
 from coopenv.policies import find_agent
 from coopenv.runs import scenario_text
 from coopenv.runs.scenario_text import Listing, settings
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.scenes import scene_rows
 from coopenv.scenario.sensing import Noise
 
 DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
@@ -71,75 +72,13 @@ def facts(scenario: Scenario) -> dict[str, str]:
     return found | {"Ends": _end(scenario)}
 
 
-def _vehicles(scenario: Scenario) -> str:
-    driven = sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles)
-    goals = sum(vehicle.goal_radius > 0 for vehicle in scenario.vehicles)
-    fastest = [
-        own.max_speed for own, v in zip(scenario.limits, scenario.vehicles, strict=True) if v.motion.kind == "driven"
-    ]
-    parts = [f"{driven} driven by actions, up to {_span(fastest)} m/s"] if driven else []
-    prescribed = "prescribed" if driven else "with prescribed motion"
-    others = f"{len(scenario.vehicles) - driven} " + ("in traffic" if scenario.highway else prescribed)
-    parts += [others] if driven < len(scenario.vehicles) else []
-    return "; ".join([*parts, *([f"{goals} with a goal"] if goals else [])])
-
-
-def _targets(scenario: Scenario) -> str:
-    moving = sum(landmark.motion.kind != "static" for landmark in scenario.landmarks)
-    buildings = f", {_several(len(scenario.obstacles), 'building')}" if scenario.obstacles else ""
-    mode = {
-        "fixed": "fixed topology: every neighbour is measured in every frame",
-        "sensed": "sensed topology: what is in the field of view and not hidden is measured",
-    }[scenario.topology.mode]
-    if scenario.sensing != "sensed":
-        mode = {"ideal": "every neighbour is measured in every frame", "blind": "nothing is measured"}[scenario.sensing]
-        mode = f"{scenario.sensing} sensing: {mode}"
-    also = f" ({moving} moving)" if moving else ""
-    others = ", other vehicles" if len(scenario.vehicles) > 1 else ""
-    return f"{_several(len(scenario.landmarks), 'landmark')}{also}{others}{buildings}; {mode}"
+def _joined(separator: str, *parts: object) -> str:
+    """Return the parts that are there."""
+    return separator.join(str(part) for part in parts if part)
 
 
 def _several(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def _camera(scenario: Scenario) -> str:
-    camera, noise = scenario.camera, scenario.noise.bearing
-    size = f", {camera.image_size[0]} x {camera.image_size[1]} pixels" if camera.model == "pinhole" else ""
-    reach = f", up to {number(camera.range)} m" if camera.range is not None else ""
-    misses = f", misses {number(100 * camera.miss_probability)} %" if camera.miss_probability else ""
-    unit = "rad" if noise.model == "isotropic" else "on the image plane"
-    spread = f", {noise.model} noise {number(noise.scale)} {unit}" if scenario.noise.enabled else ", no noise"
-    off = [f"{number(camera.extrinsics_error)} rad"] if camera.extrinsics_error else []
-    off += [f"{number(camera.extrinsics_position_error)} m"] if camera.extrinsics_position_error else []
-    place = f"; mounted off by {' and '.join(off)} per axis" if off and scenario.noise.enabled else ""
-    return f"{camera.model}{size}{reach}{misses}; bearings{spread}{place}"
-
-
-def _lasting(noise: Noise) -> str:
-    """Return the lasting errors of the odometry in words."""
-    parts = [f"scale error {number(100 * noise.odometry_scale)} %"] if noise.odometry_scale else []
-    bias = np.degrees(np.max(noise.gyro_bias))
-    parts += [f"gyro bias {number(bias)} deg/s"] if bias else []
-    walks = noise.odometry_scale_walk or np.any(noise.gyro_bias_walk)
-    parts += ["walking on"] if walks else []
-    parts += [f"{number(noise.slip.rate)} slips a second"] if noise.slip.rate else []
-    return "".join(f", {part}" for part in parts) if noise.enabled else ""
-
-
-def _v2x(scenario: Scenario) -> str:
-    radio = scenario.v2x
-    parts = [f"a message every {'frame' if radio.period == 1 else f'{radio.period} frames'}"]
-    parts.append(f"delay {radio.delay} frame{'' if radio.delay == 1 else 's'}, loss {number(100 * radio.loss)} %")
-    parts += [f"range {number(radio.range)} m"] if radio.range is not None else []
-    parts += [f"unused when older than {number(radio.staleness)} s"] if radio.staleness is not None else []
-    parts += ["leaders to followers only"] if scenario.topology.acyclic else []
-    return ", ".join(parts)
-
-
-def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
-    several = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
-    return _span(several)
 
 
 def _span(values: Collection[float]) -> str:
@@ -148,19 +87,90 @@ def _span(values: Collection[float]) -> str:
     return number(low) if low == high else f"{number(low)} to {number(high)}"
 
 
+def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
+    return _span(value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,))
+
+
 def _own(scenario: Scenario, part: str) -> str:
     """Return which vehicles have a camera, noise or limits of their own."""
     names = [name for name, v in zip(scenario.vehicle_names, scenario.vehicles, strict=True) if getattr(v, part)]
     return f"; {listed(names)} with entries of their own" if names else ""
 
 
+def _vehicles(scenario: Scenario) -> str:
+    pairs = zip(scenario.limits, scenario.vehicles, strict=True)
+    fastest = [own.max_speed for own, vehicle in pairs if vehicle.motion.kind == "driven"]
+    others = len(scenario.vehicles) - len(fastest)
+    goals = sum(vehicle.goal_radius > 0 for vehicle in scenario.vehicles)
+    kind = "in traffic" if scenario.highway else "prescribed" if fastest else "with prescribed motion"
+    driven = fastest and f"{len(fastest)} driven by actions, up to {_span(fastest)} m/s"
+    return _joined("; ", driven, others and f"{others} {kind}", goals and f"{goals} with a goal")
+
+
+def _targets(scenario: Scenario) -> str:
+    moving = sum(landmark.motion.kind != "static" for landmark in scenario.landmarks)
+    mode = {
+        "fixed": "fixed topology: every neighbour is measured in every frame",
+        "sensed": "sensed topology: what is in the field of view and not hidden is measured",
+    }[scenario.topology.mode]
+    if scenario.sensing != "sensed":
+        mode = {"ideal": "every neighbour is measured in every frame", "blind": "nothing is measured"}[scenario.sensing]
+        mode = f"{scenario.sensing} sensing: {mode}"
+    landmarks = _several(len(scenario.landmarks), "landmark") + (f" ({moving} moving)" if moving else "")
+    buildings = scenario.obstacles and _several(len(scenario.obstacles), "building")
+    return f"{_joined(', ', landmarks, len(scenario.vehicles) > 1 and 'other vehicles', buildings)}; {mode}"
+
+
+def _camera(scenario: Scenario) -> str:
+    camera, noise, noisy = scenario.camera, scenario.noise.bearing, scenario.noise.enabled
+    unit = "rad" if noise.model == "isotropic" else "on the image plane"
+    off = _joined(
+        " and ",
+        camera.extrinsics_error and f"{number(camera.extrinsics_error)} rad",
+        camera.extrinsics_position_error and f"{number(camera.extrinsics_position_error)} m",
+    )
+    seen = _joined(
+        ", ",
+        camera.model,
+        camera.model == "pinhole" and f"{camera.image_size[0]} x {camera.image_size[1]} pixels",
+        camera.range is not None and f"up to {number(camera.range)} m",
+        camera.miss_probability and f"misses {number(100 * camera.miss_probability)} %",
+    )
+    spread = f"{noise.model} noise {number(noise.scale)} {unit}" if noisy else "no noise"
+    return f"{seen}; bearings, {spread}" + (f"; mounted off by {off} per axis" if off and noisy else "")
+
+
+def _lasting(noise: Noise) -> str:
+    """Return the lasting errors of the odometry in words."""
+    bias = np.degrees(np.max(noise.gyro_bias))
+    errors = _joined(
+        ", ",
+        noise.odometry_scale and f"scale error {number(100 * noise.odometry_scale)} %",
+        bias and f"gyro bias {number(bias)} deg/s",
+        (noise.odometry_scale_walk or np.any(noise.gyro_bias_walk)) and "walking on",
+        noise.slip.rate and f"{number(noise.slip.rate)} slips a second",
+    )
+    return f", {errors}" if errors and noise.enabled else ""
+
+
+def _v2x(scenario: Scenario) -> str:
+    radio = scenario.v2x
+    return _joined(
+        ", ",
+        f"a message every {'frame' if radio.period == 1 else f'{radio.period} frames'}",
+        f"delay {_several(radio.delay, 'frame')}",
+        f"loss {number(100 * radio.loss)} %",
+        radio.range is not None and f"range {number(radio.range)} m",
+        radio.staleness is not None and f"unused when older than {number(radio.staleness)} s",
+        scenario.topology.acyclic and "leaders to followers only",
+    )
+
+
 def _end(scenario: Scenario) -> str:
-    steps = round(scenario.horizon * scenario.rates.decision)
-    ends = scenario.termination
-    causes = [word for word in ("collision", "arrival") if scenario.driven and getattr(ends, word)] + [*ends.own]
-    causes += [f"{number(ends.off_route)} m off its route"] if ends.off_route else []
-    early = f"; for a vehicle at {' or '.join(causes)}" if causes else ""
-    return f"after {number(scenario.horizon)} s, {steps} decisions{early}"
+    steps, ends = round(scenario.horizon * scenario.rates.decision), scenario.termination
+    own = (word for word in ("collision", "arrival") if scenario.driven and getattr(ends, word))
+    causes = _joined(" or ", *own, *ends.own, ends.off_route and f"{number(ends.off_route)} m off its route")
+    return f"after {number(scenario.horizon)} s, {steps} decisions" + (f"; for a vehicle at {causes}" if causes else "")
 
 
 def document(name: str, scenario: Scenario) -> dict[str, Any]:
@@ -207,7 +217,16 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
     for name in names:
         yield section_table(name, getattr(scenario, name), width)
         yield ""
-    yield listing_table(scenario_text.observation(scenario))
+    layout = observation_layout(scenario)
+    rows = [
+        (
+            *(name, f"{field.start}:{field.stop}", "x".join(map(str, field.shape)), field.unit, number(field.scale)),
+            f"{field.meaning}; center {number(field.center)}" if field.center else field.meaning,
+        )
+        for name, field in layout.items()
+    ]
+    title = f"Observation: {layout.size} entries per vehicle, each (value - center) / scale, clipped"
+    yield listing_table(Listing(title, ("field", "slice", "shape", "unit", "scale", "meaning"), rows))
 
 
 def shown_sections(scenario: Scenario) -> list[str]:
@@ -219,11 +238,9 @@ def shown_sections(scenario: Scenario) -> list[str]:
 def listing_table(listing: Listing) -> Table:
     """Return a listing as a table."""
     table = _table(*listing.columns, title=listing.title)
-    for i, (name, column) in enumerate(zip(listing.columns, table.columns, strict=True)):
+    for name, column, *cells in zip(listing.columns, table.columns, *listing.rows, strict=True):
         if name in WHOLE_COLUMNS:
-            column.min_width = min(
-                WHOLE_WIDTH, max(len(line) for row in listing.rows for line in row[i].splitlines() or [""])
-            )
+            column.min_width = min(WHOLE_WIDTH, max(len(line) for cell in cells for line in cell.splitlines() or [""]))
     for row in listing.rows:
         table.add_row(*row)
     return table
@@ -257,42 +274,34 @@ COLUMNS = {
 """What the tables show of the rows."""
 
 
-def environment_rows() -> list[dict[str, Any]]:
-    """Return the rows of `list envs`."""
-    from coopenv.scenario import load_scenario
-
-    rows = []
-    for name in list_envs():
-        scenario = load_scenario(name)
-        rows.append(
-            {
-                "name": name,
-                "title": scenario.title,
-                "id": environment_id(name),
-                "vehicles": len(scenario.vehicles),
-                "landmarks": len(scenario.landmarks),
-                "motion": "driven" if scenario.driven else "prescribed",
-                "horizon_s": scenario.horizon,
-            }
-        )
-    return rows
-
-
-def observer_rows() -> list[dict[str, Any]]:
-    """Return the rows of `list observers`."""
-    return [{"name": name, "about": description(name)} for name in observer_names()]
-
-
-def agent_rows() -> list[dict[str, Any]]:
-    """Return the rows of `list agents`."""
+def environment_rows(scenarios: Mapping[str, Scenario]) -> list[dict[str, Any]]:
+    """Return a row per environment."""
     return [
         {
-            "name": agent.name,
-            "kind": agent.kind,
-            "environments": list(agent.environments),
-            "about": _sentence(agent.description),
+            "name": name,
+            "title": scenario.title,
+            "id": environment_id(name),
+            "vehicles": len(scenario.vehicles),
+            "landmarks": len(scenario.landmarks),
+            "motion": "driven" if scenario.driven else "prescribed",
+            "horizon_s": scenario.horizon,
         }
-        for agent in map(find_agent, list_agents())
+        for name, scenario in scenarios.items()
+    ]
+
+
+def list_rows(kind: str) -> Sequence[Mapping[str, Any]]:
+    """Return the rows of `coopenv list`, for a key of `COLUMNS`."""
+    if kind == "envs":
+        return environment_rows({name: load_scenario(name) for name in list_envs()})
+    if kind == "observers":
+        return [{"name": name, "about": description(name)} for name in observer_names()]
+    if kind == "scenes":
+        return scene_rows()
+    agents = map(find_agent, list_agents())
+    return [
+        {"name": a.name, "kind": a.kind, "environments": list(a.environments), "about": _sentence(a.description)}
+        for a in agents
     ]
 
 
@@ -308,11 +317,12 @@ def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Tab
         number = bool(rows) and isinstance(rows[0][key], int | float)
         table.add_column(heading, justify="right" if number else "left", no_wrap=key != columns[-1])
     for row in rows:
-        table.add_row(*(_text(row[key]) for key in columns))
+        table.add_row(*(cell_text(row[key]) for key in columns))
     return table
 
 
-def _text(value: Any) -> str:
+def cell_text(value: Any) -> str:
+    """Return a value of a row."""
     if isinstance(value, list):
         return ", ".join(value)
     return f"{value:g}" if isinstance(value, float) else str(value)

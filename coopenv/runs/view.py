@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, error_text
-from coopenv.runs.reels import FAULTS, Reel
-from coopenv.runs.video import MAX_FPS
+from coopenv.runs.live import FAULTS, Reel
+from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
 from coopenv.viz.web.actors import SentProperties
@@ -60,7 +60,7 @@ class Viewer:
         self._follow, self._alone = True, False
         self.shown = 0
         """How many frames have been sent."""
-        self._remember(first)
+        self._history.add(first)
         self._show(monotonic())
 
     def pick(self, vehicle: int | None) -> None:
@@ -92,7 +92,8 @@ class Viewer:
             again = "; Restart shows it again" if self._reel.abilities().seek else ""
             self._panel.set_status(f"The episode is over{again}.")
             return False
-        self._due += self._period() / self._speed
+        ticks = self._frame.tick - self._reel.frames[self._k - 1].tick
+        self._due += float(ticks) / self._reel.scenario.rates.camera / self._speed
         return True
 
     def _step(self) -> bool:
@@ -100,19 +101,12 @@ class Viewer:
         if self._k + 1 == len(self._reel.frames) and not self._reel.more():
             return False
         self._k += 1
-        self._remember(self._frame)
+        self._history.add(self._frame)
         return True
 
     @property
     def _frame(self) -> Frame:
         return self._reel.frames[self._k]
-
-    def _period(self) -> float:
-        ticks = self._frame.tick - self._reel.frames[self._k - 1].tick
-        return float(ticks) / self._reel.scenario.rates.camera
-
-    def _remember(self, frame: Frame) -> None:
-        self._history.add(frame)
 
     def _show(self, now: float) -> None:
         """Send the present frame; who is slow gets the latest one only, since messages replace one another."""
@@ -166,6 +160,8 @@ class Viewer:
             try:
                 if name.startswith("show "):
                     setattr(self._look, name.removeprefix("show "), value)
+                elif name in ("follow", "alone"):
+                    setattr(self, f"_{name}", value)
                 else:
                     getattr(self, f"_wish_{name}")(value)
             except Exception as error:  # a wish never ends the view
@@ -194,7 +190,7 @@ class Viewer:
 
     def _wish_restart(self, _: object) -> None:
         self._k = 0
-        self._remember(self._frame)
+        self._history.add(self._frame)
         self._panel.set_status("")
         self._set_playing(True)
 
@@ -209,16 +205,9 @@ class Viewer:
         ticks = np.array([frame.tick for frame in self._reel.frames])
         self._k = int(np.argmin(np.abs(ticks - tick)))
         for frame in self._reel.frames[max(0, self._k - 300) : self._k + 1]:
-            self._remember(frame)
+            self._history.add(frame)
 
-    def _wish_vehicle(self, vehicle: int | None) -> None:
-        self._panel.pick(vehicle)
-
-    def _wish_follow(self, follow: bool) -> None:
-        self._follow = follow
-
-    def _wish_alone(self, alone: bool) -> None:
-        self._alone = alone
+    _wish_vehicle = pick
 
     def _wish_magnification(self, magnification: float) -> None:
         self._look.magnification = magnification
@@ -240,7 +229,7 @@ class Viewer:
         self._k = min(self._k, len(self._reel.frames) - 1)
         self._history = History(self._reel.scenario.rates.camera)
         for frame in self._reel.frames[: self._k + 1]:
-            self._remember(frame)
+            self._history.add(frame)
         self._picture.actors.set_source(self._reel.source)
         self._panel.set_source(self._reel.source)
         self._panel.set_status("")

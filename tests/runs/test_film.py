@@ -1,8 +1,12 @@
-"""Films of scenes: which frames they show, and in which formats."""
+"""Films: which frames of a scene they show, in which formats, whole or told to be not."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
+from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +15,10 @@ from PIL import Image
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.runs.live import frames_at, write_film
-from coopenv.runs.scenes import scene_of
+from coopenv.runs.scenes import frame_stride, frames_at, scene_of, write_film, write_pictures
 from coopenv.viz.scene import SceneRecord, Source
 from coopenv.viz.topview import TopView
+from tests.helpers.processes import small_disk
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,59 @@ def test_other_formats_and_missing_extras_are_told(
 ) -> None:
     with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
         write_film(record, tmp_path / "film.avi", fps=10.0)
-    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"pip install '\.\[video\]'"):
         write_film(record, tmp_path / "film.mp4", fps=10.0)
     assert not list(tmp_path.iterdir())
+
+
+def test_films_play_in_real_time(tmp_path: Path) -> None:
+    assert frame_stride(coopenv.load_scenario("busy_intersection")) == 6
+    assert frame_stride(coopenv.load_scenario("busy_intersection", {"rates.decision": 60.0})) == 3
+    path = tmp_path / "video.gif"
+    write_pictures(path, 15.0, (np.full((300, 960, 3), 10 * shade, dtype=np.uint8) for shade in range(15)))
+    with Image.open(path) as image:
+        assert image.size == (480, 150)
+        duration = 0
+        for frame in range(image.n_frames):
+            image.seek(frame)
+            duration += image.info["duration"]
+    assert duration == 1000
+
+
+def pictures(count: int) -> Iterator[np.ndarray]:
+    return iter(np.random.default_rng(1).integers(0, 256, (count, 241, 321, 3), dtype=np.uint8))
+
+
+def test_a_film_that_does_not_fit_on_the_disk_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    with (
+        small_disk(tmp_path / "disk", "200k") as disk,
+        pytest.raises(OutputError, match=r"video.mp4: ffmpeg could not finish it") as error,
+    ):
+        write_pictures(disk / "video.mp4", 10.0, pictures(12))
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nobody_writes_to_a_film_that_was_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    writers: list[Any] = []
+    begin = ffmpeg.write_frames
+    monkeypatch.setattr(ffmpeg, "write_frames", lambda *a, **k: (writers.append(begin(*a, **k)), writers[0])[1])
+
+    def broken() -> Iterator[np.ndarray]:
+        yield from pictures(1)
+        raise KeyError
+
+    with suppress(KeyError):
+        write_pictures(tmp_path / "video.mp4", 10.0, broken())
+    assert getgeneratorstate(writers[0]) == GEN_CLOSED
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_without_pictures_is_no_file(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    write_pictures(tmp_path / f"video{suffix}", 10.0, [])
+    assert list(tmp_path.iterdir()) == []

@@ -18,11 +18,11 @@ from coopenv.cli import main
 from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
-from coopenv.runs.live import Clock, Keyboard, Keys, drive_by_hand, watch
+from coopenv.runs.live import Keyboard, Keys, drive_by_hand, watch
 from coopenv.viz.topview import Window
 from tests.helpers.four_way import FOUR_WAY
 
-AT_ONCE = Clock(np.inf)
+AT_ONCE = np.inf
 SHORT = {"horizon": 3.0}
 
 
@@ -149,7 +149,7 @@ def test_without_a_display_one_line_says_so(capsys: pytest.CaptureFixture[str]) 
 def test_a_film_in_place_of_the_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
     out = tmp_path / "film"
     assert main(["watch", "route_follower", "--set", "horizon=2.0", "--out", str(out)]) == 0
     assert capsys.readouterr().out.count("under way, position error") == 4

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 import coopenv
@@ -24,7 +23,6 @@ from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.synthetic import make_trajectory
 
@@ -189,23 +187,6 @@ def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
     trajectory = recording.trajectory()
     vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 0.0)
     assert math.isnan(vehicles[0]["observability"]["share_observable"])
-
-
-def test_films_play_in_real_time(tmp_path: Path) -> None:
-    scenario = coopenv.load_scenario("busy_intersection")
-    assert frame_stride(scenario) == 6
-    assert frame_stride(coopenv.load_scenario("busy_intersection", {"rates.decision": 60.0})) == 3
-    film = GifFilm(tmp_path / "video.gif", fps=15.0)
-    for shade in range(15):
-        film.add(np.full((300, 960, 3), 10 * shade, dtype=np.uint8))
-    film.close()
-    with Image.open(film.path) as image:
-        assert image.size == (GIF_SIZE, 150)
-        duration = 0
-        for frame in range(image.n_frames):
-            image.seek(frame)
-            duration += image.info["duration"]
-    assert duration == 1000
 
 
 def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Rollout, list[dict[str, Any]]]:

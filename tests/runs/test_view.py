@@ -18,7 +18,7 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
-from coopenv.runs.reels import FAULTS, EngineReel, Reel, SavedReel, vehicle_index
+from coopenv.runs.live import FAULTS, EngineReel, Reel, vehicle_index
 from coopenv.runs.scenes import driver_of, open_source, scene_of
 from coopenv.runs.view import Viewer, free_port, serving
 from coopenv.viz.scene import Source
@@ -314,7 +314,7 @@ def test_when_cars_end_the_view_stays_and_waits() -> None:
 def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
     record = scene_of(Engine(scenario), Source.of("overtaking", scenario, seed=0))
-    reel = SavedReel(record)
+    reel = Reel.of(record)
     with serving("127.0.0.1", None) as (server, _):
         shown = Viewer(server, reel)
         wish(shown, ("seek", 1.0))
@@ -341,6 +341,6 @@ def test_a_port_that_is_taken_is_told() -> None:
 def test_vehicles_are_found_by_either_name() -> None:
     scenario = coopenv.load_scenario("overtaking")
     found = partial(vehicle_index, scenario)
-    assert [found(name) for name in (None, "f2", "vehicle_1")] == [None, 1, 0]
+    assert [found(name) for name in (None, "f2", "vehicle_1")] == [0, 1, 0]
     with pytest.raises(CoopenvError, match="--vehicle f9: no such vehicle"):
         found("f9")
