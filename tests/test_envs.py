@@ -55,18 +55,20 @@ def test_copies_go_on_where_the_original_is(name: str, copy_of: Callable[[Env], 
     env = coopenv.parallel_env(name)
     rollout(env, 4, 12)
     twin = copy_of(env)
-    rng_a, rng_b = np.random.default_rng(1), np.random.default_rng(1)
-    for _ in range(10):
-        assert_equal(env.step(random_actions(env, rng_a)), twin.step(random_actions(twin, rng_b)))
+    for actions in actions_of(env):
+        assert_equal(env.step(actions), twin.step(actions))
 
 
 def test_saved_state_restores_noise_too(name: str) -> None:
     env = coopenv.parallel_env(name)
     rollout(env, 4, 12)
-    saved = env.get_state()
-    rng = np.random.default_rng(1)
-    actions = [random_actions(env, rng) for _ in range(10)]
+    saved, actions = env.get_state(), actions_of(env)
     first = [env.step(action) for action in actions]
     env.reset(seed=99)
     env.set_state(saved)
     assert_equal([env.step(action) for action in actions], first)
+
+
+def actions_of(env: Env) -> list[dict[str, np.ndarray]]:
+    rng = np.random.default_rng(1)
+    return [random_actions(env, rng) for _ in range(10)]

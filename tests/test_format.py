@@ -1,12 +1,17 @@
-"""Numbers for people."""
+"""Numbers for people, and results as JSON."""
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from coopenv.base.format import column, fixed, in_parentheses, number, seconds, with_error
+from coopenv.base.format import column, fixed, in_parentheses, json_text, jsonable, number, seconds, with_error
 
 NAN = math.nan
 
@@ -77,3 +82,26 @@ def test_standard_errors_in_parentheses(value: float, error: float, text: str) -
 def test_a_number_and_its_error_have_the_same_decimals() -> None:
     assert with_error(0.01234, 0.00042) == ("0.0123", "0.0004")
     assert with_error(0.01234, NAN) == ("0.0123", "")
+
+
+@dataclass
+class Row:
+    name: str
+    value: float
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (np.float64("nan"), None),
+        ([math.inf, np.int64(3), np.array([1.0, np.nan])], [None, 3, [1.0, None]]),
+        ((True, "x", None, np.bool_(False)), [True, "x", None, False]),
+        (Row("y", -math.inf), {"name": "y", "value": None}),
+        (Path("out/run"), "out/run"),
+        (np.float32(0.5), 0.5),
+    ],
+)
+def test_numpy_and_nan_are_written_as_json_knows_them(value: Any, plain: Any) -> None:
+    assert json.loads(json_text({"a": value})) == {"a": plain}
+    assert json.loads(json.dumps(jsonable(value), allow_nan=False)) == plain
+    assert json_text(value).endswith("\n")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
+import json
+import os
+import subprocess
+import sys
 
 import pytest
 
-from tests.helpers.commands import ROOT, Commands, commands
+from tests.helpers.processes import ROOT
 
 WITHOUT = """
-import sys
+import json, os, subprocess, sys
 
 LIBRARIES = {
     "cryptography", "foxglove", "gtsam", "h5py", "highway_env", "imageio_ffmpeg", "lz4", "mcap", "minari", "moviepy",
@@ -32,23 +34,41 @@ import coopenv.runs.demo
 import coopenv.runs.dataset
 import coopenv.runs.live
 from coopenv.cli import main
+
+for command, folder in json.load(sys.stdin):
+    if os.fork() == 0:
+        os.chdir(folder)
+        os.dup2(os.open("/dev/null", os.O_WRONLY), 1)
+        os.dup2(os.open(folder + ".errors", os.O_WRONLY | os.O_CREAT), 2)
+        sys.argv = ["coopenv", *command.split()]
+        sys.exit(main())
+    status = os.waitstatus_to_exitcode(os.wait()[1])
+    print(json.dumps([command, status, open(folder + ".errors").read(), sorted(os.listdir(folder))]))
 """
 FLEET = ROOT / "examples" / "fleet" / "overtaking.toml"
-
-
-@pytest.fixture(scope="module")
-def without_extras(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
-    with commands(WITHOUT, tmp_path_factory.mktemp("printed")) as started:
-        yield started
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "drive.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(64))
-    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
-    (tmp_path / "topics.toml").write_text('environment = "crossing_path"\ncars = [{ name = "svea7" }]\n')
-    (tmp_path / "recorded.mcap").write_bytes(b"\x89MCAP0\r\n" + metadata("coopenv-drive"))
-    return tmp_path
+COMMANDS = {
+    "view crossing_path": "view",
+    "film crossing_path --out film.mp4": "video",
+    "run recorded.mcap": "log",
+    "describe recorded.mcap": "log",
+    "film recorded.mcap --out film.gif": "log",
+    "run drive.bag --map topics.toml": "log",
+    "import drive.bag": "log",
+    "record crossing_path --out new.mcap": "log",
+    "bench observers recorded.mcap": "log",
+    "train facade --out agent": "train",
+    "dataset facade": "minari",
+    "describe highway_intersection": "highway",
+    "bench observers overtaking --observers factor_graph": "bench",
+    "bench observers overtaking --engine ray": "ray",
+    "svea demo": "svea",
+    "svea router": "svea",
+    f"svea fake {FLEET} --car svea7": "svea",
+    f"svea run {FLEET}": "svea",
+    f"svea keys {FLEET} --out keys": "svea",
+    f"svea health {FLEET} --car svea7": "svea",
+}
+"""Command to the extra that it needs."""
 
 
 def metadata(name: str) -> bytes:
@@ -57,35 +77,27 @@ def metadata(name: str) -> bytes:
     return b"\x0c" + len(content).to_bytes(8, "little") + content
 
 
-@pytest.mark.parametrize(
-    ("command", "extra"),
-    [
-        ("view crossing_path", "view"),
-        ("film crossing_path --out film.mp4", "video"),
-        ("run recorded.mcap", "log"),
-        ("describe recorded.mcap", "log"),
-        ("film recorded.mcap --out film.gif", "log"),
-        ("run drive.bag --map topics.toml", "log"),
-        ("import drive.bag", "log"),
-        ("record crossing_path --out new.mcap", "log"),
-        ("bench observers recorded.mcap", "log"),
-        ("train facade --out agent", "train"),
-        ("dataset facade", "minari"),
-        ("describe highway_intersection", "highway"),
-        ("bench observers overtaking --observers factor_graph", "bench"),
-        ("bench observers overtaking --engine ray", "ray"),
-        ("svea demo", "svea"),
-        ("svea router", "svea"),
-        (f"svea fake {FLEET} --car svea7", "svea"),
-        (f"svea run {FLEET}", "svea"),
-        (f"svea keys {FLEET} --out keys", "svea"),
-        (f"svea health {FLEET} --car svea7", "svea"),
-    ],
-)
-def test_one_line_names_the_extra(command: str, extra: str, folder: Path, without_extras: Commands) -> None:
-    result = without_extras.run(command.split(), folder)
-    assert result.returncode == 2, result.stderr
-    assert len(result.stderr.splitlines()) == 1, result.stderr
-    assert f"pip install '.[{extra}]'" in result.stderr
-    names = {"drive.mcap", "drive.bag", "topics.toml", "recorded.mcap"}
-    assert {path.name for path in folder.iterdir()} == names
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, list[str]]]:
+    """Return the exit status, errors and folder of every command, each run in a fork of one interpreter."""
+    orders = []
+    for number, command in enumerate(COMMANDS):
+        folder = tmp_path_factory.getbasetemp() / f"extras_{number}"
+        folder.mkdir()
+        (folder / "drive.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(64))
+        (folder / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+        (folder / "topics.toml").write_text('environment = "crossing_path"\ncars = [{ name = "svea7" }]\n')
+        (folder / "recorded.mcap").write_bytes(b"\x89MCAP0\r\n" + metadata("coopenv-drive"))
+        orders.append((command, str(folder)))
+    program = [sys.executable, "-c", WITHOUT]
+    variables = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run(program, input=json.dumps(orders), stdout=subprocess.PIPE, text=True, env=variables)
+    return {command: rest for command, *rest in map(json.loads, result.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_one_line_names_the_extra(command: str, done: dict[str, tuple[int, str, list[str]]]) -> None:
+    status, errors, names = done[command]
+    assert (status, errors.count("\n")) == (2, 1), errors
+    assert f"pip install '.[{COMMANDS[command]}]'" in errors
+    assert names == ["drive.bag", "drive.mcap", "recorded.mcap", "topics.toml"]

@@ -1,4 +1,4 @@
-"""Classes of the user's own, by file and by module."""
+"""Classes of the user's own, by file and by module; what is known of the machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import absolute_reference, is_reference, load_reference
+from coopenv.base.installation import (
+    absolute_reference,
+    available_cores,
+    environment,
+    is_reference,
+    load_reference,
+    versions,
+)
 
 SOURCE = """
 from dataclasses import dataclass
@@ -96,3 +103,23 @@ def test_a_file_that_changes_within_a_second_is_read_again(tmp_path: Path, monke
         path.write_text(f"VALUE = {value}\n")
         os.utime(path, ns=(second, second + value))
         assert load_reference(f"{path}:VALUE") == value
+
+
+def test_variables_are_as_before_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COOPENV_TEST_ONE", "7")
+    monkeypatch.delenv("COOPENV_TEST_OTHER", raising=False)
+    with pytest.raises(ZeroDivisionError), environment({"COOPENV_TEST_ONE": "1", "COOPENV_TEST_OTHER": "2"}):
+        assert (os.environ["COOPENV_TEST_ONE"], os.environ["COOPENV_TEST_OTHER"]) == ("1", "2")
+        raise ZeroDivisionError
+    assert os.environ["COOPENV_TEST_ONE"] == "7"
+    assert "COOPENV_TEST_OTHER" not in os.environ
+
+
+def test_cores_are_counted_where_there_is_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert available_cores() == 1
+
+
+def test_what_is_not_installed_has_no_version() -> None:
+    assert set(versions("numpy", "no-such-distribution")) == {"python", "numpy"}
