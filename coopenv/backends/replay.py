@@ -34,11 +34,11 @@ def scenario_of(recording: Recording, name: str, overrides: Mapping[str, Any]) -
     if recording.ticks < 2:
         raise DataError(f"{name}: only {recording.ticks} tick recorded, nothing to replay")
     raw = _raw(recording, name)
-    for key, value in overrides.items():
+    for key in overrides:
         if str(key).split(".")[0] not in CHANGEABLE and key != "rates.decision":
             free = f"free to choose: {', '.join(CHANGEABLE)}, rates.decision"
             raise CoopenvError(f"override '{key}': {name} is recorded; {free}")
-        override(raw, str(key), value)
+    override(raw, overrides)
     scenario = parse_scenario(raw, name)
     if scenario.horizon_ticks > recording.ticks - 1:
         raise CoopenvError(f"horizon: {scenario.horizon:g} s are more than {name} has ({recording.t[-1]:g} s)")

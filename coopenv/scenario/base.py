@@ -31,6 +31,12 @@ def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
 
 
+def _points_somewhere(direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    if sum(x * x for x in direction) < 1e-12:
+        raise ValueError("must not be zero")
+    return direction
+
+
 def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
     """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
     if quaternion_wxyz is None:
@@ -59,6 +65,7 @@ def _readable(text: str) -> str:
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Vector2 = tuple[Number, Number]
 Vector3 = tuple[Number, Number, Number]
+Direction = Annotated[Vector3, AfterValidator(_points_somewhere)]
 QuaternionWxyz = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit_quaternion)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]

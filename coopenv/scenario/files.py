@@ -39,7 +39,11 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
     if overrides is not None and not isinstance(overrides, Mapping):
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     if isinstance(name_or_path, Scenario):
-        return _changed(name_or_path, overrides or {})
+        if not overrides:
+            return name_or_path
+        raw = name_or_path.model_dump(exclude_unset=True)
+        override(raw, overrides)
+        return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
     made = is_scene(str(name_or_path))
     path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     try:
@@ -47,8 +51,7 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
             raw = located(read_toml(path, ScenarioError, path.name), path.parent)
-        for key, value in (overrides or {}).items():
-            override(raw, str(key), value)
+        override(raw, overrides or {})
         raw = located(raw, Path.cwd())  # those of overrides
         return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
     except RecursionError:
@@ -58,16 +61,6 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
         if overrides and str(error).startswith(of_file) and _is_valid(name_or_path):
             raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
         raise
-
-
-def _changed(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
-    """Return a scenario under overrides; arguments and errors as for `load_scenario`."""
-    if not overrides:
-        return scenario
-    raw = scenario.model_dump(exclude_unset=True)
-    for key, value in overrides.items():
-        override(raw, str(key), value)
-    return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
 
 
 def _is_valid(name_or_path: str | Path) -> bool:
@@ -131,9 +124,10 @@ def _merged(under: Any, over: Any) -> Any:
     return {**under, **{key: _merged(under.get(key), value) for key, value in over.items()}}
 
 
-def override(raw: Any, key: str, value: Any) -> None:
-    """Set one dotted key in nested plain data, in place; a table is merged into the one that is there."""
-    _descend(raw, key.split("."), value, key)
+def override(raw: Any, overrides: Mapping[str, Any]) -> None:
+    """Set dotted keys in nested plain data, in place; a table is merged into the one that is there."""
+    for key, value in overrides.items():
+        _descend(raw, str(key).split("."), value, str(key))
 
 
 def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "") -> None:

@@ -24,8 +24,12 @@ from coopenv.scenario.terms import (
     Term,
 )
 
-SECTIONS = ("observation", "reward", "termination")
-"""Parts of a scenario with a table `custom`."""
+SECTIONS: Mapping[str, Registry[Any]] = {
+    "observation": OBSERVATION_FIELDS,
+    "reward": REWARD_TERMS,
+    "termination": TERMINATION_CONDITIONS,
+}
+"""Parts of a scenario with a table `custom`, and the terms that they may name."""
 
 
 def register_reward(name: str, function: Callable[..., Any], *, unit: str = "1", meaning: str = "") -> None:
@@ -154,27 +158,19 @@ def _located(row: Any, folder: Path) -> Any:
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario with terms of coopenv only, for recordings, which must not name code."""
     result = dict(raw)
-    for section in SECTIONS:
-        if not isinstance(result.get(section), dict):
+    for section, kind in SECTIONS.items():
+        if not isinstance(raw.get(section), dict):
             continue
-        part = result[section] = {key: value for key, value in result[section].items() if key != "custom"}
+        part = result[section] = {key: value for key, value in raw[section].items() if key != "custom"}
+        for key in ("weights", "scales", "centers"):
+            if isinstance(named := part.get(key), dict):
+                part[key] = {name: value for name, value in named.items() if name in kind.built_in}
+        for key in ("include", "exclude"):
+            if isinstance(names := part.get(key), list):
+                part[key] = [name for name in names if name in GROUPS or name in kind.built_in]
+        if part.get("include") == []:
+            part["include"] = list(USUAL_GROUPS)
         if section == "termination":
-            known = (*TERMINATION_CONDITIONS.built_in, "after_arrival")
+            known = (*kind.built_in, "after_arrival")
             result[section] = {key: on for key, on in part.items() if key in known}
-        elif isinstance(weights := part.get("weights"), dict):
-            part["weights"] = {name: weight for name, weight in weights.items() if name in REWARD_TERMS.built_in}
-        elif section == "observation":
-            result[section] = _observation_of_coopenv(part)
-    return result
-
-
-def _observation_of_coopenv(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the section of an observation without a user's own fields."""
-    result = dict(part)
-    for key in ("scales", "centers"):
-        if isinstance(of_field := result.get(key), dict):
-            result[key] = {name: value for name, value in of_field.items() if name in OBSERVATION_FIELDS.built_in}
-    if isinstance(include := result.get("include"), list):
-        kept = [name for name in include if name in GROUPS or name in OBSERVATION_FIELDS.built_in]
-        result["include"] = kept or list(USUAL_GROUPS)
     return result

@@ -224,7 +224,12 @@ def _problems(s: Scenario) -> Iterator[str]:
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
-    yield from _problems_of_routes(s)
+    names = [route.name for route in s.routes]
+    yield from (f"routes: the name '{name}' is used twice" for name in _twice(names))
+    for i, vehicle in enumerate(s.vehicles):
+        for key, name in [*(("routes", n) for n in vehicle.routes), *(("next_routes", n) for n in vehicle.next_routes)]:
+            if name not in names:
+                yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
     yield from _problems_of_draws(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
@@ -247,15 +252,6 @@ def _beyond_limits(s: Scenario) -> Iterator[str]:
             yield f"{where}.latency: {limits.latency:g} s is longer than one decision ({decision:g} s)"
         if steering is not None and steering > limits.max_steering:
             yield f"action.steering: {steering:g} rad is above {where}.max_steering ({limits.max_steering:g} rad)"
-
-
-def _problems_of_routes(s: Scenario) -> Iterator[str]:
-    names = [route.name for route in s.routes]
-    yield from (f"routes: the name '{name}' is used twice" for name in _twice(names))
-    for i, vehicle in enumerate(s.vehicles):
-        for key, name in [*(("routes", n) for n in vehicle.routes), *(("next_routes", n) for n in vehicle.next_routes)]:
-            if name not in names:
-                yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
 
 
 def _problems_of_draws(s: Scenario) -> Iterator[str]:

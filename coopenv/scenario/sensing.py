@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from coopenv.base.errors import shown
 from coopenv.base.sections import Section
 from coopenv.scenario.base import (
+    Direction,
     Loss,
     NonNegative,
     NonNegativeVector3,
@@ -123,16 +124,10 @@ class BearingNoise(Section):
     the tangent plane of the bearing."""
     scale: NonNegative = 0.0
     """`paper`: largest deviation (image plane at distance 1); `isotropic`: standard deviation per axis, rad."""
-    axis: Vector3 = (0.0, 0.0, 1.0)
+    axis: Direction = (0.0, 0.0, 1.0)
     """Optical axis of the paper's formula, in the camera frame."""
     rate: Rate | Sample = "sample"
     """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
-
-    @model_validator(mode="after")
-    def _axis_points_somewhere(self) -> Self:
-        if sum(x * x for x in self.axis) < 1e-12:
-            raise ValueError("axis: must not be zero")
-        return self
 
 
 class Slip(Section):
@@ -278,16 +273,10 @@ class Lie(Section):
     """Of `drift`, m/s."""
     age: Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)] = 1.0
     """Of `replay`, s; rounded to whole periods of the radio."""
-    direction: Vector3 | None = None
+    direction: Direction | None = None
     """Of what is added to the position, map axes, of any length (default: horizontal, drawn)."""
     std: Positive | None = None
     """What it claims to know its pose by, rad and m (default: its honest covariance)."""
-
-    @model_validator(mode="after")
-    def _direction_points_somewhere(self) -> Self:
-        if self.direction is not None and sum(x * x for x in self.direction) < 1e-12:
-            raise ValueError("direction: must not be zero")
-        return self
 
 
 class Faults(Section):

@@ -256,8 +256,7 @@ class Drive(TickGenerator):
         except (ValueError, TypeError, LookupError):
             raise DataError(f"{self._where}: {ATTACHMENT} is damaged") from None
         raw = without_own_terms(raw)
-        for key, value in overrides.items():
-            override(raw, key, value)
+        override(raw, overrides)
         scenario = parse_scenario(raw, f"{self._where}: {ATTACHMENT}")
         deployment = parse_deployment(given, Path(self._where))
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
