@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from hypothesis import settings
-
-from tests.helpers.chromium import chromium
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -22,6 +21,12 @@ MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
 STARTED = time.time()
 COMPILED = pytest.StashKey[int]()
+DRAWS_WITHOUT_A_GRAPHICS_CARD = [
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
 
 
 # The same examples at every run: a failure is then a change of the code, not of the luck.
@@ -39,9 +44,16 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser without a screen; of one module, as no two can be there at once, nor an event loop beside it."""
-    with chromium() as started:
+    """Debian's Chromium, headless; of one module, as no two can be there at once, nor an event loop beside it."""
+    reason = "needs chromium and playwright: make test-browser"
+    playwright = pytest.importorskip("playwright.sync_api", reason=reason)
+    program = shutil.which("chromium")
+    if program is None:
+        pytest.skip(reason)
+    with playwright.sync_playwright() as tools:
+        started = tools.chromium.launch(executable_path=program, args=DRAWS_WITHOUT_A_GRAPHICS_CARD)
         yield started
+        started.close()
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:

@@ -1,4 +1,4 @@
-"""Code that the pages show runs as it stands."""
+"""Programs and tables of single pages run as they stand; those of tutorials are in tests/sitegen/test_sessions.py."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +15,57 @@ import pytest
 
 from coopenv.api.reward import FIELDS, OTHERS
 from coopenv.api.terms.layout import observation_layout
-from coopenv.observers import registry, run
-from coopenv.observers.registry import find
+from coopenv.bench.study import read_study
+from coopenv.cars.bags.topic_map import load_map
+from coopenv.observers import registry
+from coopenv.observers import run as run_observer
 from coopenv.policies import load_agent
 from coopenv.runs.recorder import record
-from coopenv.scenario import load_scenario
+from coopenv.scenario import load_scenario, parse_scenario
+from coopenv.training.settings import Clone, read_settings
+from tests.helpers import bags, mrclam_files
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
+RUN = {"README.md", "agents.md", "backends.md", "bags.md", "cars.md", "data.md", "draws.md", "highway.md"}
+RUN |= {"observers.md", "replay.md", "terms.md", "trainers.md", "view.md"}
+"""Pages whose programs are run below."""
 
 
 def python_blocks(page: Path) -> list[str]:
     return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda page: page.name)
-def test_blocks_are_whole_programs(page: Path, tmp_path: Path) -> None:
-    for number, block in enumerate(python_blocks(page)):
+def run(page: Path, *without: str) -> list[dict[str, Any]]:
+    """Run a page's programs, but those that hold one of some words, and return the names of each."""
+    programs = []
+    for block in python_blocks(page):
+        if not any(word in block for word in without):
+            programs.append({"__name__": "__main__"})
+            exec(compile(block, page.name, "exec"), programs[-1])
+    return programs
+
+
+def tables(page: str) -> list[str]:
+    return re.findall(r"^```toml\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def test_every_page_with_programs_is_run() -> None:
+    assert {name for name, page in PAGES.items() if python_blocks(page)} == RUN
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_blocks_are_whole_programs(page: str, tmp_path: Path) -> None:
+    for number, block in enumerate(python_blocks(PAGES[page])):
         (tmp_path / f"block_{number}.py").write_text(block, encoding="utf-8")
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select=E9,F", "--no-cache", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_the_backend_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    (block,) = python_blocks(DOCS / "backends.md")
-    program: dict[str, Any] = {}
-    exec(compile(block, "backends.md", "exec"), program)
+def test_the_page_on_backends(capsys: pytest.CaptureFixture[str]) -> None:
+    (program,) = run(DOCS / "backends.md")
     assert "missing=24" in capsys.readouterr().out
     estimates = [info["estimate"]["position"] for info in program["infos"].values()]
     assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
@@ -47,11 +73,9 @@ def test_the_backend_runs(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_tutorials_observer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_registered", {})
-    blocks = python_blocks(DOCS / "observers.md")
-    assert blocks
-    for block in blocks:
-        exec(compile(block, "observers.md", "exec"), {})
-    result = run(find("mine"), record(load_scenario("busy_intersection_tracking", {"horizon": 5.0}), 0))
+    assert run(DOCS / "observers.md")
+    recording = record(load_scenario("busy_intersection_tracking", {"horizon": 5.0}), 0)
+    result = run_observer(registry.find("mine"), recording)
     assert not result.failure
     # vehicles 1 to 3 see two landmarks and more, and turn towards them
     assert (result.orientation_error[-1, :3] < result.orientation_error[0, :3]).all()
@@ -74,14 +98,131 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    first, own = python_blocks(DOCS / "agents.md")
-    exec(compile(first, "agents.md", "exec"), {})
+    run(DOCS / "agents.md", "class Mine")
     assert "arrival_rate: 0.9" in capsys.readouterr().out
-    (tmp_path / "mine.py").write_text(own, encoding="utf-8")
+    (tmp_path / "mine.py").write_text(python_blocks(DOCS / "agents.md")[1], encoding="utf-8")
     scenario = load_scenario("urban_crossing")
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
     rows = np.zeros((3, observation_layout(scenario).size), dtype=np.float32)
     np.testing.assert_array_equal(policy(rows), [[0.0, 0.0]] * 3)
+
+
+def test_the_front_page_steps_and_draws() -> None:
+    (program,) = run(ROOT / "README.md", "coopenv.compare")
+    assert program["picture"].ndim == 3 and len(program["infos"]) >= 1
+
+
+@pytest.mark.slow
+def test_the_front_page_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (program,) = run(ROOT / "README.md", "parallel_env")
+    assert program["found"].observers == ("riccati", "robust", "dead_reckoning")
+    assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+def test_the_page_on_bags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra 'log'")
+    monkeypatch.chdir(tmp_path)
+    bags.write(tmp_path / "drive", bags.messages(bags.drive()), "ros1")
+    a_map, *others = tables("bags.md")
+    for text in (a_map, *(a_map + other for other in others)):  # tables that a map can have
+        (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
+        assert load_map("topics.toml").cars[0].name == "svea3"
+    (tmp_path / "topics.toml").write_text(a_map.replace("marker = 7 ", "marker = 3 "), encoding="utf-8")
+    (program,) = run(DOCS / "bags.md")
+    assert program["env"].possible_agents == ["vehicle_1"]
+
+
+@pytest.mark.slow
+def test_the_page_on_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh", reason="needs the extra 'svea'")
+    monkeypatch.chdir(ROOT)
+    (program,) = run(DOCS / "cars.md")
+    assert {info["car"]["name"] for info in program["infos"].values()} <= {"svea1", "svea7"}
+
+
+def test_the_page_on_recorded_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recordings").mkdir()
+    mrclam_files.write(tmp_path / "recordings", 6, seconds=15.0)
+    run(DOCS / "data.md")
+    errors = np.array([float(number) for number in re.findall(r"\d\.\d+", capsys.readouterr().out)])
+    assert errors.shape == (5,) and (errors < 0.5).all()
+
+
+def test_the_page_on_draws() -> None:
+    (program,) = run(DOCS / "draws.md")
+    assert program["envs"].action_space.shape[0] == 16
+    lot = {
+        "title": "draws",
+        "horizon": 1.0,
+        "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}],
+        "vehicles": [{"motion": {"kind": "driven"}, "initial_pose": {"position": [0.0, 0.0, 0.0]}}],
+    }
+    routes, landmarks, factors = (tomllib.loads(text) for text in tables("draws.md"))
+    routes["routes"].append({"name": "straight", "waypoints": [[-8.0, -0.5], [8.0, -0.5]]})
+    assert parse_scenario(lot | routes, "draws.md").vehicles[0].routes == ("left", "straight")
+    assert len(parse_scenario(lot | landmarks, "draws.md").landmarks) == 11
+    assert parse_scenario(lot | factors, "draws.md").randomisation.camera_range == (0.8, 1.2)
+
+
+@pytest.mark.slow
+def test_the_page_on_highway(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("highway_env", reason="needs the extra 'highway'")
+    roundabout, estimates = run(DOCS / "highway.md")
+    assert not roundabout["env"].agents and np.isfinite(estimates["info"]["localisation"]["position_error"])
+    assert "vehicle_1" in capsys.readouterr().out
+    (text,) = tables("highway.md")
+    raw = {"title": "highway", "horizon": 1.0, "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}]}
+    assert parse_scenario(raw | tomllib.loads(text), "highway.md").backend == "highway"
+
+
+@pytest.mark.slow
+def test_the_page_on_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("foxglove", reason="needs the extra 'log'")
+    from coopenv.backends.mcap.format import topics_of
+
+    monkeypatch.chdir(tmp_path)
+    _, recorded, replayed = run(DOCS / "replay.md")
+    assert "/scene/world" in topics_of("shown.mcap")
+    again, first = (
+        recorded["run"]("riccati", r) for r in (recorded["read_recording"]("drive.mcap"), recorded["recording"])
+    )
+    np.testing.assert_array_equal(again.position_error, first.position_error)
+    assert replayed["env"].possible_agents == [f"vehicle_{i}" for i in range(1, 6)]
+
+
+def test_the_page_on_watching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    monkeypatch.chdir(tmp_path)
+    run(DOCS / "view.md")
+    assert (tmp_path / "replay.html").stat().st_size > 500_000
+
+
+def test_the_tables_of_terms() -> None:
+    own, driven = (tomllib.loads(text) for text in tables("terms.md"))
+    lanes = tomllib.loads((ROOT / "examples" / "lane_keeping" / "lane_keeping.toml").read_text(encoding="utf-8"))
+    for table in ("reward", "observation", "termination"):
+        assert own[table].items() <= (lanes[table] | own[table]).items()
+        assert own[table]["custom"].keys() == lanes[table]["custom"].keys()
+    overrides = {f"{table}.{key}": value for table, keys in driven.items() for key, value in keys.items()}
+    assert load_scenario("urban_crossing", overrides).observation.map_size == 6
+
+
+def test_the_settings_of_training(tmp_path: Path) -> None:
+    settings, study = tables("trainers.md")
+    path = tmp_path / "train.toml"
+    path.write_text(settings, encoding="utf-8")
+    said = read_settings(path)
+    assert (said.steps, said.ppo.hidden, said.clone) == (500_000, (64, 64), Clone(agent="route_follower"))
+    assert read_settings(path, environment="facade").ppo.hidden == (128, 128)
+    assert read_settings(path, "plain", "facade").scenario == {"observation.planar": False}
+    (tmp_path / "study.toml").write_text(study, encoding="utf-8")
+    path.write_text("[arms.quality]\n[arms.plain]\n", encoding="utf-8")
+    assert len(list(read_study(tmp_path / "study.toml").runs)) == 12
 
 
 @pytest.mark.train
@@ -92,7 +233,7 @@ def test_the_page_on_trainers_drives_with_the_result_of_the_one_file(
     torch = pytest.importorskip("torch", reason="needs the extra train")
     from safetensors.torch import save_file
 
-    monkeypatch.setattr(sys, "path", [*sys.path, str(DOCS.parent / "examples")])
+    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT / "examples")])
     from train_ppo import Policy
 
     torch.manual_seed(0)
@@ -107,3 +248,44 @@ def test_the_page_on_trainers_drives_with_the_result_of_the_one_file(
     exec(compile(block, "trainers.md", "exec"), program)
     ends = capsys.readouterr().out.splitlines()
     assert sorted(line.partition(":")[0] for line in ends) == sorted(program["env"].possible_agents)
+
+
+@pytest.mark.train
+@pytest.mark.slow
+def test_the_page_trains_with_stable_baselines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As long as one rollout: what the page's two million steps give is in nobody's patience."""
+    pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+    monkeypatch.chdir(tmp_path)
+    train, drive = (block for block in python_blocks(DOCS / "trainers.md") if "stable_baselines3" in block)
+    assert train.count("2_000_000") == 1
+    exec(compile(train.replace("2_000_000", "16_384"), "trainers.md", "exec"), {"__name__": "__main__"})
+    capsys.readouterr()
+    program: dict[str, Any] = {}
+    exec(compile(drive, "trainers.md", "exec"), program)
+    ends = capsys.readouterr().out.splitlines()
+    assert {line.partition(":")[0] for line in ends} <= set(program["env"].possible_agents) and ends
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "word"),
+    [
+        pytest.param("ray", "CooperativeMultiAgentEnv", marks=pytest.mark.rllib),
+        pytest.param("ray", "CooperativeRows", marks=pytest.mark.rllib),
+        pytest.param("torchrl", "PettingZooWrapper", marks=pytest.mark.torchrl),
+        pytest.param("torchrl", "batched_env", marks=pytest.mark.torchrl),
+        pytest.param("benchmarl", "benchmarl", marks=pytest.mark.benchmarl),
+    ],
+)
+def test_the_page_trains_with_libraries(
+    package: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extra = {"ray": "rllib"}.get(package, package)
+    pytest.importorskip(package, reason=f"needs the extra {extra!r}")
+    monkeypatch.chdir(tmp_path)
+    (block,) = (block for block in python_blocks(DOCS / "trainers.md") if re.search(rf"^from .*{word}", block, re.M))
+    exec(compile(block, "trainers.md", "exec"), {"__name__": "__main__"})
+    if package != "benchmarl":
+        assert capsys.readouterr().out

@@ -69,8 +69,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def kill_writers(place: Path, kills: int) -> None:
-    """Kill processes that replace results at random instants; whatever is read then is whole."""
+@pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
+def test_writers_killed_at_random_instants_leave_a_whole_result(kills: int, place: Path) -> None:
     (place / "single.txt").write_text("0" * 200_000)
     draw, least = random.Random(3), 0
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -114,15 +114,6 @@ def test_a_new_folder_goes_again_with_what_failed_in_it(tmp_path: Path) -> None:
         assert [path.name for path in (tmp_path / "kept").rglob("*")] == (["a", "file"] if left else [])
     with pytest.raises(OutputError, match="cannot write to "), new_folder(tmp_path / "kept" / "a" / "file" / "c"):
         pass
-
-
-def test_killed_writers_leave_a_whole_result(place: Path) -> None:
-    kill_writers(place, 5)
-
-
-@pytest.mark.slow
-def test_fifty_killed_writers_leave_a_whole_result(place: Path) -> None:
-    kill_writers(place, 50)
 
 
 def test_readers_find_a_whole_result_at_every_instant(place: Path) -> None:

@@ -61,18 +61,15 @@ def lock(folder: Path, wait: float = 0.0) -> int | None:
         return None
     descriptor = os.open(folder, os.O_RDONLY)
     end = monotonic() + wait
-    try:
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return descriptor
-            except BlockingIOError:
-                if monotonic() >= end:
-                    raise
-                sleep(POLL)
-    except OSError:
-        os.close(descriptor)
-        return None
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return descriptor
+        except OSError as error:
+            if not isinstance(error, BlockingIOError) or monotonic() >= end:
+                os.close(descriptor)
+                return None
+        sleep(POLL)
 
 
 def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:

@@ -91,10 +91,7 @@ def list_agents() -> list[str]:
 
 def version() -> str:
     """Return the installed version, or `unknown` in a checkout that is not installed."""
-    try:
-        return metadata.version("coopenv")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    return versions("coopenv").get("coopenv", "unknown")
 
 
 ONE_THREAD: Mapping[str, str] = dict.fromkeys(

@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
 
 HANG_S = 10.0
 """Without a word from a case."""
@@ -74,3 +77,17 @@ def _run(module: str, numbers: Sequence[int], words: Connection) -> None:
             words.send((cases.case(number), ""))
         except Exception:
             words.send(("", traceback.format_exc(limit=-6)))
+
+
+def go_through(env: Any, steps: int = 10**6, seed: int | None = None) -> None:
+    """Step an environment after its reset, with actions of zero or drawn by a seed; nothing may be NaN."""
+    draw = np.random.default_rng(seed)
+    observations, _ = env.reset(seed=seed or 0)
+    for _ in range(steps):
+        assert all(np.isfinite(row).all() for row in observations.values()) and np.isfinite(env.state()).all()
+        if not env.agents:
+            return
+        largest = 0.0 if seed is None else 1.0
+        actions = {agent: draw.uniform(-largest, largest, 2).astype(np.float32) for agent in env.agents}
+        observations, rewards, *_ = env.step(actions)
+        assert np.isfinite(list(rewards.values())).all(), rewards

@@ -19,6 +19,7 @@ from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.backends.replay import Replay
 from coopenv.observers.recording import Recording
+from tests.fuzz.harness import go_through
 from tests.fuzz.scenarios import at, mutate, places
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
@@ -72,14 +73,7 @@ def those_for(recording: Recording) -> tuple[str, ...]:
 
 def replay(recording: Recording, observer: str) -> None:
     """Go through a recording; nothing may be NaN but truth that is not known."""
-    env = CooperativeLocalisationEnv(Replay(recording, "drive", {"observer.name": observer}), "drive")
-    observations, _ = env.reset(seed=0)
-    while True:
-        assert all(np.isfinite(row).all() for row in observations.values()) and np.isfinite(env.state()).all()
-        if not env.agents:
-            return
-        observations, rewards, *_ = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
-        assert np.isfinite(list(rewards.values())).all()
+    go_through(CooperativeLocalisationEnv(Replay(recording, "drive", {"observer.name": observer}), "drive"))
 
 
 def other_header(rng: np.random.Generator, facts: dict[str, Any]) -> dict[str, Any]:

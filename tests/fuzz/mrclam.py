@@ -13,6 +13,7 @@ from coopenv import CoopenvError, DataError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.backends.mrclam import VARIANTS, load_dataset, recording_of
 from coopenv.backends.replay import Replay
+from tests.fuzz.harness import go_through
 from tests.helpers import mrclam_files
 
 WORDS = (
@@ -53,13 +54,7 @@ def replay(parent: Path, number: int) -> None:
     for value in (recording.translation, recording.velocity, recording.start_covariance, recording.landmarks):
         assert np.isfinite(value).all()
     env = CooperativeLocalisationEnv(Replay(recording, "mrclam_6", {"observer.name": name}), "mrclam_6")
-    observations, _ = env.reset(seed=0)
-    for _ in range(STEPS):
-        assert all(np.isfinite(row).all() for row in observations.values()) and np.isfinite(env.state()).all()
-        if not env.agents:
-            return
-        observations, rewards, *_ = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
-        assert np.isfinite(list(rewards.values())).all()
+    go_through(env, STEPS)
 
 
 def mutate(rng: np.random.Generator, folder: Path) -> None:

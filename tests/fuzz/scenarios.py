@@ -21,6 +21,7 @@ from coopenv.base.sections import TOO_DEEP
 from coopenv.scenario import parse_scenario
 from coopenv.scenario.files import apply_vehicle_defaults
 from coopenv.scenario.own_terms import located
+from tests.fuzz.harness import go_through
 
 STEPS = 5
 FINITE = (
@@ -28,23 +29,8 @@ FINITE = (
     *("orientation_error", "nees", "log_determinant", "gramian_min_eigenvalue", "increment_rotation", "bearing"),
 )
 NUMBERS = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    1e-300,
-    1e-12,
-    1e-6,
-    1e6,
-    9.9e8,
-    1e9,
-    -1e9,
-    1.1e9,
-    1e35,
-    1e99,
-    1e308,
-    math.inf,
-    math.nan,
+    *(0.0, -0.0, 1.0, -1.0, 1e-300, 1e-12, 1e-6, 1e6, 9.9e8, 1e9, -1e9, 1.1e9, 1e35, 1e99, 1e308),
+    *(math.inf, math.nan),
 )
 SCALES = (0.5, 2.0, 3.0, -1.0, 1e-9, 1e-3, 10.0, 1e3, 1e6, 1.0 + 1e-12)
 VALUES: tuple[Any, ...] = (
@@ -174,15 +160,6 @@ def run(scenario: Any, seed: int) -> None:
     """Run a scenario for some steps in both precisions."""
     for dtype in ("float32", "float64"):
         env = CooperativeLocalisationEnv(scenario, "mutated", dtype=dtype)
-        rng = np.random.default_rng(seed)
-        observations, _ = env.reset(seed=seed)
-        for _ in range(STEPS):
-            assert all(np.isfinite(row).all() for row in observations.values())
-            assert np.isfinite(env.state()).all()
-            if not env.agents:
-                return
-            actions = {agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.agents}
-            observations, rewards, *_ = env.step(actions)
-            assert np.isfinite(list(rewards.values())).all(), rewards
+        go_through(env, STEPS, seed)
         for name in FINITE:
             assert np.isfinite(env.engine.view(name)).all(), (dtype, name)

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,30 +39,24 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-def group_of(leader: int) -> list[str]:
-    """Return the command lines of the living processes of a process group but its leader (Linux)."""
-    found = []
+def _living() -> Iterator[tuple[int, int, str]]:
+    """Yield number, process group and command line of every living process (Linux)."""
     for path in Path("/proc").glob("[0-9]*"):
-        try:
+        with suppress(OSError):  # gone meanwhile
             state, _, group = (path / "stat").read_text().rpartition(")")[2].split()[:3]
-            if int(group) == leader and int(path.name) != leader and state != "Z":
-                found.append((path / "cmdline").read_bytes().decode(errors="replace").replace("\0", " "))
-        except OSError:  # gone meanwhile
-            continue
-    return found
+            if state != "Z":
+                line = (path / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
+                yield int(path.name), int(group), line
+
+
+def group_of(leader: int) -> list[str]:
+    """Return the command lines of the living processes of a process group but its leader."""
+    return [line for number, group, line in _living() if group == leader != number]
 
 
 def mentioning(text: str) -> list[str]:
-    """Return the command lines of the living processes that have a text in them (Linux)."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            line = (path / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
-        except OSError:  # gone meanwhile
-            continue
-        if text in line:
-            found.append(line)
-    return found
+    """Return the command lines of the living processes that have a text in them."""
+    return [line for _, _, line in _living() if text in line]
 
 
 def workers_of(leader: int) -> list[str]:
