@@ -33,9 +33,7 @@ def test_ships_the_papers_scenarios() -> None:
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_suite(name: str, check: Callable[[Make], None]) -> None:
-    # highway-env steps cars in Python: of its environments the suite runs the first seconds
-    slow = coopenv.load_scenario(name).backend == "highway"
-    check(partial(coopenv.parallel_env, name, overrides={"horizon": 6.0} if slow else None))
+    check(partial(coopenv.parallel_env, name, overrides={"horizon": 6.0}))
 
 
 def test_registries(name: str) -> None:

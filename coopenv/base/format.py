@@ -75,13 +75,14 @@ def _place(value: float) -> int:
 
 def json_text(value: Any) -> str:
     """Return a result as JSON text; null for NaN and infinity."""
-    return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain).decode() + "\n"
+    return to_json(value, indent=2, inf_nan_mode="null", fallback=plain).decode() + "\n"
 
 
 def jsonable(value: Any) -> Any:
     """Return a result as plain Python, as `json.dumps` takes it; None for NaN and infinity."""
-    return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=plain)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return NumPy scalars and arrays as plain data, and anything else as text."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

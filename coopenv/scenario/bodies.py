@@ -277,27 +277,19 @@ class Vehicle(Section):
 
     @model_validator(mode="after")
     def _has_one_start_and_goal(self) -> Self:
-        pose, waypoints = self.initial_pose, self.motion.kind == "waypoints"
-        if waypoints and pose is not None:
+        if self.motion.kind == "waypoints" and self.initial_pose is not None:
             raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
-        if self.routes:
-            self._check_routes()
-            return self
-        if pose is not None and pose.position is None:
-            raise ValueError("initial_pose.position: needed by a vehicle without routes")
-        if self.goal is not None and self.goal.position is None:
-            raise ValueError("goal.position: needed by a vehicle without routes")
-        return self
-
-    def _check_routes(self) -> None:
-        if self.motion.kind != "driven":
+        if self.routes and self.motion.kind != "driven":
             raise ValueError(f"routes: for driven vehicles; the motion of this one is '{self.motion.kind}'")
-        pose = self.initial_pose or InitialPose()
-        for key in ("position", "yaw", "quaternion_wxyz"):
-            if getattr(pose, key) is not None:
-                raise ValueError(f"initial_pose.{key}: a vehicle with routes starts on its route; leave this out")
-        if self.goal is not None and self.goal.position is not None:
-            raise ValueError("goal.position: a vehicle with routes goes to the end of its route; leave this out")
+        for name, does in (("initial_pose", "starts on its route"), ("goal", "goes to the end of its route")):
+            part = getattr(self, name)
+            keys = ("position", "yaw", "quaternion_wxyz") if part is not None else ()
+            given = [key for key in keys if getattr(part, key, None) is not None]
+            if self.routes and given:
+                raise ValueError(f"{name}.{given[0]}: a vehicle with routes {does}; leave this out")
+            if not self.routes and part is not None and part.position is None:
+                raise ValueError(f"{name}.position: needed by a vehicle without routes")
+        return self
 
 
 class Area(Section):

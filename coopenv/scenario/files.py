@@ -8,9 +8,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from coopenv.base.errors import ScenarioError, shown
+from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import TOO_DEEP, read_toml, validated
 from coopenv.scenario.bodies import with_groups
@@ -81,17 +80,12 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        text = json.dumps(with_groups(raw), default=_plain)
+        text = json.dumps(with_groups(raw), default=plain)
     except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:
         raise ScenarioError(f"{where}: {TOO_DEEP}") from None
     return validated(Scenario, text, where, ScenarioError)
-
-
-def _plain(value: Any) -> Any:
-    """Return NumPy scalars and arrays as plain data, and anything else as text."""
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
 
 
 def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
