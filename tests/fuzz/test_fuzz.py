@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
+
 import pytest
 
 from tests.fuzz import large
@@ -36,9 +40,20 @@ def test_large_scenarios_load_at_once() -> None:
     assert outcome.taken == {"accepted": len(large.CASES)}, outcome.failures
 
 
+def case(number: int) -> str:
+    """Crash (1), hang (2), raise (4), or go well."""
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if number == 2:
+        time.sleep(1000)
+    if number == 4:
+        raise ZeroDivisionError
+    return "accepted"
+
+
 def test_a_crash_a_hang_and_an_error_are_failures_of_their_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tests.fuzz.harness.HANG_S", 2.0)
-    outcome = run_cases("tests.fuzz.misbehaving", range(6))
+    outcome = run_cases(__name__, range(6))
     assert outcome.taken == {"accepted": 3}
     assert outcome.failures.keys() == {1, 2, 4}
     assert "ended the process (-11)" in outcome.failures[1]
