@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import typer
 
-from coopenv.api.reward import FIELDS, OTHERS
+from coopenv.api.arguments import FIELDS, OTHERS
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.study import read_study

@@ -1,85 +1,43 @@
 """The batched core under every interface: worlds plus step results, with constant Python work per step.
 
-The results of a step (observations, reward terms, judgements) are computed on the device.
+The results of a step (observations, reward terms, judgements) are computed on the device. Observers in Python
+(`PlugIns`) run on the host in place of the embedded one: the world advances tick by tick, observers run in between.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from coopenv.api.plugins import PlugIns
-from coopenv.api.reward import RewardFunction, Step, check_function, reward_of
-from coopenv.api.terms.layout import Layout, observation_layout
+from coopenv.api.arguments import RewardFunction, Step, check_function, reward_of
+from coopenv.api.terms.layout import observation_layout
 from coopenv.api.terms.own import OwnTerms
 from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results
-from coopenv.backends.base import Backend
+from coopenv.backends.base import Backend, SensingWorld
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
 from coopenv.base.errors import CoopenvError, check_memory, error_text, training_seed, world_keys
+from coopenv.estimation.poses import riccati_covariance
+from coopenv.observers.contract import Estimate
+from coopenv.observers.group import ObserverError, ObserverGroup
+from coopenv.observers.interference import Interference, interference_of
+from coopenv.observers.recording import Sensed
+from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
+from coopenv.viz.scene.stage import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory
 from coopenv.world.state import allocate, has_begun, overwrite, size_of, state_fields
-from coopenv.world.world import Keys, World
+from coopenv.world.world import Keys
 
-
-class Report:
-    """The arrays of the step results of a world, and what fills them."""
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        world: World,
-        layout: Layout,
-        reward: RewardFunction | None,
-        view: Callable[[str], np.ndarray],
-    ) -> None:
-        """Allocate the results and bind the scenario's terms.
-
-        Args:
-            scenario: names the terms.
-            world: whose state is reported.
-            layout: of the observation.
-            reward: in place of the scenario's weighted sum; on the CPU only.
-            view: returns fields of results and state on the host.
-
-        Raises:
-            CoopenvError: a term does not exist or fails, or the results would not fit into memory.
-        """
-        self._world, self._view, p = world, view, world.precision
-        terms = len(scenario.reward.by_name)
-        sizes = {"W": world.worlds, "N": world.model.vehicles, "D": layout.size, "K": terms}
-        needed = size_of(results_struct(p), sizes)
-        check_memory(needed, f"results of {world.worlds} worlds", device_memory(world.device))
-        self.results = allocate(results_struct(p), sizes, world.device)
-        self._own = OwnTerms(scenario, world, layout, self.results)
-        check_function(reward, world.device)
-        self._reward, self._step = reward, Step(view, scenario)
-        self._table = results_table(scenario, layout, world.device)
-
-    def end_episodes(self) -> None:
-        """End the episodes of vehicles that fulfil a condition of the user."""
-        self._own.end_episodes()
-
-    def fill(self, key: str, fresh: Any, chosen: Any) -> None:
-        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun."""
-        world = self._world
-        parts = [PerWorld(part) for part in (self._own.records, self.results, fresh, chosen)]
-        arguments = [world.model, PerWorld(world.state), self._table, *parts]
-        world.launch(key, step_results, arguments, inner=(world.model.vehicles,))
-        self._own.fill(key, fresh, chosen)
-        if world.device == "cpu":  # reading from a GPU would wait for it
-            self._own.check(self._view)
-
-    def reward_anew(self, fresh: Any) -> None:
-        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
-        if self._reward is not None:
-            earning = self._view("alive") & (fresh.numpy()[:, None] == 0)
-            self._view("reward")[...] = reward_of(self._reward, self._step, earning)
+if TYPE_CHECKING:
+    from coopenv.viz.topview import TopView
 
 
 class Engine:
@@ -109,6 +67,9 @@ class Engine:
             threads: shares of the batch on the CPU.
             backend: where ticks come from (None: computed).
             reward: in place of the scenario's weighted sum; on the CPU only.
+
+        Raises:
+            CoopenvError: also where a term does not exist or fails, or the results would not fit into memory.
         """
         self.backend: Backend = backend or simulation_of(scenario)
         self.world = open_world(self.backend, worlds, dtype, device, threads)
@@ -120,9 +81,14 @@ class Engine:
         """Names of the reward terms, in the order of the field `terms`."""
         self._views: dict[str, np.ndarray] = {}
         self._state_fields = set(state_fields(self.world.precision))
-        self._report = Report(scenario, self.world, self.layout, reward, self.view)
-        self.results = self._report.results
-        worlds, device = self.world.worlds, self.world.device
+        worlds, device, results = self.world.worlds, self.world.device, results_struct(self.world.precision)
+        sizes = {"W": worlds, "N": self.world.model.vehicles, "D": self.layout.size, "K": len(self.reward_terms)}
+        check_memory(size_of(results, sizes), f"results of {worlds} worlds", device_memory(device))
+        self.results = allocate(results, sizes, device)
+        self._own_terms = OwnTerms(scenario, self.world, self.layout, self.results)
+        check_function(reward, device)
+        self._reward, self._step = reward, Step(self.view, scenario)
+        self._table = results_table(scenario, self.layout, device)
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
         self.begun = False
@@ -156,10 +122,10 @@ class Engine:
         if self.plugins is not None:
             self.plugins.start(np.flatnonzero(chosen))
         self._fresh.assign(chosen.astype(np.int32))
-        self._report.fill("results fresh", self._fresh, self._fresh)
+        self._fill("results fresh", self._fresh, self._fresh)
         if self.backend.capabilities.real_time and not self.begun:
             self.refresh()  # once, as every step does: the first one must not wait for its launch
-            self._report.fill("results fresh", self._fresh, self._fresh)
+            self._fill("results fresh", self._fresh, self._fresh)
         self.begun = True
         return seeds
 
@@ -175,17 +141,17 @@ class Engine:
     def load(self) -> None:
         """Load all kernels, compiling those that this machine has not compiled yet; nothing moves."""
         (self.plugins or self.world).load()
-        self._report.end_episodes()
-        self._report.fill("load", self._nowhere, self._nowhere)
+        self._own_terms.end_episodes()
+        self._fill("load", self._nowhere, self._nowhere)
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, A) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
-        self._report.end_episodes()
+        self._own_terms.end_episodes()
         self.refresh()
-        self._report.reward_anew(self._nowhere)
+        self._reward_anew(self._nowhere)
 
     def step_or_restart(self) -> None:
         """Restart the worlds that are over, advance the others by one decision; nothing leaves the device."""
@@ -195,9 +161,9 @@ class Engine:
         wp.copy(self.world.mask, self.results.over)
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision)
         self._restart()
-        self._report.end_episodes()
-        self._report.fill("results some fresh", self.world.mask, self._everywhere)
-        self._report.reward_anew(self.world.mask)
+        self._own_terms.end_episodes()
+        self._fill("results some fresh", self.world.mask, self._everywhere)
+        self._reward_anew(self.world.mask)
         self.world.mask.zero_()
 
     def restart_finished(self) -> None:
@@ -206,12 +172,28 @@ class Engine:
         wp.copy(self._fresh, self.results.over)
         self._restart()
         self.world.mask.zero_()
-        self._report.fill("results fresh", self._fresh, self._fresh)
+        self._fill("results fresh", self._fresh, self._fresh)
 
     def _restart(self) -> None:
         self.world.restart()
         if self.plugins is not None:
             self.plugins.start(np.flatnonzero(self.world.mask.numpy()))
+
+    def _fill(self, key: str, fresh: Any, chosen: Any) -> None:
+        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun."""
+        world = self.world
+        parts = [PerWorld(part) for part in (self._own_terms.records, self.results, fresh, chosen)]
+        arguments = [world.model, PerWorld(world.state), self._table, *parts]
+        world.launch(key, step_results, arguments, inner=(world.model.vehicles,))
+        self._own_terms.fill(key, fresh, chosen)
+        if world.device == "cpu":  # reading from a GPU would wait for it
+            self._own_terms.check(self.view)
+
+    def _reward_anew(self, fresh: Any) -> None:
+        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
+        if self._reward is not None:
+            earning = self.view("alive") & (fresh.numpy()[:, None] == 0)
+            self.view("reward")[...] = reward_of(self._reward, self._step, earning)
 
     def set_actions(self, actions: np.ndarray) -> None:
         """Copy host actions, (W, N, A), to the device."""
@@ -222,7 +204,7 @@ class Engine:
 
     def refresh(self) -> None:
         """Recompute the step results of every world from the present state."""
-        self._report.fill("results", self._nowhere, self._everywhere)
+        self._fill("results", self._nowhere, self._everywhere)
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the results, the state or the actions on the host."""
@@ -248,10 +230,24 @@ class Engine:
             self.backend.stop(error_text(error))
             raise
 
+    @cached_property
+    def top_view(self) -> TopView:
+        """What draws pictures; matplotlib is loaded with the first one."""
+        from coopenv.viz.topview import TopView
+
+        return TopView(self.backend.scenario)
+
+    def picture(self, world: int = 0) -> np.ndarray:
+        """Return an (H, W, 3) uint8 picture of a world."""
+        return self.top_view.paint(Frame.of(self, world))
+
     def close(self) -> None:
-        """Stop and close the backend, and end the threads."""
+        """Stop and close the backend, end the threads, and close the window, if there is one."""
         self.backend.close()
         self.world.launch.close()
+        if "top_view" in vars(self):
+            self.top_view.close()
+            del self.top_view
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of everything that the next step depends on.
@@ -278,3 +274,136 @@ class Engine:
         self.refresh()
         overwrite(memory, checked)
         self.begun = bool(has_begun(self.view("start_rotation")).all())
+
+
+class PlugIns:
+    """A group of observers per world.
+
+    Estimates are written into the world's state, from which observations, rewards and metrics follow as for the
+    embedded observer. For an observer without covariance the scenario's P(0) is kept.
+    """
+
+    def __init__(self, name: str, world: SensingWorld) -> None:
+        """Find the observer.
+
+        Raises:
+            CoopenvError: no such observer, or the world is not on the CPU.
+        """
+        factory = find(name)
+        if world.device != "cpu":
+            raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
+        self.name, self._world = name, world
+        observer_init = world.observer_init
+        self.groups = [ObserverGroup(factory, observer_init) for _ in range(world.worlds)]
+        self._order = observer_init.order
+        self._ticking = np.zeros(world.worlds, dtype=bool)  # worlds that are in the tick under way
+        self._failures: dict[int, str] = {}
+
+    def start(self, worlds: np.ndarray) -> None:
+        """Start the observers of the given worlds (indices), which have just been reset.
+
+        Raises:
+            CoopenvError: an observer cannot start.
+        """
+        R, p = self._world.view("estimate_rotation"), self._world.view("estimate_position")
+        for w in worlds.tolist():
+            self._failures.pop(w, None)
+            rotation = np.array(R[w], dtype=float)
+            position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
+            with self._naming_the_observer():
+                self.groups[w].start(rotation, position, self._interference(w, 0))
+
+    def load(self) -> None:
+        """Load the kernels of the stages, see `World.load`."""
+        world = self._world
+        world.restart()
+        world.mask.fill_(1)
+        world.decide()
+        world.sense()
+        world.receive(0)
+        world.broadcast(0)
+        world.finish()
+        world.mask.zero_()
+
+    def advance(self, ticks: int) -> None:
+        """Run camera ticks, stopping each world at its horizon; worlds in the world's mask stay as they are.
+
+        Raises:
+            CoopenvError: an observer failed; its world has to be reset.
+        """
+        self._world.decide()
+        for _ in range(ticks):
+            active = (self._world.mask.numpy() == 0) & (self._world.view("tick") < self._world.model.horizon_ticks)
+            if not active.any() or not self._world.fetch():
+                return
+            self._tick(active)
+
+    def _tick(self, active: np.ndarray) -> None:
+        world, worlds = self._world, np.flatnonzero(active).tolist()
+        for w in worlds:
+            if w in self._failures:
+                raise CoopenvError(f"{self._failures[w]} (reset starts anew)")
+        self._ticking = active
+        world.sense()
+        sensed = {w: world.sensed(w, int(world.view("tick")[w]) + 1) for w in worlds}
+        joint = self.groups[0].joint
+        with self._naming_the_observer():
+            for w in worlds if joint else ():
+                for i, answer in enumerate(self.groups[w].update_all(sensed[w])):
+                    self._write(w, i, answer.estimate)
+            for vehicle in self._order:
+                world.receive(vehicle)
+                for w in () if joint else worlds:
+                    self._write(w, vehicle, self._estimate(w, vehicle, sensed[w]))
+                world.broadcast(vehicle)
+        world.finish()
+
+    def _estimate(self, w: int, vehicle: int, sensed: Sensed) -> Estimate:
+        interference, view = self._interference(w, sensed.index), self._world.view
+        if interference is not None and interference.restarts[vehicle]:
+            for name in ("inbox_tick", "inbox_stamp"):
+                view(name)[w, vehicle] = -1
+        return self.groups[w].update(vehicle, sensed, view("inbox_tick")[w, vehicle], interference).estimate
+
+    def _interference(self, w: int, k: int) -> Interference | None:
+        return interference_of(self._world.scenario, self._world.model, self._world.view, w, k)
+
+    @contextmanager
+    def _naming_the_observer(self) -> Iterator[None]:
+        """Name the observer in an error, and remember it for the worlds that were in this tick: it has no end."""
+        try:
+            yield
+        except ObserverError as failure:
+            message = f"observer '{self.name}' {failure}"
+            self._failures.update(dict.fromkeys(np.flatnonzero(self._ticking).tolist(), message))
+            raise CoopenvError(message) from failure.__cause__
+
+    def _write(self, w: int, vehicle: int, estimate: Estimate) -> None:
+        R, view = np.asarray(estimate.rotation, dtype=float), self._world.view
+        view("estimate_rotation")[w, vehicle] = R
+        view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
+        if estimate.covariance is not None:
+            view("covariance")[w, vehicle] = riccati_covariance(
+                estimate.coordinates, estimate.rotation, estimate.position, estimate.covariance
+            )
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """Return a deep copy of every observer and message.
+
+        Raises:
+            CoopenvError: an observer cannot be copied.
+        """
+        return [group.get_state() for group in self.groups]
+
+    def set_state(self, states: Any, begun: np.ndarray) -> None:
+        """Go back to what `get_state` returned, of worlds (W,) of which some have begun.
+
+        Raises:
+            CoopenvError: it is of other observers; nothing has changed then.
+        """
+        if not isinstance(states, list) or len(states) != len(self.groups):
+            raise CoopenvError(f"state: no observers '{self.name}' in it")
+        copies = [group.checked_state(*state) for group, *state in zip(self.groups, states, begun, strict=True)]
+        for group, state in zip(self.groups, copies, strict=True):
+            group.set_state(state)
+        self._failures.clear()

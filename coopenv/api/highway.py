@@ -158,7 +158,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Return the observation that highway-env makes when all cars have their estimated poses."""
         agent, last = self._cars[-1], len(self._cars) - 1
         own = self._estimated(last)
-        received = {self._cars[i]: self._received(i) for i in range(last) if self._is_fresh(i)}
+        received = {self._cars[i]: message for i in range(last) if (message := self._received(i)) is not None}
         c, s = np.cos(own.heading - agent.heading), np.sin(own.heading - agent.heading)
         turn = np.array([[c, -s], [s, c]])
         seen = {
@@ -178,16 +178,15 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         R = view("estimate_rotation")[0, i]
         return self._kinematics(i, R, R @ view("estimate_position")[0, i])
 
-    def _received(self, i: int) -> Kinematics:
-        """Return the last message of a connected car to the agent's."""
+    def _received(self, i: int) -> Kinematics | None:
+        """Return the last message of a connected car to the agent's; None if it is stale, or the car left the road."""
         view = self._engine.view
+        sent = int(view("inbox_tick")[0, -1, i])
+        age = (int(view("tick")[0]) - sent) / self._world.scenario.rates.camera
+        there = any(car is self._cars[i] for car in self.highway.road.vehicles)
+        if sent < 0 or age > self._world.model.radio.staleness or not there:
+            return None
         return self._kinematics(i, view("inbox_rotation")[0, -1, i], view("inbox_position")[0, -1, i])
-
-    def _is_fresh(self, i: int) -> bool:
-        """Return whether the last message of a connected car that is on the road is not stale."""
-        sent, radio = int(self._engine.view("inbox_tick")[0, -1, i]), self._world.model.radio
-        age = (int(self._engine.view("tick")[0]) - sent) / self._world.scenario.rates.camera
-        return sent >= 0 and age <= radio.staleness and any(car is self._cars[i] for car in self.highway.road.vehicles)
 
     def _kinematics(self, i: int, R: Array, position: Array) -> Kinematics:
         view = self._engine.view
@@ -199,8 +198,8 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _with_localisation(self, info: dict[str, Any]) -> dict[str, Any]:
         """Return the info with estimates and their errors."""
-        found = [self._localisation(i) for i in range(len(self._cars))]
-        return {**info, "localisation": found[-1], "connected": tuple(found[:-1])}
+        *connected, agent = (self._localisation(i) for i in range(len(self._cars)))
+        return {**info, "localisation": agent, "connected": tuple(connected)}
 
     def _localisation(self, i: int) -> dict[str, Any]:
         view, estimated = self._engine.view, self._estimated(i)

@@ -10,13 +10,12 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from coopenv.api.arguments import ArrayKind
+from coopenv.api.arguments import RewardFunction, check_choice
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
-from coopenv.api.reward import RewardFunction
-from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation, simulation_of
-from coopenv.base.errors import CoopenvError, ScenarioError, suggest
+from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario, load_scenario
@@ -61,7 +60,7 @@ def parallel_env(
         data: folder of recorded data sets; None: COOPENV_DATA.
         variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
         topics: of a ROS bag: the TOML file with the meaning of its topics.
-        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
+        reward: a function of a `coopenv.api.arguments.Step` that returns the rewards (1, vehicles); None: the weighted
             sum of the scenario's terms.
         deployment: file with the cars; for `backend="svea"`, see docs/cars.md.
         car: name of the car that is estimated and driven here; the other ones only send (None: all cars).
@@ -122,7 +121,7 @@ def make_vec(
         arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
         threads: shares of the batch on the CPU; None: by size and cores.
         render_mode: None or "rgb_array".
-        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
+        reward: a function of a `coopenv.api.arguments.Step` that returns the rewards (num_worlds, vehicles), on the CPU
             only; None: the weighted sum of the scenario's terms.
         observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: that of the scenario.
         observation: "flat" rows, or a "dict" of arrays (num_envs, size) by field.
@@ -224,8 +223,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self._spec: EnvSpec | None = None
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names = self.world.possible_agents
-        if vehicle not in names:
-            raise CoopenvError(f"unknown vehicle '{vehicle}'{suggest(str(vehicle), names)}; known: {', '.join(names)}")
+        check_choice("vehicle", vehicle, names)
         self.vehicle, self._others = vehicle, others
         self.render_mode = self.world.render_mode
         self.metadata = dict(self.world.metadata)

@@ -1,4 +1,4 @@
-"""The PettingZoo environment: one world, dictionaries keyed by agent."""
+"""The PettingZoo environment: one world, dictionaries keyed by agent; and a wrapper that keeps numeric infos."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -7,32 +7,39 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
 
 from coopenv.api.arguments import (
+    QUALITIES,
     SETTINGS,
-    ActionReader,
-    InfoWriter,
-    Pictures,
+    RewardFunction,
+    Step,
     check_choice,
     checked_options,
-    state_space,
-    state_vector,
-    world_number,
+    outcome_words,
     world_parameters,
 )
 from coopenv.api.engine import Engine
-from coopenv.api.reward import RewardFunction
-from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Health
+from coopenv.api.terms.layout import Layout, action_space, observation_space
+from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
-from coopenv.base.errors import CoopenvError, shown, suggest, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, shown, suggest, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.reset import ABSENT
+from coopenv.world.state import FAULTS, LASTING_ERRORS
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
 
 RENDER_MODES = ("rgb_array", "human")
+PER_AGENT = 12
+"""Of the state, of every agent: position (3), first two columns of R (6), linear velocity (3), all of truth."""
+PER_VEHICLE = 9
+"""Of every vehicle: estimated position (3) and first two columns of Rhat (6)."""
+LASTING = 12
+"""Of every vehicle with lasting errors: scale (1), gyro bias (3), slip (2), turn and shift of the camera (6)."""
+LIMIT = 1e6
+"""m and m/s, far beyond any scene."""
 
 
 class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
@@ -72,7 +79,6 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """Build the world; use `coopenv.parallel_env` to build one by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
-        check_choice("observation", observation, ("flat", "dict"))
         backend = simulation_of(source) if isinstance(source, Scenario) else source
         self.scenario = scenario = backend.scenario
         self.render_mode = render_mode
@@ -90,14 +96,15 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self._np_random: np.random.Generator | None = None
         self._index = {agent: names.index(agent) for agent in self.possible_agents}
         self._flat = observation == "flat"
-        layout = self.engine.layout
-        space: spaces.Space[Any] = flat_space(layout) if self._flat else dict_space(layout)
+        space = observation_space(self.engine.layout, observation)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
-        self.state_space = state_space(scenario)
-        self._read_actions = ActionReader(self._index, self.engine)
-        self._infos = InfoWriter(self.engine, scenario)
-        self._pictures = Pictures(self.engine, scenario)
+        per_vehicle = PER_VEHICLE + (LASTING if scenario.has_lasting_errors else 0)
+        size = PER_AGENT * len(scenario.target_names) + per_vehicle * len(names) + 1
+        self.state_space = spaces.Box(-LIMIT, LIMIT, shape=(size,), dtype=np.float32)
+        self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
+        lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
+        self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
 
     @property
     def agents(self) -> list[str]:
@@ -127,9 +134,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         return self.action_spaces[agent]
 
     def _check_agent(self, agent: str) -> None:
-        if agent not in self._index:
-            known = ", ".join(self.possible_agents)
-            raise CoopenvError(f"unknown agent {shown(agent)}{suggest(str(agent), self._index)}; known: {known}")
+        check_choice("agent", agent, self._index)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode.
@@ -148,8 +153,10 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         first, own, parameters = 0, options or {}, None
         if self.engine.backend.capabilities.batched:
             wanted, own = checked_options(options, ("world", *SETTINGS), IGNORED_OPTIONS), {}
-            first, parameters = world_number(wanted.get("world", 0)), world_parameters(wanted, 1, self.scenario)
-        keys = None if seed is None else world_keys(seed, 1, first)
+            first, parameters = wanted.get("world", 0), world_parameters(wanted, 1, self.scenario)
+            if isinstance(first, bool) or not isinstance(first, int | np.integer) or not 0 <= first < 2**32:
+                raise CoopenvError(f"option 'world' must be a whole number from 0 to 2^32 - 1, got {shown(first)}")
+        keys = None if seed is None else world_keys(seed, 1, int(first))
         if keys is not None:
             self._np_random = seeding.np_random(keys[0])[0]
         with self.engine.stopping():
@@ -174,7 +181,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         if not alive:
             return {}, {}, {}, {}, {}
         with self.engine.stopping():
-            self.engine.step(self._read_actions(actions, alive))
+            self.engine.step(self._checked_actions(actions, alive))
         indices = [self._index[agent] for agent in alive]
         values = (self.engine.view(name)[0].tolist() for name in ("reward", "terminated", "truncated"))
         rewards, terminated, truncated = (dict(zip(alive, [of[i] for i in indices], strict=True)) for of in values)
@@ -195,28 +202,113 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()} for agent in agents
         }
 
+    def _infos(self, agents: list[str]) -> Infos:
+        """Return one info per agent, always with the same keys."""
+        engine, view, step = self.engine, self.engine.view, self._step
+        truth = {name: values[0].copy() for name, values in step["truth"].items()}
+        truth |= {name: view(name)[0].copy() for name in self._lasting}
+        estimate = {name: values[0].copy() for name, values in step["estimate"].items()}
+        numbers = {name: view(name)[0].tolist() for name in QUALITIES}
+        ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
+        seen: list[list[str]] = [[] for _ in ended]
+        for i, target in zip(*(each.tolist() for each in np.nonzero(step["visible"][0])), strict=True):
+            seen[i].append(self.scenario.target_names[target])
+        late, missing = engine.world.late.tolist(), engine.world.missing.tolist()
+        time, backend = float(step["time"][0, 0]), engine.backend
+        infos = {}
+        for agent in agents:
+            i = self._index[agent]
+            infos[agent] = {
+                "truth": {name: values[i] for name, values in truth.items()},
+                "estimate": {name: values[i] for name, values in estimate.items()},
+                "visible": tuple(seen[i]),
+                **{name: values[i] for name, values in numbers.items()},
+                "reward_terms": dict(zip(engine.reward_terms, terms[i], strict=True)),
+                "time": time,
+                "outcome": self._outcomes[ended[i]],
+                "late_ticks": late[i],
+                "missing_ticks": missing[i],
+                **({"car": backend.notes(i)} if isinstance(backend, Broadcasting) else {}),
+            }
+        return infos
+
+    def _checked_actions(self, actions: Mapping[str, np.ndarray], alive: list[str]) -> np.ndarray:
+        """Return the actions (1, N, A); vehicles that have ended keep their last one, whatever is given.
+
+        Raises:
+            ActionError: an action is missing, unknown, of the wrong shape, or not finite.
+        """
+        if not isinstance(actions, Mapping):
+            raise ActionError(f"actions must be a dict of agent to array, got {type(actions).__name__}")
+        whole = self.engine.view("actions").copy()
+        size = whole.shape[-1]
+        try:
+            values = np.array([actions[agent] for agent in alive])
+        except (IndexError, KeyError, TypeError, ValueError, RuntimeError):
+            values = np.empty(0)
+        numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), size)
+        unknown = len(actions) != len(alive) and not set(actions) <= set(self._index)
+        if not numeric or unknown or not np.isfinite(values).all():
+            self._complain(actions, alive, size)
+        whole[0, [self._index[agent] for agent in alive]] = np.clip(values, -1.0, 1.0)
+        return whole
+
+    def _complain(self, actions: Mapping[str, np.ndarray], alive: list[str], size: int) -> None:
+        """Raise an error for the first agent or action that is wrong."""
+        for agent in actions:
+            if agent not in self._index:
+                near = suggest(str(agent), self._index)
+                raise ActionError(f"action for unknown agent '{agent}'{near}; agents: {', '.join(alive)}")
+        for agent in alive:
+            if agent not in actions:
+                raise ActionError(f"no action for '{agent}'; agents: {', '.join(alive)}")
+            try:
+                value = np.asarray(actions[agent])
+            except (TypeError, ValueError):
+                value = np.array("?")
+            if value.dtype.kind not in "fiu":
+                raise ActionError(f"action of '{agent}' is not numeric: {actions[agent]!r}")
+            if value.shape != (size,):
+                raise ActionError(f"action of '{agent}' has shape {value.shape}, expected ({size},)")
+            if not np.isfinite(value).all():
+                raise ActionError(f"action of '{agent}' is not finite: {value.tolist()}")
+
     @property
     def health(self) -> Health:
         """Counts of data that the backend has delivered, and of data that is missing."""
         return self.engine.backend.health
 
     def state(self) -> np.ndarray:
-        """Return the truth and the estimates of all vehicles as one vector, see `state_vector`."""
-        return state_vector(self.engine)
+        """Return every agent's truth (landmarks first), every vehicle's estimate, and the share of the episode.
+
+        Where the scenario has lasting errors of sensors, those of every vehicle come last. Truth that a recording does
+        not know reads 0.
+        """
+        view = self.engine.view
+        R, position, velocity = (view(name)[0] for name in ("rotation", "position", "velocity"))
+        R_hat, p_hat = view("estimate_rotation")[0], view("estimate_position")[0]
+        position_hat = np.einsum("nij,nj->ni", R_hat, p_hat)
+        truth = np.hstack([position, R[:, :, 0], R[:, :, 1], velocity])
+        estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
+        share = view("tick")[:1] / self.engine.world.model.horizon_ticks
+        lasting = [view(name)[0] for name in LASTING_ERRORS] if self.scenario.has_lasting_errors else []
+        errors = np.hstack([np.zeros((len(p_hat), 0)), *(part.reshape(len(p_hat), -1) for part in lasting)])
+        whole = np.concatenate([truth.ravel(), estimate.ravel(), share, errors.ravel()]).astype(np.float32)
+        return np.asarray(np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0))
 
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:
             return None
+        picture = self.engine.picture()
         if self.render_mode == "human":
-            self._pictures.show()
+            self.engine.top_view.show(picture)
             return None
-        return self._pictures.of()
+        return picture
 
     def close(self) -> None:
         """Stop the backend's vehicles, let go of it, and close the window, if any."""
         self.engine.close()
-        self._pictures.close()
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
@@ -253,3 +345,50 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     def __setstate__(self, saved: dict[str, Any]) -> None:
         self.__init__(**saved["arguments"])  # type: ignore[misc]
         self.set_state(saved["state"])
+
+
+NUMBERS = ("position_error", "orientation_error", "nees", "arrived", "collided")
+"""Keys of every info of `PlainInfos`: m, deg, squared normalised error, and 1.0 in the step of that event."""
+
+
+class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
+    """Keeps what is a number of each info, and drops the actions of vehicles that have ended.
+
+    TorchRL makes a tensor of every entry of an info, and sends actions for all agents, the dead ones included. RLlib
+    keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
+    """
+
+    def __init__(self, env: CooperativeLocalisationEnv, with_absent: bool = False) -> None:
+        """Wrap a world.
+
+        Args:
+            env: the world.
+            with_absent: whether a reset also returns zeros for vehicles that are absent in the episode, which are in
+                `possible_agents` and not in `agents`. TorchRL's wrapper asks for them.
+        """
+        super().__init__(env)
+        self.state_space = env.state_space
+        self.with_absent = with_absent
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset the world."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        infos = self._numbers(infos)
+        for agent in self.possible_agents if self.with_absent else ():
+            if agent not in infos:
+                space = self.observation_space(agent)
+                observations[agent] = spaces.unflatten(space, np.zeros(spaces.flatdim(space), dtype=np.float32))
+                infos[agent] = dict.fromkeys(NUMBERS, 0.0)
+        return observations, infos
+
+    def step(self, actions: dict[str, np.ndarray]) -> Any:
+        """Step the world."""
+        living = {agent: actions[agent] for agent in self.env.agents if agent in actions}
+        *results, infos = self.env.step(living)
+        return *results, self._numbers(infos)
+
+    def _numbers(self, infos: Infos) -> dict[str, dict[str, float]]:
+        return {
+            agent: {name: float(info[name] if name in info else info["outcome"] == name) for name in NUMBERS}
+            for agent, info in infos.items()
+        }

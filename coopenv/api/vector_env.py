@@ -3,10 +3,12 @@
 from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from importlib.util import find_spec
 from typing import Any, Literal
 
 import gymnasium
 import numpy as np
+import warp as wp
 from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorWrapper
@@ -14,21 +16,18 @@ from gymnasium.vector.utils import batch_space
 
 from coopenv.api.arguments import (
     SETTINGS,
-    ArrayKind,
-    Exchange,
-    Pictures,
+    RewardFunction,
     check_choice,
-    checked_autoreset,
     checked_options,
-    world_mask,
+    host_actions,
     world_parameters,
 )
 from coopenv.api.engine import Engine
-from coopenv.api.reward import RewardFunction
-from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.base.errors import CoopenvError, world_keys
+from coopenv.api.terms.layout import Layout, action_space, observation_space
+from coopenv.base.errors import ActionError, CoopenvError, world_keys
 from coopenv.scenario import Scenario
 
+ArrayKind = Literal["numpy", "torch"]
 INFO_FIELDS = (
     *("alive", "ended", "position_error", "orientation_error", "nees"),
     *("log_determinant", "gramian_min_eigenvalue"),
@@ -73,13 +72,14 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Build the worlds; use `coopenv.make_vec` to build them by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
         check_choice("render_mode", render_mode, (None, "rgb_array"))
-        check_choice("observation", observation, ("flat", "dict"))
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
         self.scenario = scenario = self.engine.backend.scenario
-        self.pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
-        self.autoreset_mode = checked_autoreset(autoreset)
+        modes = {word.lower(): mode for mode in AutoresetMode for word in (mode.name, mode.value)}
+        word = str(getattr(autoreset, "name", autoreset)).lower().replace("-", "_")
+        check_choice("autoreset", word, modes)
+        self.autoreset_mode = modes[word]
         self.render_mode = render_mode
         self.metadata = {
             "name": f"{name}_v0",
@@ -87,10 +87,17 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             "render_modes": ["rgb_array"],
             "render_fps": scenario.rates.decision,
         }
-        self._flat, layout = observation == "flat", self.engine.layout
-        self.single_observation_space = flat_space(layout) if self._flat else dict_space(layout)
+        self._flat = observation == "flat"
+        self.single_observation_space = observation_space(self.engine.layout, observation)
         self.single_action_space = action_space(self.scenario)
-        self._exchange = Exchange(self.engine, arrays)
+        self._on_cpu = self.engine.world.device == "cpu"
+        self.arrays: ArrayKind = arrays if arrays is not None else ("numpy" if self._on_cpu else "torch")
+        """What arrays are: fresh host arrays, or tensors on the device that share memory with the engine."""
+        check_choice("arrays", self.arrays, ("numpy", "torch"))
+        if self.arrays == "torch" and find_spec("torch") is None:
+            raise CoopenvError("arrays='torch' needs torch: pip install '.[train]'")
+        self._tensors: dict[str, Any] = {}
+        self._stream: Any = None
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
@@ -101,11 +108,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The batch of `single_action_space`."""
         return batch_space(self.single_action_space, self.num_envs)
-
-    @property
-    def arrays(self) -> ArrayKind:
-        """What arrays are: "numpy" or "torch"."""
-        return self._exchange.kind
 
     @property
     def observation_layout(self) -> Layout:
@@ -137,8 +139,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         wanted = checked_options(options, ("reset_mask", *SETTINGS))
         parameters = world_parameters(wanted, self.num_worlds, self.scenario)
         given = wanted.get("reset_mask")
-        mask = None if given is None else world_mask(given, self.num_worlds, self.vehicles)
-        self._exchange.follow_torch()
+        mask = None if given is None else self._world_mask(given)
+        self._follow_torch()
         seeds = self.engine.reset(self._world_seeds(seed), mask, parameters=parameters)
         if seeds is not None and seeds[0] is not None:
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds[0]))
@@ -155,13 +157,13 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             CoopenvError: `reset` has not been called.
         """
         self.engine.check_begun()
-        self._exchange.follow_torch()
-        self._exchange.set_actions(actions)
+        self._follow_torch()
+        self._set_actions(actions)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             self.engine.step_or_restart()
         else:
             self.engine.step()
-        flags = [self._exchange.rows(name) for name in ("reward", "terminated", "truncated")]
+        flags = [self._rows(name) for name in ("reward", "terminated", "truncated")]
         infos = self._infos()
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             flags, infos = self._restart_at_once(flags, infos)
@@ -169,7 +171,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _observations(self) -> Any:
         """Return the rows, or a dictionary of their parts by field."""
-        rows = self._exchange.rows("observation")
+        rows = self._rows("observation")
         if self._flat:
             return rows
         return {name: rows[:, field.slice] for name, field in self.engine.layout.items()}
@@ -179,20 +181,103 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         `final_obs` and `final_info` are there when a row has ended; for tensors always, as looking would mean waiting.
         """
-        flags = [self._exchange.owned(flag) for flag in flags]
+        flags = [self._owned(flag) for flag in flags]
         ended = flags[1] | flags[2]
-        if self._exchange.kind == "numpy" and not ended.any():
+        if self.arrays == "numpy" and not ended.any():
             return flags, infos
-        observation = self._exchange.owned(self._observations())
+        observation = self._owned(self._observations())
         final = {"final_obs": observation, "_final_obs": ended, "_final_info": ended}
-        final["final_info"] = self._exchange.owned(infos)
+        final["final_info"] = self._owned(infos)
         self.engine.restart_finished()
         return flags, {**self._infos(), **final}
 
     def _infos(self) -> dict[str, Any]:
-        terms = dict(zip(self.engine.reward_terms, self._exchange.rows("terms").T, strict=True))
-        fields = {name: self._exchange.rows(name) for name in INFO_FIELDS}
-        return {**fields, "reward_terms": terms, "time": self._exchange.time()}
+        terms = dict(zip(self.engine.reward_terms, self._rows("terms").T, strict=True))
+        fields = {name: self._rows(name) for name in INFO_FIELDS}
+        return {**fields, "reward_terms": terms, "time": self._time()}
+
+    def _follow_torch(self) -> None:
+        """Queue the kernels on torch's current CUDA stream, so that neither overtakes the other."""
+        if self._on_cpu or self.arrays != "torch":
+            return
+        import torch
+
+        device = self.engine.world.device
+        current = torch.cuda.current_stream(wp.device_to_torch(device))
+        if self._stream is None or self._stream.cuda_stream != current.cuda_stream:
+            self._stream = wp.stream_from_torch(current)
+        # The first time, wait for what was queued on the stream so far, such as the building of the world.
+        wp.set_stream(self._stream, device, sync=wp.get_stream(device) != self._stream)
+
+    def _rows(self, name: str) -> Any:
+        """Return a field of the engine: a copy on the host, or a tensor that shares memory."""
+        if self.arrays == "numpy":
+            view = self.engine.view(name)
+            return view.reshape(self.num_envs, *view.shape[2:]).copy()
+        tensor = self._tensors.get(name)
+        if tensor is None:
+            whole = wp.to_torch(self.engine.array(name))
+            tensor = self._tensors[name] = whole.reshape(self.num_envs, *whole.shape[2:])
+        return tensor
+
+    def _time(self) -> Any:
+        """Return (num_envs,) s since the start of each row's episode."""
+        period = float(self.engine.world.model.camera_period)
+        if self.arrays == "numpy":
+            return np.repeat(self.engine.view("tick") * period, self.vehicles)
+        return (wp.to_torch(self.engine.array("tick")) * period).repeat_interleave(self.vehicles)
+
+    def _owned(self, rows: Any) -> Any:
+        """Return rows, or dictionaries of them, as what the next step does not touch."""
+        if isinstance(rows, dict):
+            return {name: self._owned(values) for name, values in rows.items()}
+        return rows if self.arrays == "numpy" else rows.clone()
+
+    def _set_actions(self, actions: Any) -> None:
+        """Take actions (W N, A), or (W, N, A), clipped to [-1, 1] by the actuators.
+
+        A tensor that is on the device already is copied there; whether it is finite is not checked, as that would
+        wait for the device: an action that is not finite counts as zero.
+
+        Raises:
+            ActionError: wrong shape or dtype; a host array that is not finite.
+        """
+        shape = tuple(self.engine.array("actions").shape)
+        if self.arrays != "torch" or type(actions).__module__.split(".")[0] != "torch":
+            self.engine.set_actions(host_actions(actions, shape))
+            return
+        import torch
+
+        if tuple(actions.shape) not in ((self.num_envs, shape[-1]), shape):
+            raise ActionError(f"actions have shape {tuple(actions.shape)}, expected ({self.num_envs}, {shape[-1]})")
+        if not torch.is_floating_point(actions) or actions.device.type == "meta":
+            raise ActionError(f"actions have dtype {actions.dtype} on {actions.device}, expected a float with data")
+        if actions.device.type == "cpu" and not torch.isfinite(actions).all():
+            host_actions(actions.detach().numpy(), shape)  # says which row
+        wp.to_torch(self.engine.array("actions")).copy_(actions.detach().reshape(shape))
+
+    def _world_mask(self, value: object) -> np.ndarray:
+        """Return the option `reset_mask`, one bool per row or per world, as (num_worlds,).
+
+        Raises:
+            CoopenvError: it is something else, or splits a world.
+        """
+        try:
+            chosen = np.asarray(value)
+        except (TypeError, ValueError, RuntimeError):
+            chosen = np.empty(0)
+        if chosen.dtype != bool or not chosen.any():
+            raise CoopenvError("reset_mask must be an array of bool with at least one True")
+        if chosen.shape == (self.num_envs,):
+            by_world = self.world_major(chosen)
+            split = np.flatnonzero(by_world.any(axis=1) != by_world.all(axis=1))
+            if split.size:
+                raise CoopenvError(f"reset_mask splits world {split[0]}: its {self.vehicles} rows are reset together")
+            chosen = by_world[:, 0]
+        if chosen.shape != (self.num_worlds,):
+            expected = f"({self.num_envs},) rows or ({self.num_worlds},) worlds"
+            raise CoopenvError(f"reset_mask has shape {chosen.shape}, expected {expected}")
+        return chosen
 
     def _world_seeds(self, seed: Any) -> list[int | None] | None:
         """Return the keys of the worlds, None where one goes on from its last."""
@@ -211,7 +296,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:
             return None
-        pictures = [self.pictures.of(world) for world in range(self.num_worlds)]
+        pictures = [self.engine.picture(world) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
     def get_state(self) -> dict[str, Any]:
@@ -248,7 +333,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
             self.engine.close()
-            self.pictures.close()
 
 
 class TrueEnds(VectorWrapper):
@@ -269,58 +353,6 @@ class TrueEnds(VectorWrapper):
             ended = terminated | truncated
             infos = {**infos, "_final_obs": ended, "_final_info": ended}
         return observations, rewards, terminated, truncated, infos
-
-
-class EpisodeSums:
-    """Sums over the episodes under way, one per row (world, vehicle)."""
-
-    def __init__(self, rows: int, terms: tuple[str, ...]) -> None:
-        """Start from zero.
-
-        Args:
-            rows: number of rows.
-            terms: names of the reward terms.
-        """
-        self._names = ("r", "l", *terms)
-        self._sums = np.zeros((len(self._names), rows))
-
-    def add(self, rewards: np.ndarray, acted: np.ndarray, infos: dict[str, Any]) -> None:
-        """Add a step.
-
-        Args:
-            rewards: (rows,).
-            acted: (rows,) whether the vehicle was under way in this step.
-            infos: of the step, as `CooperativeVectorEnv` gives them.
-        """
-        step = [rewards, np.ones_like(rewards), *(infos["reward_terms"][name] for name in self._names[2:])]
-        self._sums += np.where(acted, step, 0.0)
-
-    def take(self, ended: np.ndarray) -> dict[str, Any]:
-        """Return the sums of the rows whose episode has ended, 0 elsewhere, and begin anew there.
-
-        Returns:
-            `r`, the undiscounted return, and `l`, decisions, (rows,) each; `reward_terms`, (rows,) by name.
-        """
-        taken = np.where(ended, self._sums, 0.0)
-        self.forget(ended)
-        sums: dict[str, Any] = dict(zip(self._names, taken, strict=True))
-        terms = {name: sums.pop(name) for name in self._names[2:]}
-        return {"r": sums["r"], "l": sums["l"].astype(int), "reward_terms": terms}
-
-    @property
-    def under_way(self) -> np.ndarray:
-        """The sums so far, (2 + terms, rows), for a checkpoint; what is assigned replaces them."""
-        return self._sums.copy()
-
-    @under_way.setter
-    def under_way(self, sums: np.ndarray) -> None:
-        if sums.shape != self._sums.shape or not np.isfinite(sums).all():
-            raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._sums.shape}")
-        self._sums[...] = sums
-
-    def forget(self, rows: np.ndarray) -> None:
-        """Begin anew in rows of a mask."""
-        self._sums[:, rows] = 0.0
 
 
 class RecordVehicleEpisodes(VectorWrapper):
@@ -346,11 +378,23 @@ class RecordVehicleEpisodes(VectorWrapper):
         self._batch = env.unwrapped
         if self._batch.arrays != "numpy":
             raise CoopenvError("RecordVehicleEpisodes needs NumPy arrays: make_vec(arrays='numpy')")
-        self._sums = EpisodeSums(self.num_envs, self._batch.engine.reward_terms)
+        self._names = ("r", "l", *self._batch.engine.reward_terms)
+        self._sums = np.zeros((len(self._names), self.num_envs))
         self._waiting = np.zeros(self.num_envs, dtype=bool)
         self.episode_count = 0
         self.return_queue: deque[float] = deque(maxlen=buffer_length)
         self.length_queue: deque[int] = deque(maxlen=buffer_length)
+
+    @property
+    def sums(self) -> np.ndarray:
+        """Return, decisions and reward terms of the episodes under way, (2 + terms, num_envs), for a saved state."""
+        return self._sums.copy()
+
+    @sums.setter
+    def sums(self, sums: np.ndarray) -> None:
+        if sums.shape != self._sums.shape or not np.isfinite(sums).all():
+            raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._sums.shape}")
+        self._sums[...] = sums
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the batch, and the sums of the rows that were reset."""
@@ -359,7 +403,7 @@ class RecordVehicleEpisodes(VectorWrapper):
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
         if chosen.shape != (self.num_envs,):
             chosen = np.repeat(chosen, self._batch.vehicles)
-        self._sums.forget(chosen)
+        self._sums[:, chosen] = 0.0
         self._waiting[chosen] = False
         return result
 
@@ -368,12 +412,17 @@ class RecordVehicleEpisodes(VectorWrapper):
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         step = infos.get("final_info", infos)
         acted, over = step["alive"] & ~self._waiting, terminated | truncated
-        self._sums.add(rewards, acted, step)
+        terms = (step["reward_terms"][name] for name in self._names[2:])
+        self._sums += np.where(acted, [rewards, np.ones_like(rewards), *terms], 0.0)
         if self._batch.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._waiting = over
         ended = acted & over
         if ended.any():
-            infos = {**infos, "episode": self._sums.take(ended), "_episode": ended}
+            sums: dict[str, Any] = dict(zip(self._names, np.where(ended, self._sums, 0.0), strict=True))
+            self._sums[:, ended] = 0.0
+            of_terms = {name: sums.pop(name) for name in self._names[2:]}
+            episode = {"r": sums["r"], "l": sums["l"].astype(int), "reward_terms": of_terms}
+            infos = {**infos, "episode": episode, "_episode": ended}
             self.episode_count += int(ended.sum())
             self.return_queue.extend(infos["episode"]["r"][ended].tolist())
             self.length_queue.extend(infos["episode"]["l"][ended].tolist())

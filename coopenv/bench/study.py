@@ -158,8 +158,7 @@ def perform(task: Task) -> None:
     Raises:
         CoopenvError: what `train` raises.
     """
-    from coopenv.training.checkpoint import read  # needs the extra `train`
-    from coopenv.training.command import train
+    from coopenv.training.command import read, train  # needs the extra `train`
 
     path = task.out / CHECKPOINT_FILE
     resume = path.is_file() and read(path).plan == task.plan

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -42,10 +42,6 @@ class NetworkColumn(BaseModel):
     scale: float
     center: float
     unit: str
-
-    def signature(self) -> dict[str, float | str]:
-        """Return the properties of the field that must agree between agent and environment."""
-        return {"size": self.stop - self.start, **self.model_dump(exclude={"start", "stop"})}
 
 
 class NetworkCard(BaseModel):
@@ -191,17 +187,13 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
         CoopenvError: there is none, which `what` was to be.
     """
     names = [*others, *list_agents()]
-    if name not in names and not installation.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
-        raise _not_found(what, name, names)
-
-
-def _not_found(what: str, name: str, known: Sequence[str]) -> CoopenvError:
-    """Return the error for a name without an agent, with a hint or the known names."""
+    if name in names or installation.is_reference(name) or (Path(name) / AGENT_FILE).is_file():
+        return
     if (Path(name) / CHECKPOINT_FILE).is_file():
-        return CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
+        raise CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
     if name.endswith(".py"):
-        return CoopenvError(f"{name}: name a class or function in it: {name}:Class")
-    return CoopenvError(f"unknown {what} '{name}'{suggest(name, known)}; known: {', '.join(known)}")
+        raise CoopenvError(f"{name}: name a class or function in it: {name}:Class")
+    raise CoopenvError(f"unknown {what} '{name}'{suggest(name, names)}; known: {', '.join(names)}")
 
 
 def agents_for(environment: str) -> list[str]:

@@ -1,6 +1,5 @@
 """Planning of headings by predicted pose covariances over sampled plans; a reference for what is possible."""
 
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -57,6 +56,7 @@ class LookAhead(RouteFollower):
     """
 
     needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
+    remembers = 2  # decisions until the next plan, and the present one
 
     def __init__(
         self,
@@ -88,26 +88,17 @@ class LookAhead(RouteFollower):
         self._first, self._second = (np.array(part, dtype=np.float32) for part in zip(*plans, strict=True))
         self._offsets = np.array(OFFSETS, dtype=np.float32)
         self._sharpest = np.tan(self.layout.action[1].high) / self.wheelbase  # rad/m
-        self._left = np.zeros(0, dtype=int)
-        self._plan = np.zeros(0, dtype=int)
-
-    def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask."""
-        if len(mask) != len(self._left):
-            self._left, self._plan = (np.zeros(len(mask), dtype=int) for _ in range(2))
-        self._left[mask] = 0
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
-        if len(observations) != len(self._left):
-            self.reset(np.ones(len(observations), dtype=bool))
-        due = np.flatnonzero(self._left == 0)
+        left, plan = self.memory(observations)
+        due = np.flatnonzero(left == 0)
         if len(due):
-            self._plan[due] = np.argmin(self.costs(observations[due]), axis=1)
-            self._left[due] = HOLD
-        self._left -= 1
+            plan[due] = np.argmin(self.costs(observations[due]), axis=1)
+            left[due] = HOLD
+        left -= 1
         heading = self.read(observations, "route_heading")[:, 0]
-        offset = self._first[self._plan]
+        offset = self._first[plan]
         along = self.pursue(self.direction(observations))
         steering = np.where(offset == 0.0, along, self.pursue(offset - heading))
         return self.speed(observations), steering
@@ -118,8 +109,13 @@ class LookAhead(RouteFollower):
         landmarks = self.read(observations, "map_position")[..., :2]
         boxes = self.occluders.boxes(partial(self.read, observations))
         known = self.known(observations)[:, None]
-        covariance, offsets, now = self._covariance(observations), self._offsets, self._start(observations)
-        too_close = self._too_close(observations)
+        axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
+        none = np.zeros_like(std)
+        covariance = PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, std**2)
+        offsets, shape = self._offsets, (len(observations), len(self._offsets))
+        zero = np.zeros(shape, dtype=np.float32)
+        now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), shape[1], axis=1))
+        (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
         cost, stride = np.zeros_like(now.x), self.cruise * STEP
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -140,33 +136,14 @@ class LookAhead(RouteFollower):
             covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
             cost = cost + STEP * self.price * np.maximum(covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
-            cost = cost + STEP * CLOSE * too_close(place, STEP * (step + 1))
+            # Vehicles with a received message are expected to drive straight on at the speed `cruise`.
+            driven = self.cruise * (STEP * (step + 1)) * forward
+            apart = (others + driven)[:, None] - place[:, :, None]
+            distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
+            cost = cost + STEP * CLOSE * np.maximum(keep - distance, 0.0)
         later = covariance.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
         cost = cost + self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / self.cruise + BACK * np.abs(now.aside))
-
-    def _too_close(self, observations: np.ndarray) -> Callable[[np.ndarray, float], np.ndarray]:
-        """Return a function of places (rows, plans, 2) and a time (s), with the missing distance to vehicles, m.
-
-        Vehicles with a received message are expected to drive straight on at the speed `cruise`.
-        """
-        if "message_mask" not in self.layout:
-            return lambda place, time: np.zeros(place.shape[:2])
-        mask, others, forward = self.received(observations)
-        keep = np.broadcast_to(self.distance_to_keep(observations), len(observations))
-
-        def too_close(place: np.ndarray, time: float) -> np.ndarray:
-            apart = (others + self.cruise * time * forward)[:, None] - place[:, :, None]
-            distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
-            return np.asarray(np.maximum(keep[:, None] - distance, 0.0))
-
-        return too_close
-
-    def _start(self, observations: np.ndarray) -> "_Path":
-        shape = len(observations), len(self._offsets)
-        x, y, heading, along = (np.zeros(shape, dtype=np.float32) for _ in range(4))
-        aside = np.repeat(self.read(observations, "route_offset"), shape[1], axis=1)
-        return _Path(x, y, heading, along, aside)
 
     def _route_pieces(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the route (rows, P), rad, own frame, and where they begin, (P,), m."""
@@ -175,12 +152,6 @@ class LookAhead(RouteFollower):
         leg = np.diff(points[:, 1:], axis=1)
         ahead = np.arctan2(leg[..., 1], leg[..., 0])
         return np.column_stack([heading, ahead]), distance[:-1]
-
-    def _covariance(self, observations: np.ndarray) -> PlanarCovariance:
-        """Return the covariance as far as the observation holds it, (rows, 1)."""
-        axes, heading = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
-        none = np.zeros_like(heading)
-        return PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, heading**2)
 
 
 class Peek(RouteFollower):

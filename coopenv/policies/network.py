@@ -18,6 +18,8 @@ from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
 """The `entry` of learned agents."""
+PLACE = {"start", "stop"}
+"""Properties of a field that may differ between agent and environment."""
 
 
 def layout_tables(layout: Layout) -> tuple[dict[str, NetworkColumn], dict[str, NetworkColumn]]:
@@ -64,8 +66,14 @@ class Network:
         observation, action = layout_tables(observation_layout(scenario))
         _compare("observation", network.observation, observation)
         _compare("action", network.action, action)
-        _check_order(network.action, action)
-        _compare_settings(network.settings, settings_of_meaning(scenario, network.observation))
+        if list(network.action) != list(action):
+            before, now = ", ".join(network.action), ", ".join(action)
+            raise CoopenvError(f"it was trained with other actions: {before} and not {now}")
+        settings = settings_of_meaning(scenario, network.observation)
+        for key in sorted({*network.settings, *settings}):
+            trained, here = network.settings.get(key), settings.get(key)
+            if trained is None or here is None or not math.isclose(trained, here, rel_tol=1e-9):
+                raise CoopenvError(f"it was trained with another {key}, {trained!r}, and it is {here!r} here")
         fields = [observation[name] for name in network.observation]
         self._columns = np.concatenate([np.arange(field.start, field.stop) for field in fields])
         path = folder / network.weights
@@ -95,22 +103,11 @@ def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str,
         before = f"it was trained with another {what}: '{name}'"
         if name not in here:
             raise CoopenvError(f"{before} is not in this environment")
-        pairs = zip(entry.signature().items(), here[name].signature().values(), strict=True)
-        for (key, value), now in pairs:
+        then, present = ({"size": c.stop - c.start, **c.model_dump(exclude=PLACE)} for c in (entry, here[name]))
+        for key, value in then.items():
+            now = present[key]
             if value != now if isinstance(value, str) else not np.isclose(value, now, rtol=1e-9):
                 raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")
-
-
-def _compare_settings(trained: Mapping[str, float], here: Mapping[str, float]) -> None:
-    for key in sorted({*trained, *here}):
-        before, now = trained.get(key), here.get(key)
-        if before is None or now is None or not math.isclose(before, now, rel_tol=1e-9):
-            raise CoopenvError(f"it was trained with another {key}, {before!r}, and it is {now!r} here")
-
-
-def _check_order(trained: Mapping[str, NetworkColumn], here: Mapping[str, NetworkColumn]) -> None:
-    if list(trained) != list(here):
-        raise CoopenvError(f"it was trained with other actions: {', '.join(trained)} and not {', '.join(here)}")
 
 
 def _load(path: Path, digest: str) -> dict[str, np.ndarray]:

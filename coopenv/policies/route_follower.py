@@ -22,6 +22,8 @@ class Driver(ABC):
 
     needs: tuple[str, ...] = ()
     """Fields of the observation without which it cannot drive."""
+    remembers = 0
+    """How many numbers it remembers of every row."""
 
     def __init__(self, scenario: Scenario, *, cruise: float | None = None, look_ahead: float | None = None) -> None:
         """Learn where everything stands in an observation.
@@ -43,12 +45,26 @@ class Driver(ABC):
         self.cruise = self.layout.action[0].high if cruise is None else cruise
         least = PURSUED * self.cruise / scenario.rates.decision
         self.look_ahead = max(1.0, least) if look_ahead is None else look_ahead
-        self.length, self.width = body_of_driven(scenario)
+        driven = [vehicle.body for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
+        self.length, self.width, _ = max((body.size for body in driven), default=(*SMALL, 0.0))
         self.scale = max(1.0, self.length / SMALL[0])
         # The reference point of highway-env's cars is midway between axles that stand at their ends, not the rear one.
         self.midway = scenario.backend == "highway"
         self.wheelbase = self.length if self.midway else scenario.dynamics.wheelbase
         self._distances = scenario.observation.route_step * MULTIPLES
+        self._memory = np.zeros((self.remembers, 0), dtype=int)
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Begin new episodes in the rows of a mask: what is remembered of them is 0."""
+        if len(mask) != self._memory.shape[1]:
+            self._memory = np.zeros((self.remembers, len(mask)), dtype=int)
+        self._memory[:, mask] = 0
+
+    def memory(self, observations: np.ndarray) -> np.ndarray:
+        """Return what is remembered, (remembers, rows)."""
+        if len(observations) != self._memory.shape[1]:
+            self.reset(np.ones(len(observations), dtype=bool))
+        return self._memory
 
     @abstractmethod
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -103,13 +119,6 @@ class Driver(ABC):
         turn = np.clip((direction + np.pi) % (2.0 * np.pi) - np.pi, -np.pi / 2.0, np.pi / 2.0)
         circle = self.look_ahead + (self.wheelbase * np.cos(turn) if self.midway else 0.0)
         return np.asarray(np.arctan(2.0 * self.wheelbase * np.sin(turn) / circle))
-
-
-def body_of_driven(scenario: Scenario) -> tuple[float, float]:
-    """Return length and width, m, of the longest vehicle that is driven; `SMALL` where none has a body."""
-    bodies = [vehicle.body.size for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
-    length, width, _ = max(bodies, default=(*SMALL, 0.0))
-    return length, width
 
 
 class ConstantSpeed(Driver):
@@ -170,7 +179,13 @@ class RouteFollower(Driver):
         return self.speed(observations), self.pursue(self.direction(observations))
 
     def received(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the senders of received messages, (rows, M), their places and directions, (rows, M, 2), own frame."""
+        """Return the senders of received messages, (rows, M), their places and directions, (rows, M, 2), own frame.
+
+        Where nobody can send there is one sender, from whom nothing is received.
+        """
+        if "message_mask" not in self.layout or 0 in self.layout["message_mask"].shape:
+            none = np.zeros((len(observations), 1, 2))
+            return none[..., 0] > 0.0, none, none
         mask = self.read(observations, "message_mask") > 0.5
         place, forward = (self.read(observations, f"message_{name}")[..., :2] for name in ("position", "forward"))
         return mask, place, forward
@@ -180,8 +195,6 @@ class RouteFollower(Driver):
 
         Others are expected to go straight on at the speed `cruise`, or at any of `paces` of it.
         """
-        if "message_mask" not in self.layout:
-            return np.full(len(observations), self.cruise)
         mask, place, forward = self.received(observations)
         points, distance = self.route_points(observations)
         velocities = [pace * self.cruise * forward for pace in self.paces]
@@ -194,10 +207,10 @@ class RouteFollower(Driver):
         waiting = least(np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0]))
         return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
 
-    def distance_to_keep(self, observations: np.ndarray) -> np.ndarray | float:
-        """Return the distance to keep, m, one or (rows,): it grows with the standard deviation of the own position."""
+    def distance_to_keep(self, observations: np.ndarray) -> np.ndarray:
+        """Return the distances to keep, (rows,) in m: they grow with the standard deviation of the own position."""
         if "position_std" not in self.layout:
-            return self.clearance
+            return np.full(len(observations), self.clearance)
         std = 10.0 ** self.read(observations, "position_std")[:, 0]
         return np.asarray(np.minimum(self.closest + std, self.clearance))
 
@@ -274,9 +287,7 @@ class IntelligentDriver(RouteFollower):
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s, that the model's acceleration leads to until the next decision."""
         own = np.maximum(self.read(observations, "velocity")[:, 0], 0.0)
-        gap, closing = np.full(len(own), np.inf), np.zeros(len(own))
-        if "message_mask" in self.layout:
-            gap, closing = self._ahead(observations, own)
+        gap, closing = self._ahead(observations, own)
         wanted = own * self.time_gap + own * closing / (2.0 * np.sqrt(self.acceleration * self.deceleration))
         wanted = self.standstill_gap + np.maximum(wanted, 0.0)
         free = 1.0 - (own / self.cruise) ** 4
@@ -296,10 +307,7 @@ class IntelligentDriver(RouteFollower):
             aside = np.abs(along[:, None, 0] * offset[..., 1] - along[:, None, 1] * offset[..., 0])
             on_it = mask & (aside < self.half_width) & (ahead > 0.0) & (ahead <= distance[k + 1] - distance[k])
             length = np.where(on_it, ahead + distance[k] - self.length, np.inf)
-            which = np.argmin(length, axis=1) if length.shape[1] else np.zeros(len(own), dtype=int)
-            if not length.shape[1]:
-                continue
-            rows = np.arange(len(own))
+            rows, which = np.arange(len(own)), np.argmin(length, axis=1)
             nearer = length[rows, which] < gap
             theirs = self.cruise * (forward * along[:, None]).sum(axis=-1)[rows, which]
             gap = np.where(nearer, length[rows, which], gap)
@@ -314,6 +322,7 @@ class StopWhenLost(RouteFollower):
     """
 
     needs = ("position_std",)
+    remembers = 1  # decisions for which it has been lost
 
     def __init__(self, scenario: Scenario, *, threshold: float = 0.15, patience: float = 3.0) -> None:
         """Choose when to stop.
@@ -326,19 +335,11 @@ class StopWhenLost(RouteFollower):
         super().__init__(scenario)
         self.threshold = np.log10(threshold)
         self.patience = round(patience * scenario.rates.decision)
-        self._waited = np.zeros(0, dtype=int)
-
-    def reset(self, mask: np.ndarray) -> None:
-        """Begin new episodes in the rows of a mask."""
-        if len(mask) != len(self._waited):
-            self._waited = np.zeros(len(mask), dtype=int)
-        self._waited[mask] = 0
 
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s."""
-        if len(observations) != len(self._waited):
-            self.reset(np.ones(len(observations), dtype=bool))
         lost = self.read(observations, "position_std")[:, 0] > self.threshold
-        self._waited = np.where(lost, self._waited + 1, 0)
-        stands = lost & (self._waited <= self.patience)
+        (waited,) = self.memory(observations)
+        waited[:] = np.where(lost, waited + 1, 0)
+        stands = lost & (waited <= self.patience)
         return np.where(stands, 0.0, super().speed(observations))

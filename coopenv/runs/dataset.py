@@ -14,7 +14,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
-from coopenv.api.terms.layout import action_space, flat_space, observation_layout
+from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.base.errors import CoopenvError, OutputError, world_keys
 from coopenv.base.files import replacing_folder, writing
 from coopenv.base.installation import environment, environment_id, version
@@ -195,7 +195,7 @@ def write_dataset(
             env=gymnasium.spec(environment_id(name)) if name else None,
             requirements=[f"coopenv=={version()}"],
             data_format="hdf5",
-            observation_space=flat_space(observation_layout(scenario)),
+            observation_space=observation_space(observation_layout(scenario)),
             action_space=action_space(scenario),
             **facts,
         )

@@ -288,7 +288,7 @@ GROUPS = tuple(FIELDS)
 """Groups of fields of coopenv, in their order in an observation."""
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
 """Those of a scenario that does not name any."""
-VALUES = "coopenv.api.terms.values"
+VALUES = "coopenv.api.terms.records"
 """Module that computes the values of the built-in fields and reward terms, in the order of their rows."""
 
 OBSERVATION_FIELDS = Registry(

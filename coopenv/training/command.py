@@ -1,23 +1,33 @@
-"""`coopenv train`: learn, judge on held-out maps, keep checkpoints, and write the agent's folder. Needs `train`."""
+"""`coopenv train`: learn, judge on held-out maps, keep checkpoints, and write the agent's folder. Needs `train`.
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+A checkpoint holds all that the next update depends on, in one file without pickle: a safetensors file of arrays, whose
+header holds the plan, how far the training is, and its curve. It is replaced as a whole, so that a run that is killed
+while writing keeps the one before.
+"""
+
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError, OutputError, evaluation_seed
-from coopenv.base.files import check_file, new_folder, replacing_folder
+from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
-from coopenv.training import checkpoint, files
 from coopenv.training.export import EXPORTED, check_onnx, export
-from coopenv.training.files import environment_file
-from coopenv.training.settings import Plan
+from coopenv.training.settings import Plan, check_settings, environment_file
 from coopenv.training.trainer import DivergedError, Status, Trainer
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
@@ -25,6 +35,11 @@ NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
+
+
+FORMAT = 2
+HEADER = "coopenv_checkpoint"
+Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -47,7 +62,7 @@ def resumed_plan(out: Path) -> Plan:
     """
     if not (out / CHECKPOINT_FILE).is_file() and (out / AGENT_FILE).is_file():
         raise CoopenvError(f"nothing to resume: {out} holds a finished agent and no checkpoint")
-    return checkpoint.read(out / CHECKPOINT_FILE).plan
+    return read(out / CHECKPOINT_FILE).plan
 
 
 def possible(plan: Plan) -> Scenario:
@@ -100,82 +115,67 @@ def train(
             or something cannot be written; the last checkpoint stays.
     """
     report, path = reports or Reports(), out / CHECKPOINT_FILE
-    scenario = possible(plan)
-    kept = checkpoint.read(path) if resume else None
-    if kept is None and path.is_file():
-        raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
-    if kept is None and (out / AGENT_FILE).exists() and not force:
-        raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
-    files.check(out, plan, environment_file(plan.environment).name)
-    outputs = checkpoint.Outputs(onnx, logs)
+    scenario, environment = possible(plan), environment_file(plan.environment)
+    kept = read(path) if resume else None
     if kept is not None:
-        outputs = outputs.or_else(kept.outputs)
-    if outputs.onnx:
+        onnx, logs = onnx or kept.onnx, logs or kept.logs
+    elif path.is_file():
+        raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
+    elif (out / AGENT_FILE).exists() and not force:
+        raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
+    check_settings(out, plan, environment)
+    if onnx:
         check_onnx()
     trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
+    judge = partial(_judge, trainer, threads, report)
     try:
-        with new_folder(out), new_folder(outputs.logs or out / LOGS) as tensorboard:
+        with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.log_to(str(tensorboard))
         if kept is not None:
-            checkpoint.restore(kept, trainer)
+            restore(kept, trainer)
         else:
             trainer.begin(report.cloning)
-        worlds = plan.settings.evaluation.final_worlds
-        with _kept_from_before(path):
-            _learn(trainer, path, curve, outputs, threads, report)
-            results = _judge(trainer, held_out_seeds(0, worlds), threads, report)
-        with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
-            files.write(folder, out, plan, trainer.environment.name)
-            export(folder, trainer, results, curve, outputs.onnx)
+        try:
+            _learn(trainer, curve, report, judge, partial(save, path, trainer, curve, onnx, logs))
+            results = judge(held_out_seeds(0, plan.settings.evaluation.final_worlds))
+        except DivergedError as error:
+            if not path.is_file():
+                raise
+            left = f"{path} is kept as it was after {read(path).progress['steps']} steps"
+            raise DivergedError(f"{error}; {left}, remove it to begin anew with other settings") from None
+        with replacing_folder(out, (*NAMES, environment.name)) as folder:
+            export(folder, out, trainer, environment, results, curve, onnx)
     finally:
         trainer.close()
     return results
 
 
-@contextmanager
-def _kept_from_before(path: Path) -> Iterator[None]:
-    """Say where a training that diverges has left its last checkpoint."""
-    try:
-        yield
-    except DivergedError as error:
-        if not path.is_file():
-            raise
-        kept = f"{path} is kept as it was after {checkpoint.read(path).progress['steps']} steps"
-        raise DivergedError(f"{error}; {kept}, remove it to begin anew with other settings") from None
-
-
 def _learn(
     trainer: Trainer,
-    path: Path,
     curve: list[dict[str, float]],
-    outputs: checkpoint.Outputs,
-    threads: int | None,
     report: Reports,
+    judge: Callable[[list[int]], list[Result]],
+    keep: Callable[[], None],
 ) -> None:
     """Update until the budget is spent; judge and write a checkpoint every so often."""
     evaluation = trainer.plan.settings.evaluation
-    if not path.is_file():
-        _save(trainer, path, curve, outputs)
+    if trainer.status.steps == 0:
+        keep()
     while trainer.status.share < 1.0:
         before = trainer.status.steps // evaluation.every
         status = trainer.update()
         report.status(status)
         if status.steps // evaluation.every > before and status.share < 1.0:
             seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
-            means = {result.metric: result.mean for result in _judge(trainer, seeds, threads, report)}
+            means = {result.metric: result.mean for result in judge(seeds)}
             trainer.record(means)
             curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
-            _save(trainer, path, curve, outputs)
+            keep()
 
 
-def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]], outputs: checkpoint.Outputs) -> None:
-    checkpoint.save(path, trainer, curve, outputs)
-    interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
-
-
-def _judge(trainer: Trainer, seeds: list[int], threads: int | None, report: Reports) -> list[Result]:
+def _judge(trainer: Trainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
     """Return how the mean action drives in held-out worlds."""
     engine = Engine(trainer.scenario, len(seeds), threads=threads)
     try:
@@ -184,3 +184,155 @@ def _judge(trainer: Trainer, seeds: list[int], threads: int | None, report: Repo
         engine.close()
     report.judged(trainer.status.steps, results)
     return results
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a file holds."""
+
+    path: Path
+    plan: Plan
+    scenario: str
+    """JSON of the scenario, to find out whether it is still the same."""
+    progress: dict[str, Any]
+    curve: list[dict[str, float]]
+    onnx: bool
+    """Whether an ONNX model is to be written, too, as the command line said."""
+    logs: Path | None
+    """Its folder for TensorBoard; None: in the agent's folder."""
+    arrays: Arrays
+
+
+def save(
+    path: Path, trainer: Trainer, curve: list[dict[str, float]], onnx: bool = False, logs: Path | None = None
+) -> None:
+    """Write a checkpoint in the place of the one before.
+
+    Raises:
+        OutputError: it cannot be written; the one before is whole.
+    """
+    header = {
+        "format": FORMAT,
+        "plan": trainer.plan.document(),
+        "scenario": trainer.scenario.model_dump_json(),
+        "progress": {
+            "steps": trainer.model.num_timesteps,
+            "seconds": trainer.seconds,
+            "cpu_seconds": trainer.cpu_seconds,
+        },
+        "curve": curve,
+        "onnx": onnx,
+        "logs": None if logs is None else str(logs.absolute()),
+    }
+    with replacing_file(path) as new, writing(path):
+        try:
+            save_file(_arrays(trainer), new, metadata={HEADER: json.dumps(header)})
+        except SafetensorError as error:  # what the system says of a full disk comes as one of these
+            raise OSError(str(error)) from None
+    interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
+
+
+def read(path: Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        CoopenvError: there is none, it is damaged, or of another version.
+    """
+    if not path.is_file():
+        raise CoopenvError(f"nothing to resume: there is no {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})[HEADER])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        if header["format"] != FORMAT:
+            raise CoopenvError(f"{path}: a checkpoint of format {header['format']}, expected {FORMAT}")
+        plan = Plan.of_document(header["plan"])
+        counts = header["progress"]
+        progress = {"steps": int(counts["steps"]), **{name: float(counts[name]) for name in ("seconds", "cpu_seconds")}}
+        logs = header.get("logs")  # checkpoints of before there was such an entry go on without
+        outputs = bool(header.get("onnx")), None if logs is None else Path(logs)
+        return Checkpoint(path, plan, header["scenario"], progress, header["curve"], *outputs, arrays)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, CoopenvError):
+            raise
+        raise CoopenvError(f"{path}: damaged, or not a checkpoint ({error}); remove it to start anew") from None
+
+
+def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
+    """Let a trainer of the same plan go on from a checkpoint.
+
+    Raises:
+        CoopenvError: it does not fit: the environment has changed since, or the file has been edited.
+    """
+    if checkpoint.scenario != trainer.scenario.model_dump_json():
+        name = trainer.plan.environment
+        raise CoopenvError(f"{checkpoint.path}: {name} has changed since; remove the file to start anew")
+    try:
+        _restore(checkpoint, trainer)
+    except (RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise CoopenvError(f"{checkpoint.path}: does not fit: {error}; remove it to start anew") from None
+    trainer.model.num_timesteps = checkpoint.progress["steps"]
+    trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
+
+
+def _arrays(trainer: Trainer) -> Arrays:
+    policy, statistics = trainer.model.policy, trainer.env.statistics
+    arrays = {f"policy/{name}": values.numpy() for name, values in policy.state_dict().items()}
+    for index, moments in policy.optimizer.state_dict()["state"].items():
+        arrays |= {f"optimiser/{index}/{name}": values.numpy() for name, values in moments.items()}
+    arrays |= {
+        "statistics/mean": statistics.mean,
+        "statistics/var": statistics.var,
+        "statistics/count": np.array(statistics.count),
+    }
+    _, key, position, *_ = np.random.get_state()
+    arrays |= {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.append(key, np.uint32(position))}
+    arrays |= {f"world/{name}": values for name, values in _worlds(trainer).items()}
+    return {name: np.array(values, order="C") for name, values in arrays.items()}
+
+
+def _worlds(trainer: Trainer) -> Arrays:
+    """Return the episodes under way; nothing where objects are part of them, so that new ones begin on resuming.
+
+    Such are observers on the host, which are anybody's, and the environments of highway-env.
+    """
+    if trainer.batch.engine.plugins is not None:
+        return {}
+    state: Mapping[str, object] = trainer.batch.get_state()
+    arrays = {name: values for name, values in state.items() if isinstance(values, np.ndarray)}
+    return arrays if len(arrays) == len(state) else {}
+
+
+def _restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
+    policy, statistics = trainer.model.policy, trainer.env.statistics
+    policy.load_state_dict(_tensors(_under("policy/", checkpoint.arrays)), strict=True)
+    moments: dict[int, dict[str, torch.Tensor]] = {}
+    for name, values in _tensors(_under("optimiser/", checkpoint.arrays)).items():
+        index, _, moment = name.partition("/")
+        moments.setdefault(int(index), {})[moment] = values
+    policy.optimizer.load_state_dict({**policy.optimizer.state_dict(), "state": moments})
+    for name in ("mean", "var"):
+        found = checkpoint.arrays[f"statistics/{name}"]
+        if found.shape != statistics.mean.shape:
+            raise ValueError(f"statistics/{name} has shape {found.shape}")
+        setattr(statistics, name, found)
+    statistics.count = float(checkpoint.arrays["statistics/count"])
+    torch.set_rng_state(torch.from_numpy(checkpoint.arrays["random/torch"]))
+    key, position = np.split(checkpoint.arrays["random/numpy"], [-1])
+    np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
+    world = _under("world/", checkpoint.arrays)
+    if world:
+        trainer.env.go_on_from(trainer.batch.set_state(world))
+    else:
+        trainer.batch.seed(trainer.plan.seed + checkpoint.progress["steps"])
+
+
+def _under(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def _tensors(arrays: Arrays) -> dict[str, torch.Tensor]:
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} is not finite")
+    return {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}

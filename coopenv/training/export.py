@@ -1,10 +1,9 @@
-"""An agent's folder from a trained policy: `agent.toml`, weights, settings, curve, ONNX. Needs the extra `train`."""
+"""An agent's folder: settings and environment of its training, `agent.toml`, weights, curve, ONNX. Needs `train`."""
 
 import csv
-import platform
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from shlex import join
 from typing import Any
@@ -17,13 +16,12 @@ from torch import nn
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import writing
-from coopenv.base.installation import version
+from coopenv.base.installation import version, versions
 from coopenv.evaluation import Result
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
-from coopenv.training import files
-from coopenv.training.settings import SETTINGS_FILE
+from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, settings_digest, write_settings
 from coopenv.training.trainer import Trainer
 
 WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
@@ -33,27 +31,37 @@ PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
 
 
 def export(
-    folder: Path, trainer: Trainer, results: Sequence[Result], curve: list[dict[str, float]], onnx: bool = False
+    folder: Path,
+    old: Path,
+    trainer: Trainer,
+    environment: EnvironmentFile,
+    results: Sequence[Result],
+    curve: list[dict[str, float]],
+    onnx: bool = False,
 ) -> None:
-    """Write everything that an agent's folder holds, but for its settings (`files.write`).
+    """Write everything that an agent's folder holds.
 
     Args:
         folder: to write to.
+        old: whose place it takes.
         trainer: whose policy it is.
+        environment: of the training, as it was at its beginning.
         results: figures on held-out maps.
         curve: rows of figures while it learnt.
         onnx: also write the mean action as an ONNX model, from raw observations to actions.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: it cannot be written, or see `check_settings`.
     """
+    write_settings(folder, old, trainer.plan, environment)
     tensors = network_of(trainer)
     weights = save(tensors)
     with writing(folder):
         (folder / WEIGHTS_FILE).write_bytes(weights)
-        if trainer.environment.text is not None:
-            (folder / trainer.environment.name).write_text(trainer.environment.text, encoding="utf-8")
-        (folder / AGENT_FILE).write_text(_card(trainer, results, sha256(weights).hexdigest()), encoding="utf-8")
+        if environment.text is not None:
+            (folder / environment.name).write_text(environment.text, encoding="utf-8")
+        card = _card(trainer, environment, results, sha256(weights).hexdigest())
+        (folder / AGENT_FILE).write_text(card, encoding="utf-8")
         if curve:
             with (folder / CURVE_FILE).open("w", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, curve[-1])
@@ -75,12 +83,6 @@ def network_of(trainer: Trainer) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in tensors.items()}
 
 
-def command_of(trainer: Trainer) -> str:
-    """Return the command that trains the same once more, in the agent's folder."""
-    name, seed = trainer.environment.name, str(trainer.plan.seed)
-    return join(["coopenv", "train", name, "--settings", SETTINGS_FILE, "--seed", seed])
-
-
 def scenario_digest(scenario: Scenario) -> str:
     """Return the first 16 hexadecimal digits of SHA-256 over what a scenario sets, whatever it is called."""
     aside = {"title", "description", "source", *(["difficulty"] if scenario.difficulty.neutral else [])}
@@ -88,8 +90,8 @@ def scenario_digest(scenario: Scenario) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
-    plan, environment = trainer.plan, trainer.environment
+def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
+    plan = trainer.plan
     observation, action = layout_tables(observation_layout(trainer.scenario))
     settings = settings_of_meaning(trainer.scenario, observation)
     card = NetworkCard(
@@ -110,16 +112,17 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
     document["environments"] = [environment.name]
     document["network"] = _with_rows(card.model_dump(), "observation", "action")
     document["training"] = {
-        "command": command_of(trainer),
+        # trains the same once more, in the agent's folder
+        "command": join(["coopenv", "train", environment.name, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)]),
         "environment": environment.name,
         "seed": plan.seed,
         "scenario": scenario_digest(trainer.scenario),
-        "settings": files.settings_digest(plan),
+        "settings": settings_digest(plan),
         **({"arm": plan.arm} if plan.arm else {}),
         "steps": trainer.status.steps,
         "minutes": round(trainer.status.seconds / 60.0, 2),
         "cpu_minutes": round(trainer.cpu_seconds / 60.0, 2),
-        "versions": {"coopenv": version(), "python": platform.python_version(), **_versions()},
+        "versions": {"coopenv": version(), **versions(*PACKAGES)},
     }
     document["results"] = _with_rows({"figures": _figures(results)}, "figures")
     return tomlkit.dumps(document)
@@ -147,10 +150,6 @@ def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:
             row.update(values)
             rows[name][key] = row
     return rows
-
-
-def _versions() -> dict[str, str]:
-    return {name: metadata.version(name) for name in PACKAGES}
 
 
 def check_onnx() -> None:

@@ -1,16 +1,25 @@
-"""The settings of a training, read from a TOML file, and what exactly is to be trained."""
+"""The settings of a training, read from a TOML file, what exactly is to be trained, and these files beside an agent."""
 
 import json
+import re
+import shutil
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from coopenv.base.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, OutputError, suggest
+from coopenv.base.files import writing
+from coopenv.base.installation import is_scene, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
+from coopenv.policies.loader import AGENT_FILE
 from coopenv.scenario.base import NonNegative, Positive, Probability
+from coopenv.scenario.own_terms import SECTIONS, located
+from coopenv.scenario.scenes import scene_text
 
 SETTINGS_FILE = "train.toml"
 Count = Annotated[int, Field(gt=0, le=2**31)]
@@ -123,25 +132,15 @@ class Plan:
 
     def document(self) -> dict[str, Any]:
         """Return it as plain data."""
-        return {
-            "environment": self.environment,
-            "arm": self.arm,
-            "seed": self.seed,
-            "overrides": dict(self.overrides or {}),
-            "settings": self.settings.model_dump(mode="json"),
-        }
+        document: dict[str, Any] = TypeAdapter(Plan).dump_python(self, mode="json")
+        return document
 
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Plan":
-        """Return the plan of what `document` returned.
-
-        Raises:
-            CoopenvError: it is none.
-        """
+        """Return the plan of what `document` returned. Raises CoopenvError: it is none."""
         try:
-            settings = Settings.model_validate_json(json.dumps(document["settings"]), strict=True)
-            return cls(str(document["environment"]), settings, document["seed"], document["arm"], document["overrides"])
-        except (ValidationError, KeyError, TypeError) as error:
+            return TypeAdapter(Plan).validate_json(json.dumps(document), strict=True)
+        except (ValidationError, TypeError) as error:
             raise CoopenvError(f"not the plan of a training: {type(error).__name__}") from None
 
 
@@ -207,3 +206,110 @@ def _merged(base: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
         inner = merged.get(key)
         merged[key] = _merged(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
     return merged
+
+
+class EnvironmentFile(NamedTuple):
+    """The environment as an agent's folder holds it."""
+
+    title: str
+    """Its name in texts."""
+    name: str
+    """By which `agent.toml` names it: one of coopenv's, or a file beside `agent.toml`."""
+    text: str | None = None
+    """Contents of that file."""
+
+
+def environment_file(environment: str) -> EnvironmentFile:
+    """Return an environment, by its name or TOML file, as it goes with an agent. Raises CoopenvError: there is none."""
+    if environment in list_envs():
+        return EnvironmentFile(environment, environment)
+    if is_scene(environment):
+        name = re.sub(r"[^A-Za-z0-9]+", "_", environment)
+        return EnvironmentFile(environment, f"{name}.toml", scene_text(environment))
+    path = scenario_path(environment)
+    name = f"{path.stem}.toml"
+    if name in (AGENT_FILE, SETTINGS_FILE):  # which stand there
+        name = "environment.toml"
+    return EnvironmentFile(path.stem, name, _movable(path.read_text(encoding="utf-8-sig"), path.parent))
+
+
+def _movable(text: str, folder: Path) -> str:
+    """Return a scenario of some folder as it means the same in every other: with absolute places of its own terms."""
+    raw = tomllib.loads(text)
+    changed = located(raw, folder)
+    if changed == raw:
+        return text
+    import tomlkit  # of the extra `train`
+
+    document = tomlkit.parse(text)
+    for section in SECTIONS:
+        rows = changed.get(section, {}).get("custom", {})
+        for name, row in rows.items():
+            document[section]["custom"][name] = row
+    return tomlkit.dumps(document)
+
+
+def settings_text(plan: Plan) -> str:
+    """Return the settings of a training, defaults and overrides among them, as TOML."""
+    import tomlkit  # of the extra `train`
+
+    values = plan.settings.model_dump(mode="json", exclude_none=True)
+    return tomlkit.dumps({**values, "scenario": plan.all_overrides})
+
+
+def settings_digest(plan: Plan) -> str:
+    """Return the SHA-256 of `settings_text`, by which a later training knows the file for the agent's."""
+    return sha256(settings_text(plan).encode()).hexdigest()
+
+
+def check_settings(folder: Path, plan: Plan, environment: EnvironmentFile) -> None:
+    """Find out before any work whether `write_settings` can be done.
+
+    Raises:
+        OutputError: a folder holds other settings, and they are not those of an agent in it but the user's own.
+    """
+    path = folder / SETTINGS_FILE
+    if path.exists() and not _says(path, plan, environment) and not _is_the_agents(path):
+        raise OutputError(
+            f"{path}: no agent's, and this training has other settings: name another folder with --out, or move it"
+        )
+
+
+def write_settings(folder: Path, old: Path, plan: Plan, environment: EnvironmentFile) -> None:
+    """Write the settings of a training to the new folder of its agent; a file that says the same goes along as it is.
+
+    Args:
+        folder: to write to.
+        old: whose place it takes.
+        plan: of the training.
+        environment: of the training.
+
+    Raises:
+        OutputError: it cannot be written, or see `check_settings`.
+    """
+    check_settings(old, plan, environment)
+    new = folder / SETTINGS_FILE
+    with writing(new):
+        if (old / SETTINGS_FILE).exists() and _says(old / SETTINGS_FILE, plan, environment):
+            shutil.copy2(old / SETTINGS_FILE, new, follow_symlinks=False)
+        else:
+            new.write_text(settings_text(plan), encoding="utf-8", newline="\n")
+
+
+def _says(path: Path, plan: Plan, environment: EnvironmentFile) -> bool:
+    """Return whether `coopenv train` with a file and no other option has the settings of a plan."""
+    try:
+        settings = read_settings(path, None, Path(environment.name).stem)
+    except CoopenvError:
+        return False
+    return settings == plan.settings.model_copy(update={"scenario": plan.all_overrides})
+
+
+def _is_the_agents(path: Path) -> bool:
+    """Return whether `coopenv train` has written a file that was not changed since."""
+    try:
+        card: dict[str, Any] = tomllib.loads((path.parent / AGENT_FILE).read_text(encoding="utf-8"))
+        known = card["training"].get("settings")  # earlier versions noted none
+        return known is None or known == sha256(path.read_bytes()).hexdigest()
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, AttributeError):
+        return False

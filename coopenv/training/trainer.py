@@ -26,7 +26,6 @@ from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
-from coopenv.training.files import environment_file
 from coopenv.training.settings import Clone, Plan
 
 EPISODES = 200
@@ -158,14 +157,12 @@ class NormalisedEnv(VecEnvWrapper):
 BATCH = 512  # rows per gradient step
 
 
-def clone(
+def imitate(
     policy: ActorCriticPolicy,
     env: NormalisedEnv,
-    settings: Clone,
-    gamma: float,
-    reward_scale: float,
-    seed: int,
-    report: Callable[[str], None] = lambda line: None,
+    clone: Clone,
+    plan: Plan,
+    report: Callable[[str], None],
 ) -> None:
     """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
@@ -175,21 +172,20 @@ def clone(
     Args:
         policy: to be fitted.
         env: whose statistics are to be filled.
-        settings: driver and number of episodes.
-        gamma: discount per decision.
-        reward_scale: of the rewards that the value is to predict.
-        seed: of the worlds, the noise and the order of rows.
+        clone: driver and number of episodes.
+        plan: with the discount, the scale of rewards, and the seed of the worlds, the noise and the order of rows.
         report: called with a line on the progress.
     """
-    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed, report)
+    ppo = plan.settings.ppo
+    raw, actions, returns = watch(env.venv.envs, clone, ppo.gamma, plan.seed, report)
     env.statistics.update(raw)
     observations = torch.from_numpy(env.normalise(raw))
     targets = torch.from_numpy(actions.astype(np.float32))
-    values = torch.from_numpy((reward_scale * returns).astype(np.float32))
-    optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
-    shuffle = torch.Generator().manual_seed(seed)
-    for epoch in range(settings.epochs):
-        report(f"learning from {settings.agent}: pass {epoch + 1} of {settings.epochs}")
+    values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
+    optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
+    shuffle = torch.Generator().manual_seed(plan.seed)
+    for epoch in range(clone.epochs):
+        report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
         for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
             latent_policy, latent_value = policy.mlp_extractor(observations[rows])
             action_error = policy.action_net(latent_policy) - targets[rows]
@@ -250,7 +246,6 @@ class Trainer:
         """
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
         self.plan, self.scenario = plan, scenario
-        self.environment = environment_file(plan.environment)
         ppo = plan.settings.ppo
         rows = CooperativeVectorEnv(
             scenario,
@@ -263,7 +258,7 @@ class Trainer:
         self.batch = CooperativeSB3VecEnv(rows)
         self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
         self._rollout = ppo.decisions * self.env.num_envs
-        self._share, self._seconds, self.cpu_seconds = 0.0, 0.0, 0.0
+        self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
         widths = list(ppo.hidden)
         self.model = PPO(
             "MlpPolicy",
@@ -297,15 +292,8 @@ class Trainer:
 
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
         """Clone another driver, if settings name one, and start the first episodes; `report` gets progress lines."""
-        settings = self.plan.settings
-        if settings.clone is not None:
-            clone(
-                *(self.model.policy, self.env, settings.clone),
-                gamma=settings.ppo.gamma,
-                reward_scale=settings.ppo.reward_scale,
-                seed=self.plan.seed,
-                report=report,
-            )
+        if self.plan.settings.clone is not None:
+            imitate(self.model.policy, self.env, self.plan.settings.clone, self.plan, report)
         self.env.start()
 
     def update(self) -> Status:
@@ -318,7 +306,7 @@ class Trainer:
         self._share = self._spent()
         with self._finite():
             self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
-        self._seconds += monotonic() - begin
+        self.seconds += monotonic() - begin
         self.cpu_seconds += process_time() - cpu_begin
         return self.status
 
@@ -352,19 +340,11 @@ class Trainer:
     @property
     def status(self) -> Status:
         """How far the training is."""
-        return Status(self.model.num_timesteps, self._seconds, self._spent(), self._watch.figures())
+        return Status(self.model.num_timesteps, self.seconds, self._spent(), self._watch.figures())
 
     def _spent(self) -> float:
         steps, seconds = self.plan.settings.budget
-        return min(1.0, self.model.num_timesteps / steps if steps else self._seconds / (seconds or math.inf))
-
-    def progress(self) -> dict[str, Any]:
-        """Return how far it is as plain data, for `continue_at`."""
-        return {"steps": self.model.num_timesteps, "seconds": self._seconds, "cpu_seconds": self.cpu_seconds}
-
-    def continue_at(self, steps: int, seconds: float, cpu_seconds: float) -> None:
-        """Count on from there."""
-        self.model.num_timesteps, self._seconds, self.cpu_seconds = steps, seconds, cpu_seconds
+        return min(1.0, self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf))
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""

@@ -144,7 +144,7 @@ def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, 
 
 
 HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
-"""In place of an observer that runs on the host (`coopenv.api.plugins`)."""
+"""In place of an observer that runs on the host (`coopenv.api.engine.PlugIns`)."""
 
 
 @device_function

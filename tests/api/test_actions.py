@@ -18,45 +18,34 @@ def env() -> coopenv.CooperativeLocalisationEnv:
     return env
 
 
-def good() -> dict[str, Any]:
-    return {f"vehicle_{i}": np.zeros(2, dtype=np.float32) for i in range(1, 5)}
+GOOD = {f"vehicle_{i}": np.zeros(2, dtype=np.float32) for i in range(1, 5)}
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("actions", "message"),
     [
-        ({"vehicle_2": [np.nan, 0.0]}, "action of 'vehicle_2' is not finite"),
-        ({"vehicle_2": [np.inf, 0.0]}, "action of 'vehicle_2' is not finite"),
-        ({"vehicle_2": [0.0, 0.0, 0.0]}, r"action of 'vehicle_2' has shape \(3,\), expected \(2,\)"),
-        ({"vehicle_2": 0.5}, r"action of 'vehicle_2' has shape \(\), expected \(2,\)"),
-        ({"vehicle_2": "left"}, "action of 'vehicle_2' is not numeric"),
-        ({"vehicle_2": None}, "action of 'vehicle_2'"),
-        ({"vehicel_2": [0.0, 0.0]}, r"unknown agent 'vehicel_2' \(did you mean 'vehicle_2'\?\)"),
+        ({**GOOD, "vehicle_2": [np.nan, 0.0]}, "action of 'vehicle_2' is not finite"),
+        ({**GOOD, "vehicle_2": [np.inf, 0.0]}, "action of 'vehicle_2' is not finite"),
+        ({**GOOD, "vehicle_2": [0.0, 0.0, 0.0]}, r"action of 'vehicle_2' has shape \(3,\), expected \(2,\)"),
+        ({**GOOD, "vehicle_2": 0.5}, r"action of 'vehicle_2' has shape \(\), expected \(2,\)"),
+        ({**GOOD, "vehicle_2": "left"}, "action of 'vehicle_2' is not numeric"),
+        ({**GOOD, "vehicle_2": None}, "action of 'vehicle_2'"),
+        ({**GOOD, "vehicel_2": [0.0, 0.0]}, r"unknown agent 'vehicel_2' \(did you mean 'vehicle_2'\?\)"),
+        ({agent: GOOD[agent] for agent in ("vehicle_1", "vehicle_2", "vehicle_4")}, "no action for 'vehicle_3'"),
+        (np.zeros((4, 2)), "must be a dict"),
     ],
 )
-def test_wrong_actions(env: coopenv.CooperativeLocalisationEnv, change: dict[str, Any], message: str) -> None:
+def test_wrong_actions(env: coopenv.CooperativeLocalisationEnv, actions: Any, message: str) -> None:
     before = env.get_state()
     with pytest.raises(coopenv.ActionError, match=message):
-        env.step({**good(), **change})
+        env.step(actions)
     after = env.get_state()
     assert all(np.array_equal(before[key], after[key]) for key in before)
 
 
-def test_missing_action(env: coopenv.CooperativeLocalisationEnv) -> None:
-    actions = good()
-    del actions["vehicle_3"]
-    with pytest.raises(coopenv.ActionError, match="no action for 'vehicle_3'"):
-        env.step(actions)
-
-
-def test_all_at_once_is_not_a_dict(env: coopenv.CooperativeLocalisationEnv) -> None:
-    with pytest.raises(coopenv.ActionError, match="must be a dict"):
-        env.step(np.zeros((4, 2)))  # type: ignore[arg-type]
-
-
 def test_step_before_reset() -> None:
     with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        coopenv.parallel_env(FOUR_WAY).step(good())
+        coopenv.parallel_env(FOUR_WAY).step(GOOD)
 
 
 def test_out_of_range_is_clipped() -> None:

@@ -129,12 +129,13 @@ WRONG = [
     ({"parameters": {"traffic_pace": 2.0}}, "parameter 'traffic_pace' must be from 0 to 1, got 2.0"),
     ({"difficulty": 1.5}, "option 'difficulty' must be from 0 to 1, got 1.5"),
     ({"difficulty": "heard"}, r"unknown difficulty 'heard' \(did you mean 'hard'\?\); known: easy, normal, hard"),
+    ([1], "options must be a dict"),
     ({"dificulty": 1}, r"unknown option 'dificulty' \(did you mean 'difficulty'\?\)"),
 ]
 
 
 @pytest.mark.parametrize(("options", "message"), WRONG)
-def test_wrong_options_are_one_error_in_all_interfaces(options: dict[str, Any], message: str) -> None:
+def test_wrong_options_are_one_error_in_all_interfaces(options: Any, message: str) -> None:
     made = sometimes()
     for env in (CooperativeLocalisationEnv(made, "test"), batch(made, 2)):
         with pytest.raises(CoopenvError, match=message):

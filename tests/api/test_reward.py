@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import coopenv
-from coopenv.api.reward import FIELDS, OTHERS, Step, check_function
+from coopenv.api.arguments import FIELDS, OTHERS, Step, check_function
 from coopenv.base.errors import CoopenvError
 from tests.helpers.four_way import FOUR_WAY
 

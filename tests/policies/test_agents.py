@@ -21,10 +21,6 @@ from tests.helpers.four_way import FOUR_WAY
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
 
 
-def test_there_are_agents() -> None:
-    assert "route_follower" in list_agents()
-
-
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
     folder = data_directory("agents") / agent

@@ -19,7 +19,7 @@ from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.routes import compile_motion
 from coopenv.scenario.scenes import MOST_VEHICLES, SCENES, scene_rows, scene_text
 from coopenv.scenario.schema import neighbour_sets
-from coopenv.training.files import environment_file
+from coopenv.training.settings import environment_file
 
 
 def made(name: str, **changes: object) -> Scenario:

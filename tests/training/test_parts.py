@@ -21,7 +21,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
 from coopenv.training.export import export, network_of, onnx_model
-from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings
+from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings, environment_file
 from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer
 from tests.helpers.four_way import FOUR_WAY
 
@@ -44,7 +44,7 @@ def trained() -> Trainer:
 
 
 def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> None:
-    export(tmp_path, trained, [], [])
+    export(tmp_path, tmp_path, trained, environment_file(FOUR_WAY), [], [])
     observations = np.random.default_rng(0).uniform(-1, 1, (100, 132)).astype(np.float32)
     expected = trained.model.predict(trained.env.normalise(observations), deterministic=True)[0]
     agent = load_agent(tmp_path, trained.scenario)
@@ -82,7 +82,7 @@ def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
     trainer = trainer_of(minutes=1e-6)
     assert trainer.status.share == 0.0
     assert trainer.update().share == 1.0
-    trainer.continue_at(steps=128, seconds=3e-5, cpu_seconds=0.0)
+    trainer.model.num_timesteps, trainer.seconds = 128, 3e-5
     assert (trainer.status.steps, trainer.status.share) == (128, pytest.approx(0.5))
 
 
@@ -146,7 +146,7 @@ def test_learns_to_drive_faster_where_nothing_else_counts(tmp_path: Path) -> Non
 
 
 def test_an_agent_of_a_longer_action_is_not_this_one(trained: Trainer, tmp_path: Path) -> None:
-    export(tmp_path, trained, [], [])
+    export(tmp_path, tmp_path, trained, environment_file(FOUR_WAY), [], [])
     text = (
         (tmp_path / "agent.toml")
         .read_text()

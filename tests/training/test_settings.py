@@ -1,4 +1,4 @@
-"""Settings of a training: defaults, arms, and what is refused in one line."""
+"""Settings of a training: defaults, arms, and what is refused in one line; its files beside an agent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,19 @@ from pathlib import Path
 import pytest
 
 import coopenv
-from coopenv.training.settings import Plan, read_settings
+from coopenv.base.errors import OutputError
+from coopenv.base.installation import data_directory
+from coopenv.policies import find_agent
+from coopenv.training.settings import (
+    Plan,
+    check_settings,
+    environment_file,
+    read_settings,
+    settings_digest,
+    write_settings,
+)
+
+HERE = environment_file("urban_crossing")
 
 FILE = """
 steps = 1000
@@ -108,3 +120,143 @@ def test_missing_file_and_unknown_arm(path: Path) -> None:
         read_settings(path, environment="open_square")
     with pytest.raises(coopenv.CoopenvError, match=r"nowhere\.toml: cannot be read \(No such file"):
         read_settings(path.with_name("nowhere.toml"))
+
+
+# Settings beside an agent: the user's own are never lost
+
+
+MINE = """# my own words
+steps = 3000
+scenario.horizon = 6.0 # short
+[ppo]
+vehicles = 16
+[arms.long]
+steps = 9000
+"""
+REFUSED = r"train\.toml: no agent's, and this training has other settings: name another folder with --out, or move it"
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """Return a folder with settings of the user's."""
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "train.toml").write_bytes(MINE.replace("\n", "\r\n").encode())
+    return tmp_path / "old"
+
+
+@pytest.fixture
+def new(tmp_path: Path) -> Path:
+    pytest.importorskip("tomlkit", reason="needs the extra 'train'")
+    (tmp_path / "new").mkdir()
+    return tmp_path / "new"
+
+
+def plan_of(folder: Path, arm: str | None = None, **changes: int) -> Plan:
+    return Plan("urban_crossing", read_settings(folder / "train.toml", arm, "urban_crossing", **changes), 5, arm, {})
+
+
+def finish(folder: Path, plan: Plan) -> None:
+    """Leave in a folder what a training writes of its settings there."""
+    write_settings(folder, folder / "nothing", plan, HERE)
+    (folder / "agent.toml").write_text(f'[training]\nsettings = "{settings_digest(plan)}"\n')
+
+
+def test_what_the_user_wrote_stays_byte_for_byte(old: Path, new: Path) -> None:
+    write_settings(new, old, plan_of(old), HERE)
+    assert (new / "train.toml").read_bytes() == (old / "train.toml").read_bytes()
+
+
+@pytest.mark.parametrize(("arm", "changes"), [("long", {}), (None, {"steps": 10})])
+def test_with_other_options_it_is_refused(arm: str | None, changes: dict[str, int], old: Path, new: Path) -> None:
+    plan = plan_of(old, arm, **changes)
+    with pytest.raises(OutputError, match=REFUSED):
+        check_settings(old, plan, HERE)
+    with pytest.raises(OutputError, match=REFUSED):
+        write_settings(new, old, plan, HERE)
+
+
+def test_overrides_are_among_the_settings(old: Path) -> None:
+    settings = read_settings(old / "train.toml")
+    check_settings(old, Plan("urban_crossing", settings, 5, None, {"horizon": 6.0}), HERE)
+    with pytest.raises(OutputError, match=REFUSED):
+        check_settings(old, Plan("urban_crossing", settings, 5, None, {"horizon": 7.0}), HERE)
+
+
+def test_those_of_an_agent_that_is_replaced_are_replaced(old: Path, new: Path) -> None:
+    plan = plan_of(old)
+    finish(new, plan)
+    assert read_settings(new / "train.toml") == plan.settings
+    other = plan_of(old, steps=10)
+    newer = new / "newer"
+    newer.mkdir()
+    write_settings(newer, new, other, HERE)
+    assert read_settings(newer / "train.toml") == other.settings
+
+
+def test_those_of_an_agent_of_before_the_digest_are_replaced(old: Path) -> None:
+    (old / "agent.toml").write_text("[training]\nseed = 5\n")
+    check_settings(old, plan_of(old, steps=10), HERE)
+
+
+def test_those_of_an_agent_that_the_user_has_changed_are_the_users(old: Path, new: Path) -> None:
+    plan = plan_of(old)
+    finish(new, plan)
+    with (new / "train.toml").open("a") as file:
+        file.write("# gamma = 0.9 was worse\n")
+    check_settings(new, plan, HERE)
+    with pytest.raises(OutputError, match=REFUSED):
+        check_settings(new, plan_of(old, steps=10), HERE)
+
+
+def test_what_cannot_be_read_is_the_users(old: Path) -> None:
+    plan = plan_of(old)
+    (old / "train.toml").write_text("steps = ")
+    with pytest.raises(OutputError, match=REFUSED):
+        check_settings(old, plan, HERE)
+
+
+def test_a_link_stays_a_link(old: Path, new: Path) -> None:
+    (old / "train.toml").rename(old.parent / "mine.toml")
+    (old / "train.toml").symlink_to("../mine.toml")
+    write_settings(new, old, plan_of(old), HERE)
+    assert (new / "train.toml").readlink() == Path("../mine.toml")
+
+
+# The environment's file as it goes with the agent that has learnt in it
+
+
+SQUARE = data_directory("envs") / "open_square.toml"
+
+
+def test_a_shipped_environment_goes_by_its_name() -> None:
+    assert environment_file("open_square") == ("open_square", "open_square", None)
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [("my_square.toml", "my_square.toml"), ("train.toml", "environment.toml"), ("agent.toml", "environment.toml")],
+)
+def test_a_file_goes_as_it_is_and_hides_no_other_of_the_agent(given: str, name: str, tmp_path: Path) -> None:
+    (tmp_path / given).write_text(SQUARE.read_text())
+    assert environment_file(str(tmp_path / given)) == (Path(given).stem, name, SQUARE.read_text())
+
+
+def test_code_that_it_names_is_found_from_the_copy_too(tmp_path: Path) -> None:
+    pytest.importorskip("tomlkit", reason="needs the extra 'train'")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "terms.py").write_text("def calm(q):\n    return 0.0 * q.speed\n")
+    text = SQUARE.read_text()
+    assert "[reward]\n" in text
+    text = text.replace("[reward]\n", '[reward]\ncustom.calm = "terms.py:calm"\nweights.calm = 1.0\n')
+    (tmp_path / "mine" / "square.toml").write_text(text)
+    kept = environment_file(str(tmp_path / "mine" / "square.toml")).text
+    assert kept is not None
+    (tmp_path / "copy.toml").write_text(kept)
+    original, copied = (coopenv.load_scenario(tmp_path / name) for name in ("mine/square.toml", "copy.toml"))
+    assert copied == original
+
+
+def test_an_agent_names_files_of_its_folder(tmp_path: Path) -> None:
+    card = 'title = "x"\ndescription = "x"\nentry = "mine.py:Mine"\nenvironments = ["square.toml", "facade"]\n'
+    (tmp_path / "agent.toml").write_text(card)
+    assert find_agent(tmp_path).environments == (str(tmp_path / "square.toml"), "facade")

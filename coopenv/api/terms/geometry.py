@@ -1,28 +1,30 @@
-"""Route, map and neighbours as seen from a vehicle's own estimate."""
+"""How the records of terms are filled: estimate, route, map, targets and neighbours of one vehicle."""
 
 from typing import Any
 
 import warp as wp
 
+from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth, log10, mat66
 from coopenv.world.camera import (
+    VISIBLE,
     behind_building,
+    body_bearing,
     camera_to_body,
     inverse_square_of,
     marker_position,
     project,
     segment_hits_box,
 )
-from coopenv.world.dynamics import ARRIVED
-from coopenv.world.route import place_on_route, point_on_route, route_length
+from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING, UNDER_WAY
+from coopenv.world.quality import position_covariance
+from coopenv.world.route import goal_distance, place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
 FASTEST = wp.constant(wp.float64(2.0))
 """Largest gain of progress per time, in multiples of the top speed (the inside of a bend is shorter)."""
-FORESIGHT = wp.constant(6.0)
-"""Time horizon of the closest approach, s."""
-FAR = wp.constant(4.0)
-"""Upper bound of the closest approach, m; also its value without a message."""
+NEVER = wp.constant(wp.float64(1.0e9))
+"""Age without any measurement or message, s."""
 
 
 @device_function
@@ -30,17 +32,12 @@ def estimate_on_route(state: Any, world: int, vehicle: int):
     """Return the place of a route nearest to the estimate; 0 without a goal.
 
     Returns:
-        Arc length (m), offset of the estimate to the left (m), heading of the route (rad).
+        Arc length (m), offset of the estimate to the left (m), heading of the route (rad), and the progress: the arc
+        length within the ends of the route (m).
     """
     p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
     s, offset, heading = place_on_route(state, world, vehicle, p[0], p[1])
-    return s, offset, heading
-
-
-@device_function
-def estimated_progress(state: Any, world: int, vehicle: int, s: Any):
-    """Return an arc length within the ends of a route, m."""
-    return wp.clamp(s, s - s, route_length(state, world, vehicle))
+    return s, offset, heading, wp.clamp(s, s - s, route_length(state, world, vehicle))
 
 
 @wp.func
@@ -98,30 +95,142 @@ def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, progr
     return gained, missed
 
 
-@wp.struct
-class Nearest:
-    """A landmark in the order of the distance."""
+@wp.func
+def zero_if_unknown(value: Any) -> wp.float32:
+    """Return a quantity of the truth, 0 in a recording without it."""
+    return wp.where(wp.isfinite(value), wp.float32(value), 0.0)
 
-    index: wp.int32  # -1: none
-    distance: wp.float32  # m, horizontal
+
+@wp.func
+def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float32:
+    """Return the age in s of a measurement or message by its tick; `NEVER` without one."""
+    return wp.float32(wp.where(then < 0, NEVER, wp.float64(now - then) / rate))
+
+
+@wp.func
+def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32:
+    """Return the age in s of the last of so many samples, the first of which was at 0 s."""
+    age = wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
+    return wp.float32(wp.where(samples == 0, NEVER, age))
 
 
 @device_function
-def next_nearest(model: Any, state: Any, world: int, vehicle: int, last: Nearest) -> Nearest:
-    """Return the landmark that follows `last` in the order of the distance from the estimate, then of the index."""
-    p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
-    found = Nearest(-1, wp.float32(0.0))
-    if last.index < 0 and last.distance >= 0.0:
-        return found  # `last` was the end of the map
-    for n in range(model.landmarks):
-        offset = marker_position(model, state, world, n) - p
-        distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
-        behind = distance > last.distance or (distance == last.distance and n > last.index)
-        nearer = found.index < 0 or distance < found.distance
-        if state.present[world, n] != 0 and behind and nearer:  # an absent landmark is on no map
-            found.index = n
-            found.distance = distance
-    return found
+def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, remaining: Any, route: bool):
+    """Return the records `Ego` and `Truth` of a vehicle.
+
+    `results` holds the quality of its estimate and the values after the last decision; `remaining` is the length of its
+    route that is left, m. Without `route`, the fields `route_offset` to `route_ahead` stay 0.
+    """
+    ego = Ego()
+    tick = state.tick[world]
+    time = wp.float64(tick) / model.camera_rate
+    ego.time = wp.float32(time)
+    ego.elapsed = wp.float32(wp.float64(tick - results.last_tick[world, vehicle]) / model.camera_rate)
+    R = state.estimate_rotation[world, vehicle]
+    p = state.estimate_position[world, vehicle]
+    ego.position_estimate = wp.vec3(R * p)
+    ego.rotation_estimate = wp.mat33(R)
+    ego.covariance = mat66(state.covariance[world, vehicle])
+    ego.log_determinant = wp.float32(results.log_determinant[world, vehicle])
+    ego.mean_log_variance = wp.float32(results.log_determinant[world, vehicle] / p.dtype(6.0))
+    last = results.last_log_determinant[world, vehicle]
+    ego.information_gained = wp.float32((last - results.log_determinant[world, vehicle]) / p.dtype(6.0))
+    ego.position_std = wp.float32(results.position_std[world, vehicle])
+    spread = position_covariance(state.covariance[world, vehicle], p)
+    for axis in range(3):
+        ego.axis_std[axis] = wp.float32(wp.sqrt(wp.max(spread[axis, axis], p.dtype(0.0))))
+    ego.heading_std = wp.float32(wp.sqrt(wp.max(state.covariance[world, vehicle][2, 2], p.dtype(0.0))))
+    ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
+    ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
+    s, offset, along, progress = estimate_on_route(state, world, vehicle)
+    gained, missed = metres(model, state, results, world, vehicle, progress, wp.float64(ego.elapsed))
+    ego.metres_gained = wp.float32(gained)
+    ego.metres_missed = wp.float32(missed)
+    ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
+    floor = wp.float32(model.judgement.observability_floor)
+    ego.soft_observability = log10(floor + wp.max(ego.gramian_min_eigenvalue, 0.0))
+    ego.observability_floor = log10(floor)
+    ego.observability_level = wp.float32(model.judgement.observability_level)
+    ego.targets_in_view = results.targets_in_view[world, vehicle]
+    ego.possible_targets = model.target_count[vehicle]
+    ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
+    ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
+    ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
+    first = wp.float32(state.action[world, vehicle, 0])
+    second = wp.float32(state.action[world, vehicle, 1])
+    third = float(0.0)
+    if model.action_size > 2:
+        third = wp.float32(state.action[world, vehicle, 2])
+    ego.action = wp.vec3(first, second, third)
+    ego.effort = wp.length_sq(ego.action)
+    command = state.command[world, vehicle]
+    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
+    ego.pan = wp.float32(state.pan[world, vehicle])
+    ego.steering = wp.float32(state.steering[world, vehicle])
+    ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
+    if route and route_length(state, world, vehicle) > p.dtype(0.0):
+        turn, left, ahead = route_from_estimate(model, state, world, vehicle, s, along)
+        ego.route_offset = wp.float32(offset)
+        ego.route_heading = wp.float32(turn)
+        ego.route_left = wp.float32(left)
+        ego.route_ahead = ahead
+    ego.route_step = wp.float32(model.route_step)
+    ego.top_speed = wp.max(wp.float32(model.dynamics[vehicle].max_speed), 1.0e-3)
+    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
+        ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
+    if results.alive[world, vehicle]:
+        ego.arrived = state.arrivals[world, vehicle] - results.last_arrivals[world, vehicle]
+    ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
+
+    truth = Truth()
+    agent = model.landmarks + vehicle
+    truth.position = wp.vec3(state.position[world, agent])
+    truth.rotation = wp.mat33(state.rotation[world, agent])
+    truth.velocity = wp.vec3(state.velocity[world, agent])
+    truth.angular_velocity = wp.vec3(state.angular_velocity[world, agent])
+    truth.position_error = zero_if_unknown(results.position_error[world, vehicle])
+    truth.orientation_error = zero_if_unknown(results.orientation_error[world, vehicle])
+    truth.nees = zero_if_unknown(results.nees[world, vehicle])
+    truth.goal_distance = zero_if_unknown(goal_distance(model, state, world, vehicle))
+    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
+        nearer = results.last_remaining[world, vehicle] - remaining
+        if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now
+            nearer += route_length(state, world, vehicle)
+        truth.progress = zero_if_unknown(nearer)
+    truth.contact = state.collided[world, vehicle] != 0
+    return ego, truth
+
+
+@device_function
+def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) -> Target:
+    """Return the record of a target."""
+    target = Target()
+    target.index = index
+    target.bearing = wp.vec3(state.bearing[world, vehicle, index])
+    target.in_view = state.sight[world, vehicle, index] == VISIBLE
+    target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, index], model.camera_rate)
+    return target
+
+
+@device_function
+def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: int) -> Neighbour:
+    """Return the record of another vehicle."""
+    neighbour = Neighbour()
+    now = state.tick[world]
+    neighbour.index = sender
+    neighbour.received = fresh(model, state, world, vehicle, sender, now)
+    neighbour.age = wp.float32(NEVER)
+    if neighbour.received:
+        Rt = wp.transpose(state.estimate_rotation[world, vehicle])
+        p = state.estimate_position[world, vehicle]
+        neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
+        neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
+        neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
+    target = model.landmarks + sender
+    neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
+    neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
+    neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)
+    return neighbour
 
 
 @device_function
@@ -163,43 +272,34 @@ def expected_in_view(model: Any, state: Any, world: int, vehicle: int, point: An
     return not behind_vehicle(model, state, world, vehicle, origin, line, inverse_square)
 
 
-@wp.func
-def closest_on_segment(position: wp.vec2, velocity: wp.vec2, duration: wp.float32) -> wp.float32:
-    """Return the closest approach (m) of two points within a duration (s), from their relative motion."""
-    time = wp.clamp(-wp.dot(position, velocity) / wp.max(wp.length_sq(velocity), 1.0e-9), 0.0, duration)
-    return wp.length(position + time * velocity)
+@device_function
+def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLandmark) -> MapLandmark:
+    """Return the record that follows `last` in the order of the distance from the estimate, then of the index.
 
-
-@wp.func
-def closest_approach_driving(ahead: wp.vec4, step: wp.float32, speed: wp.float32, position: wp.vec2, forward: wp.vec2):
-    """Return the closest approach (m) to a neighbour that drives straight on while the vehicle follows its route.
-
-    Args:
-        ahead: directions of the route 1, 2, 4 and 8 steps ahead, rad to the left.
-        step: m.
-        speed: of both, m/s, above 0.
-        position: of the neighbour, m, body frame.
-        forward: heading of the neighbour, unit vector, body frame.
+    A distance below 0 comes before the first landmark. Behind the end of the map the index is -1.
     """
-    closest, begin, at = FAR, 0.0, wp.vec2()
-    for k in range(4):
-        if begin < FORESIGHT:
-            to = step * wp.vec2(wp.cos(ahead[k]), wp.sin(ahead[k]))
-            time = step / speed - begin
-            velocity = (to - at) / time
-            duration = wp.where(k == 3, FORESIGHT, wp.min(step / speed, FORESIGHT)) - begin
-            apart = position + begin * speed * forward - at
-            closest = wp.min(closest, closest_on_segment(apart, speed * forward - velocity, duration))
-            begin += time
-            at = to
-            step += step
-    return closest
-
-
-@wp.func
-def closest_approach_standing(speed: wp.float32, position: wp.vec2, forward: wp.vec2):
-    """Return the closest approach (m) to a neighbour that drives straight on while the vehicle stands.
-
-    Arguments as of `closest_approach_driving`.
-    """
-    return wp.min(FAR, closest_on_segment(position, speed * forward, FORESIGHT))
+    landmark = MapLandmark()
+    landmark.index = -1
+    landmark.age = wp.float32(NEVER)
+    if last.index < 0 and last.distance >= 0.0:
+        return landmark  # `last` was the end of the map
+    R = state.estimate_rotation[world, vehicle]
+    p = R * state.estimate_position[world, vehicle]
+    for n in range(model.landmarks):
+        offset = marker_position(model, state, world, n) - p
+        distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
+        behind = distance > last.distance or (distance == last.distance and n > last.index)
+        nearer = landmark.index < 0 or distance < landmark.distance
+        if state.present[world, n] != 0 and behind and nearer:  # an absent landmark is on no map
+            landmark.index = n
+            landmark.distance = distance
+    if landmark.index >= 0:
+        point = marker_position(model, state, world, landmark.index)
+        landmark.exists = True
+        landmark.position = wp.vec3(wp.transpose(R) * point - state.estimate_position[world, vehicle])
+        landmark.expected = expected_in_view(model, state, world, vehicle, point)
+        landmark.in_view = state.sight[world, vehicle, landmark.index] == VISIBLE
+        landmark.bearing = wp.vec3(body_bearing(model, state, world, vehicle, landmark.index))
+        then = state.bearing_tick[world, vehicle, landmark.index]
+        landmark.age = seconds_since(state.tick[world], then, model.camera_rate)
+    return landmark

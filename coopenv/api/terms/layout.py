@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopenv.api.arguments import check_choice
 from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
@@ -181,18 +182,18 @@ def settings_of_meaning(scenario: Scenario, fields: Iterable[str]) -> dict[str, 
     return values
 
 
-def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
-    """Return the flat float32 Box."""
+def observation_space(layout: Mapping[str, Field], kind: str = "flat") -> spaces.Space[Any]:
+    """Return the flat float32 Box, or a one-level Dict of one-dimensional boxes, one per field.
+
+    Raises:
+        CoopenvError: `kind` is neither "flat" nor "dict".
+    """
     from gymnasium import spaces
 
-    low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
-    return spaces.Box(low, np.ones_like(low), dtype=np.float32)
-
-
-def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
-    """Return a one-level Dict of one-dimensional boxes, one per field."""
-    from gymnasium import spaces
-
+    check_choice("observation", kind, ("flat", "dict"))
+    if kind == "flat":
+        low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
+        return spaces.Box(low, np.ones_like(low), dtype=np.float32)
     return spaces.Dict(
         {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in layout.items()}
     )

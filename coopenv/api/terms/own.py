@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from coopenv.api.reward import check_finite
+from coopenv.api.arguments import check_finite
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth
 from coopenv.api.terms.results import Records, write_records
@@ -41,8 +41,11 @@ class OwnTerm(NamedTuple):
     function: wp.Function
     both: bool
     """Whether it takes a second record."""
+    kernel: Callable[["OwnTerm"], wp.Kernel]
     place: int
     """First entry in the observation, place among the reward terms, or outcome of a condition."""
+    returns: str = "a number"
+    """What the function is to return."""
     weight: float = 0.0
     """Of a reward term."""
     per: str = "vehicle"
@@ -52,13 +55,6 @@ class OwnTerm(NamedTuple):
     """Those that the observation holds."""
     center: float = 0.0
     scale: float = 1.0
-
-    @property
-    def result(self) -> tuple[Any, str]:
-        """The type of a number that the function returns, and its name."""
-        if self.size == 1:
-            return wp.float32, "a number"
-        return wp.types.vector(self.size, wp.float32), f"a vector of {self.size}"
 
 
 class OwnTerms:
@@ -71,91 +67,84 @@ class OwnTerms:
             CoopenvError: a function does not exist, cannot be loaded or compiled, takes or returns something else than
                 its row says, or uses the truth where the scenario does not say so.
         """
-        self._world, self._results = world, results
-        self._fields = [*_own_fields(scenario, layout)]
-        self._rewards = [*_own_rewards(scenario)]
-        self.conditions = [*_own_conditions(scenario)]
-        needed = {field.per for field in self._fields if field.both}
-        vehicles = len(scenario.vehicles) if self._fields or self._rewards or self.conditions else 0
-        sizes = {"W": world.worlds, "N": vehicles}
-        many = {"target": world.model.agents, "neighbour": world.model.vehicles - 1, "landmark": world.model.map_size}
+        self._world, self._results, model = world, results, world.model
+        terms = [*_own_terms(scenario, layout)]
+        self._terms = [term for term in terms if term.kernel is not condition_kernel]
+        self._conditions = [term for term in terms if term.kernel is condition_kernel]
+        needed = {term.per for term in terms if term.kernel is field_kernel and term.both}
+        many = {"target": model.agents, "neighbour": model.vehicles - 1, "landmark": model.map_size}
         self._many = {per: number if per in needed else 0 for per, number in many.items()}
+        sizes = {"W": world.worlds, "N": model.vehicles if terms else 0}
         sizes.update(zip("TML", self._many.values(), strict=True))
         self.records = allocate(Records, sizes, world.device)
         """Filled by the results kernel; empty arrays where no user term reads them."""
         nowhere = wp.zeros(world.worlds, dtype=wp.int32, device=world.device)
-        for term in self._fields:
-            self._check(term, field_kernel, term.result[1], self._field_arguments(term, nowhere))
-        for term in self._rewards:
-            self._check(term, reward_kernel, term.result[1], self._reward_arguments(term, nowhere, nowhere))
-        for term in self.conditions:
-            self._check(term, condition_kernel, "true or false", self._condition_arguments(term))
+        for term in terms:
+            self._check_function(
+                term, [a.value if isinstance(a, PerWorld) else a for a in self._arguments(term, nowhere, nowhere)]
+            )
 
     def end_episodes(self) -> None:
         """End the episodes of vehicles that fulfil a condition."""
-        if not self.conditions:
-            return
-        state, records = PerWorld(self._world.state), PerWorld(self.records)
-        self._launch("records", write_records, [self._world.model, state, records, PerWorld(self._results)])
-        for k, term in enumerate(self.conditions):
-            self._launch(("condition", k), condition_kernel(term), self._condition_arguments(term))
+        if self._conditions:
+            world = self._world
+            arguments = [world.model, *map(PerWorld, (world.state, self.records, self._results))]
+            world.launch("records", write_records, arguments, inner=(world.model.vehicles,))
+            self._launch("condition", self._conditions)
 
     def fill(self, key: str, fresh: Any, chosen: Any) -> None:
-        """Add fields and reward terms to the results of the worlds in `chosen` (W,), see `Report.fill`."""
-        for k, term in enumerate(self._fields):
-            arguments = self._field_arguments(term, chosen)
-            self._launch(("field", key, k), field_kernel(term), arguments, (self._many.get(term.per, 1),))
-        for k, term in enumerate(self._rewards):
-            self._launch(("reward", key, k), reward_kernel(term), self._reward_arguments(term, fresh, chosen))
+        """Add fields and reward terms to the results of the worlds in `chosen` (W,), see `Engine`."""
+        self._launch(key, self._terms, fresh, chosen)
 
     def check(self, view: Callable[[str], np.ndarray]) -> None:
         """Make sure that all values are finite. Raises CoopenvError: one is not."""
-        for term in self._fields:
-            check_finite(term.title, view("observation")[..., term.place : term.place + self._width(term)])
-        for term in self._rewards:
-            check_finite(term.title, view("terms")[..., term.place])
+        for term in self._terms:
+            name, width = "terms", 1
+            if term.kernel is field_kernel:
+                name, width = "observation", self._many.get(term.per, 1) * len(term.entries)
+            check_finite(term.title, view(name)[..., term.place : term.place + width])
 
-    def _width(self, term: OwnTerm) -> int:
-        return self._many.get(term.per, 1) * len(term.entries)
+    def _launch(self, key: str, terms: list[OwnTerm], fresh: Any = None, chosen: Any = None) -> None:
+        for k, term in enumerate(terms):
+            more = (self._many.get(term.per, 1),) if term.kernel is field_kernel else ()
+            inner = (self._world.model.vehicles, *more)
+            self._world.launch((key, k), term.kernel(term), self._arguments(term, fresh, chosen), inner=inner)
 
-    def _launch(self, key: Any, kernel: Any, arguments: list[Any], more: tuple[int, ...] = ()) -> None:
-        self._world.launch(key, kernel, arguments, inner=(self._world.model.vehicles, *more))
+    def _arguments(self, term: OwnTerm, fresh: Any, chosen: Any) -> list[Any]:
+        """Return the arguments of a term's kernel."""
+        results, records, state, model = self._results, self.records, self._world.state, self._world.model
+        arrays: tuple[Any, ...] = (records.ego, records.truth, state.tick, state.ended)
+        numbers: tuple[float, ...] = (model.ticks_per_decision, model.horizon_ticks, term.place)
+        if term.kernel is field_kernel:
+            other = getattr(records, "target" if term.per == "vehicle" else term.per)
+            arrays, numbers = (
+                (records.ego, other, results.observation, chosen),
+                (term.place, term.center, 1.0 / term.scale),
+            )
+        elif term.kernel is reward_kernel:
+            arrays = (records.ego, records.truth, results.alive, results.terms, results.reward, fresh, chosen)
+            numbers = term.place, term.weight
+        return [*map(PerWorld, arrays), *numbers]
 
-    def _field_arguments(self, term: OwnTerm, chosen: Any) -> list[Any]:
-        other = getattr(self.records, "target" if term.per == "vehicle" else term.per)
-        arrays = (self.records.ego, other, self._results.observation, chosen)
-        return [*map(PerWorld, arrays), term.place, term.center, 1.0 / term.scale]
-
-    def _reward_arguments(self, term: OwnTerm, fresh: Any, chosen: Any) -> list[Any]:
-        results, records = self._results, self.records
-        arrays = (records.ego, records.truth, results.alive, results.terms, results.reward, fresh, chosen)
-        return [*map(PerWorld, arrays), term.place, term.weight]
-
-    def _condition_arguments(self, term: OwnTerm) -> list[Any]:
-        state, model = self._world.state, self._world.model
-        arrays = (self.records.ego, self.records.truth, state.tick, state.ended)
-        return [*map(PerWorld, arrays), model.ticks_per_decision, model.horizon_ticks, term.place]
-
-    def _check(self, term: OwnTerm, factory: Callable[[OwnTerm], Any], expected: str, arguments: list[Any]) -> None:
+    def _check_function(self, term: OwnTerm, inputs: list[Any]) -> None:
         """Compile a term's kernel without running it."""
-        device = self._world.device
-        inputs = [a.value if isinstance(a, PerWorld) else a for a in arguments]
-        dim = (1, 1, 1) if factory is field_kernel else (1, 1)
+        dim = (1, 1, 1) if term.kernel is field_kernel else (1, 1)
         try:
-            launch.launch(factory(term), dim=dim, inputs=inputs, device=device, record_cmd=True)
+            launch.launch(term.kernel(term), dim=dim, inputs=inputs, device=self._world.device, record_cmd=True)
         except launch.KernelCacheError:
             raise
         except Exception as error:  # Warp raises various types
             reason = " ".join(part for part in str(error).split("\n;") if 'function "apply"' not in part)
             raise CoopenvError(
-                f"{term.title}: Warp cannot compile its function to return {expected}: {reason}"
+                f"{term.title}: Warp cannot compile its function to return {term.returns}: {reason}"
             ) from None
 
 
 @cache
 def field_kernel(term: OwnTerm) -> wp.Kernel:
     """Return the kernel of an observation field: one thread per (world, vehicle, target, neighbour or landmark)."""
-    function, both, returned, many = term.function, term.both, term.result[0], term.size > 1
+    function, both, many = term.function, term.both, term.size > 1
+    returned = wp.types.vector(term.size, wp.float32) if many else wp.float32
     width, entries = len(term.entries), wp.types.vector(len(term.entries), wp.int32)(*term.entries)
 
     def apply(
@@ -240,34 +229,31 @@ def _kernel(function: Callable[..., None]) -> wp.Kernel:
     return wp.kernel(function, module="unique", module_options={"enable_backward": False, **compiler_options()})
 
 
-def _own_fields(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:
+def _own_terms(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:
+    """Yield the user terms of a scenario: fields, reward terms, and conditions."""
     for name, row in included_fields(scenario).items():
         if name not in OBSERVATION_FIELDS.built_in:
-            term, field = _bound(OBSERVATION_FIELDS, name, row, (1 if row.per == "vehicle" else 2,)), layout[name]
-            term = term._replace(place=field.start, center=field.center, scale=field.scale)
+            field, returns = layout[name], "a number" if row.size == 1 else f"a vector of {row.size}"
+            bound = _bound(OBSERVATION_FIELDS, name, row, (1 if row.per == "vehicle" else 2,))
+            term = OwnTerm(*bound, field_kernel, field.start, returns, center=field.center, scale=field.scale)
             yield term._replace(per=row.per, size=row.size, entries=entries_of(row, scenario))
-
-
-def _own_rewards(scenario: Scenario) -> Iterator[OwnTerm]:
-    known = REWARD_TERMS.known(scenario.reward.custom)
+    rewards = REWARD_TERMS.known(scenario.reward.custom)
     for place, (name, weight) in enumerate(scenario.reward.by_name.items()):
         if name not in REWARD_TERMS.built_in:
-            term = _bound(REWARD_TERMS, name, known.get(name), (1, 2))
-            if weight and term.both and not scenario.reward.privileged:
-                raise CoopenvError(f"{term.title} uses the truth: reward.privileged must be true")
-            yield term._replace(place=place, weight=weight)
-
-
-def _own_conditions(scenario: Scenario) -> Iterator[OwnTerm]:
-    known = TERMINATION_CONDITIONS.known(scenario.termination.custom)
+            bound = _bound(REWARD_TERMS, name, rewards.get(name), (1, 2))
+            if weight and bound[2] and not scenario.reward.privileged:
+                raise CoopenvError(f"{bound[0]} uses the truth: reward.privileged must be true")
+            yield OwnTerm(*bound, reward_kernel, place, weight=weight)
+    conditions = TERMINATION_CONDITIONS.known(scenario.termination.custom)
     for place, name in enumerate(scenario.termination.own, len(Outcome)):
-        term = _bound(TERMINATION_CONDITIONS, name, known.get(name), (1, 2))
-        if term.both and not scenario.termination.privileged:
-            raise CoopenvError(f"{term.title} uses the truth: termination.privileged must be true")
-        yield term._replace(place=place)
+        bound = _bound(TERMINATION_CONDITIONS, name, conditions.get(name), (1, 2))
+        if bound[2] and not scenario.termination.privileged:
+            raise CoopenvError(f"{bound[0]} uses the truth: termination.privileged must be true")
+        yield OwnTerm(*bound, condition_kernel, place, "true or false")
 
 
-def _bound(kind: Registry[Any], name: str, row: Row | None, records: tuple[int, ...]) -> OwnTerm:
+def _bound(kind: Registry[Any], name: str, row: Row | None, records: tuple[int, ...]) -> tuple[str, wp.Function, bool]:
+    """Return title and function of a term, and whether it takes a second record."""
     title = f"{kind.kind} '{name}'"
     if row is None:
         raise CoopenvError(f"{title} is not registered in this process; see docs/terms.md")
@@ -278,9 +264,9 @@ def _bound(kind: Registry[Any], name: str, row: Row | None, records: tuple[int, 
             function = installation.load_reference(function)
         except CoopenvError as error:
             raise CoopenvError(f"{title}: {error}") from None
-    taken = record_count(title, function, records)
+    both = record_count(title, function, records) == 2
     try:
-        return OwnTerm(title, _warp_function(function), taken == 2, 0)
+        return title, _warp_function(function), both
     except RuntimeError as error:  # Warp reads the source, which a program of text does not have
         raise CoopenvError(f"{title}: {error}") from None
 

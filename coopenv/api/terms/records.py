@@ -1,33 +1,25 @@
-"""Records from which terms are computed: one vehicle at the end of a decision.
+"""Records from which terms are computed, one vehicle at the end of a decision, and the values of the built-in terms.
 
 Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
 `MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
 terminations may take `Truth`, and are then privileged. Observations therefore cannot leak truth.
-"""
 
-from typing import Any
+Values stand in the order of their rows in `coopenv.scenario.terms`, and in their units; the results kernel scales and
+clips them, or weighs them.
+"""
 
 import warp as wp
 
-from coopenv.api.terms.geometry import (
-    Nearest,
-    estimate_on_route,
-    estimated_progress,
-    expected_in_view,
-    metres,
-    route_from_estimate,
-)
-from coopenv.world.camera import VISIBLE, body_bearing, marker_position
-from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
-from coopenv.world.quality import position_covariance
-from coopenv.world.route import goal_distance, route_length
-from coopenv.world.v2x import fresh
-from coopenv.world.warp_internals import device_function
-
-NEVER = wp.constant(wp.float64(1.0e9))
-"""Age without any measurement or message, s."""
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.world.dynamics import COLLIDED, OFF_ROUTE
 
 LOG10_E = wp.constant(0.4342944819032518)
+FORESIGHT = wp.constant(6.0)
+"""Time horizon of the closest approach, s."""
+FAR = wp.constant(4.0)
+"""Upper bound of the closest approach, m; also its value without a message."""
+DEGREES = wp.constant(57.29577951308232)
+EIGENVALUE_FLOOR = wp.constant(1.0e-9)
 
 mat66 = wp.types.matrix((6, 6), wp.float32)
 
@@ -131,6 +123,18 @@ class MapLandmark:
     age: wp.float32  # s since measured
 
 
+SOURCES: dict[str, int] = {}
+"""First place of every built-in field among the values of its kind of record."""
+_sizes = dict.fromkeys(("vehicle", "target", "neighbour", "landmark"), 0)
+for _name, _row in OBSERVATION_FIELDS.built_in.items():
+    SOURCES[_name] = _sizes[_row.per]
+    _sizes[_row.per] += _row.size
+VehicleValues, TargetValues, NeighbourValues, LandmarkValues = (
+    wp.types.vector(size, wp.float32) for size in _sizes.values()
+)
+RewardValues = wp.types.vector(len(REWARD_TERMS.built_in), wp.float32)
+
+
 @wp.func
 def log10(value: wp.float32) -> wp.float32:
     """Return the decimal logarithm."""
@@ -138,159 +142,147 @@ def log10(value: wp.float32) -> wp.float32:
 
 
 @wp.func
-def zero_if_unknown(value: Any) -> wp.float32:
-    """Return a quantity of the truth, 0 in a recording without it."""
-    return wp.where(wp.isfinite(value), wp.float32(value), 0.0)
+def closest_on_segment(position: wp.vec2, velocity: wp.vec2, duration: wp.float32) -> wp.float32:
+    """Return the closest approach (m) of two points within a duration (s), from their relative motion."""
+    time = wp.clamp(-wp.dot(position, velocity) / wp.max(wp.length_sq(velocity), 1.0e-9), 0.0, duration)
+    return wp.length(position + time * velocity)
 
 
 @wp.func
-def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float32:
-    """Return the age in s of a measurement or message by its tick; `NEVER` without one."""
-    return wp.float32(wp.where(then < 0, NEVER, wp.float64(now - then) / rate))
+def closest_approach_driving(ahead: wp.vec4, step: wp.float32, speed: wp.float32, position: wp.vec2, forward: wp.vec2):
+    """Return the closest approach (m) to a neighbour that drives straight on while the vehicle follows its route.
 
-
-@wp.func
-def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32:
-    """Return the age in s of the last of so many samples, the first of which was at 0 s."""
-    age = wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
-    return wp.float32(wp.where(samples == 0, NEVER, age))
-
-
-@device_function
-def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, remaining: Any, route: bool):
-    """Return the records `Ego` and `Truth` of a vehicle.
-
-    `results` holds the quality of its estimate and the values after the last decision; `remaining` is the length of its
-    route that is left, m. Without `route`, the fields `route_offset` to `route_ahead` stay 0.
+    Args:
+        ahead: directions of the route 1, 2, 4 and 8 steps ahead, rad to the left.
+        step: m.
+        speed: of both, m/s, above 0.
+        position: of the neighbour, m, body frame.
+        forward: heading of the neighbour, unit vector, body frame.
     """
-    ego = Ego()
-    tick = state.tick[world]
-    time = wp.float64(tick) / model.camera_rate
-    ego.time = wp.float32(time)
-    ego.elapsed = wp.float32(wp.float64(tick - results.last_tick[world, vehicle]) / model.camera_rate)
-    R = state.estimate_rotation[world, vehicle]
-    p = state.estimate_position[world, vehicle]
-    ego.position_estimate = wp.vec3(R * p)
-    ego.rotation_estimate = wp.mat33(R)
-    ego.covariance = mat66(state.covariance[world, vehicle])
-    ego.log_determinant = wp.float32(results.log_determinant[world, vehicle])
-    ego.mean_log_variance = wp.float32(results.log_determinant[world, vehicle] / p.dtype(6.0))
-    last = results.last_log_determinant[world, vehicle]
-    ego.information_gained = wp.float32((last - results.log_determinant[world, vehicle]) / p.dtype(6.0))
-    ego.position_std = wp.float32(results.position_std[world, vehicle])
-    spread = position_covariance(state.covariance[world, vehicle], p)
-    for axis in range(3):
-        ego.axis_std[axis] = wp.float32(wp.sqrt(wp.max(spread[axis, axis], p.dtype(0.0))))
-    ego.heading_std = wp.float32(wp.sqrt(wp.max(state.covariance[world, vehicle][2, 2], p.dtype(0.0))))
-    ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
-    ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
-    s, offset, along = estimate_on_route(state, world, vehicle)
-    progress = estimated_progress(state, world, vehicle, s)
-    gained, missed = metres(model, state, results, world, vehicle, progress, wp.float64(ego.elapsed))
-    ego.metres_gained = wp.float32(gained)
-    ego.metres_missed = wp.float32(missed)
-    ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
-    floor = wp.float32(model.judgement.observability_floor)
-    ego.soft_observability = log10(floor + wp.max(ego.gramian_min_eigenvalue, 0.0))
-    ego.observability_floor = log10(floor)
-    ego.observability_level = wp.float32(model.judgement.observability_level)
-    ego.targets_in_view = results.targets_in_view[world, vehicle]
-    ego.possible_targets = model.target_count[vehicle]
-    ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
-    ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
-    ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
-    first = wp.float32(state.action[world, vehicle, 0])
-    second = wp.float32(state.action[world, vehicle, 1])
-    third = float(0.0)
-    if model.action_size > 2:
-        third = wp.float32(state.action[world, vehicle, 2])
-    ego.action = wp.vec3(first, second, third)
-    ego.effort = wp.length_sq(ego.action)
-    command = state.command[world, vehicle]
-    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
-    ego.pan = wp.float32(state.pan[world, vehicle])
-    ego.steering = wp.float32(state.steering[world, vehicle])
-    ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
-    if route and route_length(state, world, vehicle) > p.dtype(0.0):
-        turn, left, ahead = route_from_estimate(model, state, world, vehicle, s, along)
-        ego.route_offset = wp.float32(offset)
-        ego.route_heading = wp.float32(turn)
-        ego.route_left = wp.float32(left)
-        ego.route_ahead = ahead
-    ego.route_step = wp.float32(model.route_step)
-    ego.top_speed = wp.max(wp.float32(model.dynamics[vehicle].max_speed), 1.0e-3)
-    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
-    if results.alive[world, vehicle]:
-        ego.arrived = state.arrivals[world, vehicle] - results.last_arrivals[world, vehicle]
-    ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
-
-    truth = Truth()
-    agent = model.landmarks + vehicle
-    truth.position = wp.vec3(state.position[world, agent])
-    truth.rotation = wp.mat33(state.rotation[world, agent])
-    truth.velocity = wp.vec3(state.velocity[world, agent])
-    truth.angular_velocity = wp.vec3(state.angular_velocity[world, agent])
-    truth.position_error = zero_if_unknown(results.position_error[world, vehicle])
-    truth.orientation_error = zero_if_unknown(results.orientation_error[world, vehicle])
-    truth.nees = zero_if_unknown(results.nees[world, vehicle])
-    truth.goal_distance = zero_if_unknown(goal_distance(model, state, world, vehicle))
-    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        nearer = results.last_remaining[world, vehicle] - remaining
-        if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now
-            nearer += route_length(state, world, vehicle)
-        truth.progress = zero_if_unknown(nearer)
-    truth.contact = state.collided[world, vehicle] != 0
-    return ego, truth
+    closest, begin, at = FAR, 0.0, wp.vec2()
+    for k in range(4):
+        if begin < FORESIGHT:
+            to = step * wp.vec2(wp.cos(ahead[k]), wp.sin(ahead[k]))
+            time = step / speed - begin
+            velocity = (to - at) / time
+            duration = wp.where(k == 3, FORESIGHT, wp.min(step / speed, FORESIGHT)) - begin
+            apart = position + begin * speed * forward - at
+            closest = wp.min(closest, closest_on_segment(apart, speed * forward - velocity, duration))
+            begin += time
+            at = to
+            step += step
+    return closest
 
 
-@device_function
-def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) -> Target:
-    """Return the record of a target."""
-    target = Target()
-    target.index = index
-    target.bearing = wp.vec3(state.bearing[world, vehicle, index])
-    target.in_view = state.sight[world, vehicle, index] == VISIBLE
-    target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, index], model.camera_rate)
-    return target
+@wp.func
+def log10_of_std(std: wp.float32) -> wp.float32:
+    """Return the decimal logarithm of a standard deviation, at least a micrometre or a microradian."""
+    return log10(wp.max(std, 1.0e-6))
 
 
-@device_function
-def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: int) -> Neighbour:
-    """Return the record of another vehicle."""
-    neighbour = Neighbour()
-    now = state.tick[world]
-    neighbour.index = sender
-    neighbour.received = fresh(model, state, world, vehicle, sender, now)
-    neighbour.age = wp.float32(NEVER)
-    if neighbour.received:
-        Rt = wp.transpose(state.estimate_rotation[world, vehicle])
-        p = state.estimate_position[world, vehicle]
-        neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
-        neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
-        neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
-    target = model.landmarks + sender
-    neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
-    neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
-    neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)
-    return neighbour
+@wp.func
+def vehicle_values(ego: Ego) -> VehicleValues:
+    """Return the values of the fields with one value per vehicle."""
+    place, R, P = ego.position_estimate, ego.rotation_estimate, ego.covariance
+    velocity, turn_rate, goal = ego.velocity, ego.angular_velocity, ego.goal
+    std, ahead, action = ego.axis_std, ego.route_ahead, ego.action
+    return VehicleValues(
+        place[0], place[1], place[2],  # estimate_position
+        R[0, 0], R[1, 0], R[2, 0],  # estimate_forward
+        R[0, 1], R[1, 1], R[2, 1],  # estimate_left
+        log10(P[0, 0]), log10(P[1, 1]), log10(P[2, 2]),  # covariance_diagonal
+        log10(P[3, 3]), log10(P[4, 4]), log10(P[5, 5]),
+        ego.mean_log_variance,  # log_determinant
+        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # gramian_min_eigenvalue
+        wp.float32(ego.targets_in_view),
+        velocity[0], velocity[1], velocity[2],
+        turn_rate[0], turn_rate[1], turn_rate[2],  # angular_velocity
+        ego.odometry_age,
+        goal[0], goal[1], goal[2],
+        log10_of_std(ego.position_std),  # position_std
+        log10_of_std(std[0]), log10_of_std(std[1]), log10_of_std(std[2]),  # axis_std
+        log10_of_std(ego.heading_std),  # heading_std
+        ego.soft_observability,
+        ego.route_offset, ego.route_heading, ego.route_left,
+        ahead[0], ahead[1], ahead[2], ahead[3],  # route_ahead
+        ego.steering,
+        action[0], action[1], action[2],  # last_action
+        ego.time_left,
+        ego.pan,  # camera_pan
+    )  # fmt: skip
 
 
-@device_function
-def map_record(model: Any, state: Any, world: int, vehicle: int, place: Nearest) -> MapLandmark:
-    """Return the record of a landmark of the map."""
-    landmark = MapLandmark()
-    landmark.index = place.index
-    landmark.age = wp.float32(NEVER)
-    if place.index >= 0:
-        point = marker_position(model, state, world, place.index)
-        Rt = wp.transpose(state.estimate_rotation[world, vehicle])
-        landmark.exists = True
-        landmark.position = wp.vec3(Rt * point - state.estimate_position[world, vehicle])
-        landmark.distance = place.distance
-        landmark.expected = expected_in_view(model, state, world, vehicle, point)
-        landmark.in_view = state.sight[world, vehicle, place.index] == VISIBLE
-        landmark.bearing = wp.vec3(body_bearing(model, state, world, vehicle, place.index))
-        then = state.bearing_tick[world, vehicle, place.index]
-        landmark.age = seconds_since(state.tick[world], then, model.camera_rate)
-    return landmark
+@wp.func
+def target_values(target: Target) -> TargetValues:
+    """Return the values of the fields with one value per landmark and vehicle."""
+    bearing = target.bearing
+    return TargetValues(
+        bearing[0], bearing[1], bearing[2],  # bearings
+        wp.float32(target.in_view),  # bearing_mask
+        target.age,  # bearing_age
+    )  # fmt: skip
+
+
+@wp.func
+def neighbour_values(ego: Ego, neighbour: Neighbour, clearance: bool) -> NeighbourValues:
+    """Return the values of the fields with one value per other vehicle; those of `message_clearance` on demand."""
+    place, R, sighting = neighbour.position, neighbour.rotation, neighbour.bearing
+    driving, standing = FAR, FAR
+    if clearance and neighbour.received:
+        position, forward = wp.vec2(place[0], place[1]), wp.vec2(R[0, 0], R[1, 0])
+        driving = closest_approach_driving(ego.route_ahead, ego.route_step, ego.top_speed, position, forward)
+        standing = wp.min(FAR, closest_on_segment(position, ego.top_speed * forward, FORESIGHT))
+    return NeighbourValues(
+        place[0], place[1], place[2],  # message_position
+        R[0, 0], R[1, 0], R[2, 0],  # message_forward
+        wp.float32(neighbour.received),  # message_mask
+        neighbour.age,  # message_age
+        driving, standing,  # message_clearance
+        sighting[0], sighting[1], sighting[2],
+        wp.float32(neighbour.in_view),  # sighting_mask
+        neighbour.bearing_age,  # sighting_age
+    )  # fmt: skip
+
+
+@wp.func
+def landmark_values(landmark: MapLandmark) -> LandmarkValues:
+    """Return the values of the fields with one value per landmark of the map."""
+    place = landmark.position
+    return LandmarkValues(
+        place[0], place[1], place[2],  # map_position
+        wp.float32(landmark.exists),  # map_mask
+        wp.float32(landmark.expected),  # map_in_view
+        landmark.age,  # map_age
+    )  # fmt: skip
+
+
+@wp.func
+def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
+    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
+    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # NaN costs the most
+    return -(paid * ego.metres_gained + most * ego.metres_missed)
+
+
+@wp.func
+def reward_values(ego: Ego, truth: Truth) -> RewardValues:
+    """Return the values of the reward terms, without weights."""
+    threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
+    shortfall = ego.observability_level - ego.soft_observability
+    largest_shortfall = wp.max(ego.observability_level - ego.observability_floor, 0.0)
+    return RewardValues(
+        truth.progress,
+        wp.float32(ego.arrived),  # arrival
+        wp.where(ego.outcome == COLLIDED, -1.0, 0.0),  # collision
+        wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0),  # off_route
+        -ego.effort,  # control
+        -ego.elapsed,  # time
+        -truth.position_error,
+        -(truth.orientation_error / DEGREES),
+        per_metre(ego, ego.position_std - threshold, cap),  # position_uncertainty
+        per_metre(ego, truth.position_error - threshold, cap),  # position_error_per_metre
+        ego.information_gained,  # information_gain
+        -ego.log_determinant / 6.0,  # uncertainty
+        log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR)),  # observability
+        per_metre(ego, shortfall, largest_shortfall),  # observability_shortfall
+        wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1)),  # visibility
+    )

@@ -10,22 +10,23 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.api.terms.geometry import Nearest, estimate_on_route, estimated_progress, furthest_so_far, next_nearest
+from coopenv.api.terms.geometry import (
+    estimate_on_route,
+    furthest_so_far,
+    neighbour_record,
+    next_landmark,
+    own_records,
+    target_record,
+)
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import (
+    DEGREES,
+    SOURCES,
     Ego,
     MapLandmark,
     Neighbour,
     Target,
     Truth,
-    map_record,
-    neighbour_record,
-    own_records,
-    target_record,
-)
-from coopenv.api.terms.values import (
-    DEGREES,
-    SOURCES,
     landmark_values,
     neighbour_values,
     reward_values,
@@ -205,20 +206,6 @@ def is_over(model: Any, state: Any, world: int) -> bool:
     return True
 
 
-@device_function
-def set_flags(results: Any, world: int, vehicle: int, ended: int, over: bool, horizon_ticks: int):
-    """Write which vehicles were under way and which have just ended, and whether the world is over."""
-    # Over since the last step: no reward before a reset (each thread reads the memory of its own vehicle only).
-    waiting = results.last_tick[world, vehicle] >= horizon_ticks
-    alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
-    terminated = alive and ended != UNDER_WAY
-    results.alive[world, vehicle] = alive
-    results.terminated[world, vehicle] = terminated
-    results.truncated[world, vehicle] = over and not terminated
-    if vehicle == 0:
-        results.over[world] = wp.where(over, 1, 0)
-
-
 @wp.func
 def write_entries(
     out: wp.array3d(dtype=wp.float32), world: int, vehicle: int, n: int, entries: wp.array(dtype=Entry), values: Any
@@ -249,10 +236,18 @@ def step_results(
     remaining = remaining_way(model, state, world, vehicle)
     assess(model, state, results, world, vehicle)
     if fresh[world] != 0:
-        s, _, _ = estimate_on_route(state, world, vehicle)
-        progress = estimated_progress(state, world, vehicle, s)
+        _, _, _, progress = estimate_on_route(state, world, vehicle)
         store_for_next_step(state, results, world, vehicle, remaining, progress, 0)
-    set_flags(results, world, vehicle, state.ended[world, vehicle], is_over(model, state, world), model.horizon_ticks)
+    over = is_over(model, state, world)
+    # Over since the last step: no reward before a reset (each thread reads the memory of its own vehicle only).
+    waiting = results.last_tick[world, vehicle] >= model.horizon_ticks
+    alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
+    terminated = alive and state.ended[world, vehicle] != UNDER_WAY
+    results.alive[world, vehicle] = alive
+    results.terminated[world, vehicle] = terminated
+    results.truncated[world, vehicle] = over and not terminated
+    if vehicle == 0:
+        results.over[world] = wp.where(over, 1, 0)
     ego, truth = own_records(model, state, results, world, vehicle, remaining, table.route)
     furthest = furthest_so_far(state, results, world, vehicle) + type(remaining)(ego.metres_gained)
     store_for_next_step(state, results, world, vehicle, remaining, furthest, state.tick[world])
@@ -265,8 +260,7 @@ def step_results(
     for k in range(table.weights.shape[0]):
         results.terms[world, vehicle, k] = terms[k]
         total += table.weights[k] * terms[k]
-    earns = results.alive[world, vehicle] and fresh[world] == 0
-    results.reward[world, vehicle] = wp.where(earns, total, 0.0)
+    results.reward[world, vehicle] = wp.where(alive and fresh[world] == 0, total, 0.0)
 
     write_entries(results.observation, world, vehicle, 0, table.vehicle, vehicle_values(ego))
     for n in range(table.targets):
@@ -281,10 +275,10 @@ def step_results(
         write_entries(results.observation, world, vehicle, n, table.neighbour, values)
         if records.neighbour.shape[2] > 0:
             records.neighbour[world, vehicle, n] = neighbour
-    nearest = Nearest(-1, -1.0)
+    landmark = MapLandmark()
+    landmark.distance = -1.0
     for n in range(table.landmarks):
-        nearest = next_nearest(model, state, world, vehicle, nearest)
-        landmark = map_record(model, state, world, vehicle, nearest)
+        landmark = next_landmark(model, state, world, vehicle, landmark)
         write_entries(results.observation, world, vehicle, n, table.landmark, landmark_values(landmark))
         if records.landmark.shape[2] > 0:
             records.landmark[world, vehicle, n] = landmark

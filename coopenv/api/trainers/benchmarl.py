@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.api.make import parallel_env
-from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
+from coopenv.api.parallel_env import NUMBERS, PlainInfos
 
 try:
     from benchmarl.environments.common import TaskClass
@@ -55,7 +55,7 @@ class CooperativeTask(TaskClass):
         return _only(env, "observation")
 
     def info_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of `coopenv.api.trainers.numeric_infos.NUMBERS`."""
+        """Return the spec of `coopenv.api.parallel_env.NUMBERS`."""
         return _only(env, "info")
 
     def state_spec(self, env: EnvBase) -> Composite:

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorWrapper
 
 from coopenv.api.make import make_rows, parallel_env
-from coopenv.api.trainers.numeric_infos import PlainInfos
+from coopenv.api.parallel_env import PlainInfos
 from coopenv.api.vector_env import TrueEnds
 from coopenv.base.errors import CoopenvError
 

@@ -11,7 +11,7 @@ import numpy as np
 from coopenv.api.arguments import outcome_words
 from coopenv.api.make import make_vec
 from coopenv.api.terms.layout import Layout
-from coopenv.api.vector_env import CooperativeVectorEnv, EpisodeSums
+from coopenv.api.vector_env import CooperativeVectorEnv, RecordVehicleEpisodes
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Outcome
 
@@ -58,7 +58,7 @@ class CooperativeSB3VecEnv(VecEnv):
         """(num_envs,) whether the row's vehicle was under way in the last step."""
         self.batch_infos: dict[str, Any] = {}
         """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
-        self._sums = EpisodeSums(envs.num_envs, envs.engine.reward_terms)
+        self._recorder = RecordVehicleEpisodes(envs)
         self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -72,8 +72,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
         Options are those of `CooperativeVectorEnv.reset`; its settings hold until they are given again.
         """
-        observation, self.batch_infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
-        self._sums.forget(np.ones(self.num_envs, dtype=bool))
+        observation, self.batch_infos = self._recorder.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -81,7 +80,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return what the next step depends on as arrays, for `set_state`; plug-in observers cannot be among it."""
-        return {**self.engine.get_state(), "episode_sums": self._sums.under_way}
+        return {**self.engine.get_state(), "episode_sums": self._recorder.sums}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
         """Go on from what `get_state` returned, and return the observations that came with it.
@@ -90,7 +89,7 @@ class CooperativeSB3VecEnv(VecEnv):
             CoopenvError: it does not fit.
         """
         self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
-        self._sums.under_way = state["episode_sums"]
+        self._recorder.sums = state["episode_sums"]
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -103,31 +102,25 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             ActionError: actions of a wrong shape, or not finite.
         """
-        observation, rewards, terminated, truncated, after = self.envs.step(self._actions)
+        observation, rewards, _, truncated, after = self._recorder.step(self._actions)
         self.batch_infos = step = after.get("final_info", after)
         self.acted = step["alive"]
-        dones = (terminated | truncated) & self.acted
-        self._sums.add(rewards, self.acted, step)
+        dones = after.get("_episode", np.zeros(self.num_envs, dtype=bool))
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if dones.any():
-            sums, final = self._sums.take(dones), after["final_obs"]
-            for row in np.flatnonzero(dones).tolist():
-                infos[row] = {
-                    "terminal_observation": _row_of(final, row),
-                    "TimeLimit.truncated": bool(truncated[row]),
-                    **self._ending(row, step, sums),
-                }
+        for row in np.flatnonzero(dones).tolist():
+            episode, final = after["episode"], after["final_obs"]
+            flat = not isinstance(final, dict)
+            counts = {"r": float(episode["r"][row]), "l": int(episode["l"][row])}
+            infos[row] = {
+                "terminal_observation": final[row] if flat else {name: part[row] for name, part in final.items()},
+                "TimeLimit.truncated": bool(truncated[row]),
+                "episode": {**counts, "t": round(time.time() - self._begin, 6)},
+                "is_success": bool(step["ended"][row] == Outcome.ARRIVED),
+                "outcome": self._outcomes[step["ended"][row]],
+                "reward_terms": {name: float(values[row]) for name, values in episode["reward_terms"].items()},
+                **{name: float(step[name][row]) for name in AT_THE_END},
+            }
         return observation, rewards, dones, infos
-
-    def _ending(self, row: int, step: dict[str, Any], sums: dict[str, Any]) -> dict[str, Any]:
-        elapsed = round(time.time() - self._begin, 6)
-        return {
-            "episode": {"r": float(sums["r"][row]), "l": int(sums["l"][row]), "t": elapsed},
-            "is_success": bool(step["ended"][row] == Outcome.ARRIVED),
-            "outcome": self._outcomes[step["ended"][row]],
-            "reward_terms": {name: float(values[row]) for name, values in sums["reward_terms"].items()},
-            **{name: float(step[name][row]) for name in AT_THE_END},
-        }
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset, as for `CooperativeVectorEnv.reset`.
@@ -142,10 +135,10 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return one picture, the top view of world 0."""
-        return [self.envs.pictures.of()]
+        return [self.envs.engine.picture()]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self, attr_name)] * len(self._chosen(indices))
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the batch, which all rows share.
@@ -170,7 +163,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         """Return True per row for SB3's `Monitor`, whose `info["episode"]` the rows give themselves; else False."""
-        return [wrapper_class is Monitor] * len(self._chosen(indices))
+        return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
     def __copy__(self) -> "CooperativeSB3VecEnv":
         return copy.deepcopy(self)
@@ -182,19 +175,9 @@ class CooperativeSB3VecEnv(VecEnv):
         self.__dict__.update(saved)
         self.engine = self.envs.engine
 
-    def _chosen(self, indices: VecEnvIndices) -> list[int]:
-        return list(self._get_indices(indices))
-
     def _all(self, indices: VecEnvIndices, what: str) -> None:
-        if len(self._chosen(indices)) != self.num_envs:
+        if len(list(self._get_indices(indices))) != self.num_envs:
             raise CoopenvError(f"{what}: rows share one batch, so it cannot be done for some rows only")
-
-
-def _row_of(observations: Any, row: int) -> Any:
-    """Return a copy of one row of flat observations, or of each part."""
-    if isinstance(observations, dict):
-        return {name: part[row].copy() for name, part in observations.items()}
-    return observations[row].copy()
 
 
 def make_sb3_vec_env(name_or_path: str | Path, *, seed: int | None = None, **options: Any) -> CooperativeSB3VecEnv:

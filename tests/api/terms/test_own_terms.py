@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -78,30 +79,6 @@ OWN = {
 COPIES = {"velocity_again": "velocity", "bearing_again": "bearings", "age_again": "message_age"}
 
 
-def test_copies_of_built_in_terms_agree_in_one_world() -> None:
-    env = coopenv.parallel_env(FOUR_WAY, overrides=OWN, dtype="float64")
-    weights = env.scenario.reward.by_name
-    rng = np.random.default_rng(0)
-    observations, infos = env.reset(seed=0)
-    layout = env.observation_layout
-    assert list(layout)[-3:] == ["velocity_again", "bearing_again", "age_again"]
-    assert layout["bearing_again"].shape == (len(env.scenario.target_names), 3)
-    assert layout["age_again"].shape == (3,) and layout["age_again"].scale == env.scenario.observation.age_scale
-    for _ in range(5):
-        actions = {agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.agents}
-        observations, rewards, _, _, infos = env.step(actions)
-        for agent, info in infos.items():
-            terms = info["reward_terms"]
-            assert terms["error_again"] == terms["position_error"] < 0.0
-            assert terms["control_again"] == pytest.approx(terms["control"], rel=1e-6)
-            assert rewards[agent] == pytest.approx(
-                sum(weights[name] * value for name, value in terms.items()), rel=1e-5
-            )
-            for copy, original in COPIES.items():
-                assert np.array_equal(*(observations[agent][layout[name].slice] for name in (copy, original)))
-    assert np.any(observations[agent][layout["bearing_again"].slice])
-
-
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
     none = dict.fromkeys(REWARD_TERMS.built_in, 0.0)
@@ -111,6 +88,9 @@ def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
     plain = {"reward": {"privileged": True, "weights": {**none, "position_error": 1.0}}, "horizon": 0.5}
     other = coopenv.make_vec(FOUR_WAY, **options, overrides=plain)
     own_layout, layout = own.observation_layout, other.observation_layout
+    assert list(own_layout)[-3:] == ["velocity_again", "bearing_again", "age_again"]
+    assert own_layout["bearing_again"].shape == (len(own.scenario.target_names), 3)
+    assert own_layout["age_again"].shape == (3,) and own_layout["age_again"].scale == own.scenario.observation.age_scale
     rng = np.random.default_rng(0)
     steps = [(own.reset(seed=0)[0], other.reset(seed=0)[0])]
     for _ in range(12):
@@ -121,6 +101,7 @@ def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
     for one, two in steps:
         for copy, original in COPIES.items():
             assert np.array_equal(one[:, own_layout[copy].slice], two[:, layout[original].slice])
+    assert np.any(one[:, own_layout["bearing_again"].slice])
 
 
 @pytest.mark.parametrize("face", ["parallel", "vector"])
@@ -423,3 +404,35 @@ def test_infos_of_a_batch_hold_every_term(autoreset: str) -> None:
         infos = infos["final_info"]
     assert list(infos["reward_terms"]) == [*REWARD_TERMS.built_in, "error_again", "control_again"]
     assert rewards == pytest.approx(sum(weights[n] * v for n, v in infos["reward_terms"].items()), rel=1e-5)
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+
+
+def test_the_program_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(EXAMPLES / "own_terms.py"))
+    printed = capsys.readouterr().out
+    assert printed.count("smooth -0.") == 4 and "mean return" in printed
+
+
+def test_the_scenario_with_terms_beside_it() -> None:
+    env = coopenv.parallel_env(EXAMPLES / "lane_keeping" / "lane_keeping.toml", dtype="float64")
+    observations, infos = env.reset(seed=0)
+    while env.agents:
+        observations, rewards, _, _, infos = env.step({"vehicle_1": np.array([1.0, 1.0])})  # left, in a circle
+    offset = infos["vehicle_1"]["estimate"]["position"][0] - 1.0
+    terms = infos["vehicle_1"]["reward_terms"]
+    assert terms["lane"] == pytest.approx(-(offset**2), rel=1e-5)
+    assert rewards["vehicle_1"] == pytest.approx(terms["lane"] + 0.1 * terms["control"], rel=1e-5)
+    lane_offset = env.observation_layout["lane_offset"]
+    assert observations["vehicle_1"][lane_offset.slice] == pytest.approx(np.clip(offset / 3.0, -1.0, 1.0), rel=1e-5)
+    assert infos["vehicle_1"]["outcome"] in ("under way", "off_the_road")
+
+
+def test_leaving_the_road_ends_an_episode() -> None:
+    path = EXAMPLES / "lane_keeping" / "lane_keeping.toml"
+    overrides = {"vehicles.0.initial_pose.yaw": 0.0}  # straight off the road
+    envs = coopenv.make_vec(path, num_worlds=2, overrides=overrides, autoreset="disabled")
+    envs.reset(seed=0)
+    ended = np.array([envs.step(np.tile([1.0, 0.0], (2, 1)))[4]["ended"] for _ in range(25)])  # 2 m at 1.5 m/s
+    assert set(ended[:10].ravel()) == {0} and set(ended[-1]) == {len(Outcome)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -14,17 +13,14 @@ pytest.importorskip("highway_env", reason="needs the extra 'highway'")
 
 import torch
 
+from tests.helpers import examples
+
 pytestmark = pytest.mark.train
-EXAMPLE = Path(__file__).parents[3] / "examples" / "highway_policy.py"
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("highway_policy", EXAMPLE)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules["highway_policy"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return examples.example("highway_policy")
 
 
 def test_it_prints_what_error_costs(

@@ -7,7 +7,7 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
+from coopenv.api.parallel_env import NUMBERS, PlainInfos
 from tests.helpers.four_way import FOUR_WAY
 
 

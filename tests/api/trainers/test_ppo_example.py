@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,40 +18,23 @@ import torch
 from safetensors.torch import load_file
 
 import coopenv
+from tests.helpers import examples
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
-EXAMPLE = Path(__file__).parents[3] / "examples" / "train_ppo.py"
 
 
 @pytest.fixture(scope="module")
 def ppo() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("train_ppo", EXAMPLE)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules["train_ppo"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return examples.example("train_ppo")
 
 
-FEW = [
-    "--env",
-    FOUR_WAY,
-    "--num-worlds",
-    "4",
-    "--rollout",
-    "16",
-    "--total-steps",
-    "1024",
-    "--minibatches",
-    "2",
-    "--epochs",
-    "2",
-]
+FEW = f"--env {FOUR_WAY} --num-worlds 4 --rollout 16 --total-steps 1024 --minibatches 2 --epochs 2"
 
 
 def few(ppo: ModuleType, folder: Path, *more: str) -> Any:
-    words = [*FEW, "--log-every", "1", "--evaluation-worlds", "2", "--out", str(folder), *more]
+    words = [*FEW.split(), "--log-every", "1", "--evaluation-worlds", "2", "--out", str(folder), *more]
     return ppo.tyro.cli(ppo.Arguments, args=words)
 
 

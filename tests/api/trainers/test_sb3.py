@@ -102,32 +102,3 @@ def test_methods_reach_the_batch() -> None:
     assert len(env.env_method("get_images")) == 10
     with pytest.raises(coopenv.CoopenvError, match="rows share one batch"):
         env.env_method("reset", indices=[0])
-
-
-def test_step_before_reset() -> None:
-    with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        make_sb3_vec_env(FOUR_WAY, num_worlds=2).step(np.zeros((8, 2)))
-
-
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [(np.zeros((3, 2)), r"shape \(3, 2\), expected \(10, 2\)"), (np.full((10, 2), np.nan), "row 0 is not finite")],
-)
-def test_bad_actions(actions: np.ndarray, message: str) -> None:
-    env = make_sb3_vec_env("busy_intersection", num_worlds=2)
-    env.reset()
-    with pytest.raises(coopenv.ActionError, match=message):
-        env.step(actions)
-
-
-def test_a_reward_in_python_is_earned_and_starts_anew_with_its_world() -> None:
-    env = make_sb3_vec_env(
-        FOUR_WAY,
-        num_worlds=2,
-        overrides={"horizon": 0.5},
-        seed=0,
-        reward=lambda step: step["time"] + step["alive"],
-    )
-    env.reset()
-    rewards = [env.step(np.zeros((8, 2), np.float32))[1].tolist() for _ in range(6)]
-    assert rewards == [[pytest.approx(1.0 + time)] * 8 for time in (0.1, 0.2, 0.3, 0.4, 0.5, 0.1)]

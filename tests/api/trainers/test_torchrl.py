@@ -1,9 +1,13 @@
-"""TorchRL's `PettingZooWrapper` rolls out over deaths and trains. Runs where the extra `torchrl` is installed."""
+"""TorchRL's `PettingZooWrapper` rolls out over deaths and trains; a batch is one environment.
+
+Runs where the extra `torchrl` is installed.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torchrl", reason="needs the extra 'torchrl'")
@@ -19,7 +23,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import coopenv
-from coopenv.api.trainers.numeric_infos import PlainInfos
+from coopenv.api.parallel_env import PlainInfos
+from coopenv.api.trainers.torchrl import batched_env
+from coopenv.api.vector_env import RecordVehicleEpisodes
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = [pytest.mark.torchrl, pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")]
@@ -135,3 +141,37 @@ def test_ppo_trains_on_living_rows() -> None:
             errors.append(losses["loss_critic"].item())
     assert errors[7] < errors[0]
     assert any(not torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))
+
+
+OPTIONS = {"num_worlds": 3, "overrides": {"horizon": 6.0}}
+STEPS = 150
+
+
+def test_specs_of_a_batch() -> None:
+    env = batched_env(FOUR_WAY, **OPTIONS)
+    assert env.batch_size == torch.Size([12])
+    check_env_specs(env)
+
+
+def test_episodes_are_those_of_vehicles() -> None:
+    """Under wide turns, which end against walls or at the horizon: every end and all rewards are those of the batch."""
+    actions = np.column_stack([np.ones(12), np.linspace(0.0, 0.5, 12)]).astype(np.float32)
+    env = batched_env(FOUR_WAY, **OPTIONS)
+    env.set_seed(0)
+    always = torch.from_numpy(actions)
+    rollout = env.rollout(STEPS, lambda observation: always.clone(), break_when_any_done=False)
+    told = {name: rollout["next", name].squeeze(-1).numpy() for name in ("done", "truncated", "reward")}
+
+    batch = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS), 1000)
+    batch.reset(seed=0)
+    batch.reset()  # as `rollout` does
+    ends, rewards = np.zeros((12, STEPS), dtype=bool), np.zeros((12, STEPS))
+    for step in range(STEPS):
+        _, reward, terminated, truncated, infos = batch.step(actions)
+        rewards[:, step], ends[:, step] = reward, infos.get("_episode", False)
+        over = batch.unwrapped.world_major(terminated | truncated).all(axis=1)
+        if over.any():
+            batch.reset(options={"reset_mask": over})
+    assert np.array_equal(told["done"], ends)
+    assert told["reward"] == pytest.approx(rewards, abs=1e-6)
+    assert told["truncated"].any() and not told["truncated"].all(where=told["done"])
