@@ -9,6 +9,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import coopenv
 from coopenv.api.vector_env import RecordVehicleEpisodes, TrueEnds
+from tests.helpers.episodes import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 DECISIONS = 60
@@ -20,23 +21,11 @@ def actions_of(env: coopenv.CooperativeVectorEnv) -> np.ndarray:
     return np.column_stack([np.ones(env.num_envs), np.linspace(0.0, 0.5, env.num_envs)]).astype(np.float32)
 
 
-def by_hand() -> tuple[np.ndarray, np.ndarray]:
-    """Return (return, decisions) of every vehicle's first episode."""
-    env = coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS)
-    env.reset(seed=5)
-    returned, length, under_way = np.zeros(env.num_envs), np.zeros(env.num_envs), np.ones(env.num_envs, bool)
-    for _ in range(DECISIONS):
-        _, reward, terminated, truncated, _ = env.step(actions_of(env))
-        returned += np.where(under_way, reward, 0.0)
-        length += under_way
-        under_way &= ~(terminated | truncated)
-    assert length.min() < DECISIONS and length.max() == DECISIONS
-    return returned, length
-
-
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
 def test_true_episodes_only(autoreset: str) -> None:
-    returned, length = by_hand()
+    plain = coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS)
+    returned, length, _ = first_episodes(plain, 5, DECISIONS, lambda observation: actions_of(plain))
+    assert length.min() < DECISIONS and length.max() == DECISIONS
     env = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset=autoreset, **OPTIONS), buffer_length=1000)
     env.reset(seed=5)
     weights = env.unwrapped.scenario.reward.by_name

@@ -49,7 +49,11 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
                 assert np.array_equal(observations[row], results[0][agent])
                 assert rewards[row] == np.float32(results[1][agent])
                 assert (terminated[row], truncated[row]) == (results[2][agent], results[3][agent])
-                assert infos["position_error"][row] == results[4][agent]["position_error"]
+                told = results[4][agent]
+                for field in ("position_error", "nees", "log_determinant", "gramian_min_eigenvalue"):
+                    assert infos[field][row] == told[field]
+                assert {term: values[row] for term, values in infos["reward_terms"].items()} == told["reward_terms"]
+                assert infos["time"][row] == pytest.approx(told["time"])
                 assert infos["alive"][row]
 
 
@@ -358,20 +362,6 @@ def test_dict_observations_are_the_flat_ones_by_field() -> None:
         named, *_, told = parts.step(np.zeros((8, 2), np.float32))
         if "final_obs" in infos:
             assert np.array_equal(np.concatenate(list(told["final_obs"].values()), axis=1), infos["final_obs"])
-
-
-def test_infos_of_the_batch_are_those_of_the_single_world() -> None:
-    batch, single = coopenv.make_vec(FOUR_WAY, num_worlds=1), coopenv.parallel_env(FOUR_WAY)
-    batch.reset(seed=2)
-    single.reset(seed=2)
-    for _ in range(3):
-        *_, infos = batch.step(np.zeros((4, 2), np.float32))
-        *_, told = single.step(dict.fromkeys(single.agents, np.zeros(2, np.float32)))
-    for row, info in enumerate(told.values()):
-        for name in ("position_error", "nees", "log_determinant", "gramian_min_eigenvalue"):
-            assert infos[name][row] == info[name]
-        assert infos["time"][row] == pytest.approx(info["time"])
-        assert {name: values[row] for name, values in infos["reward_terms"].items()} == info["reward_terms"]
 
 
 def test_observer_by_name_and_unknown_words() -> None:

@@ -94,14 +94,6 @@ def test_leaves_an_agent(reference: Path) -> None:
     assert (again.steps, again.ppo.vehicles, again.scenario) == (3000, 16, {"horizon": 6.0})
 
 
-@pytest.mark.slow
-def test_the_command_in_agent_toml_trains_the_same_again(reference: Path) -> None:
-    options = ["--settings", "agent/train.toml", "--seed", "5", "--threads", "2", "--out", "again"]
-    process = start((*COOPENV, "train", "urban_crossing", *options), reference.parent)
-    assert process.wait(300) == 0
-    same(finished(reference.parent / "again"), finished(reference))
-
-
 def same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
     assert set(first) == set(second)
     for name, values in first.items():

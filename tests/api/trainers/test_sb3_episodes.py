@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import coopenv
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, make_sb3_vec_env
+from tests.helpers.episodes import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
@@ -38,15 +39,7 @@ class AtSpeeds:
 def by_hand() -> dict[str, np.ndarray]:
     """Return what one episode per vehicle comes to, stepped by hand: return, decisions, whether it arrived."""
     env = coopenv.make_vec(FOUR_WAY, num_worlds=WORLDS, autoreset="disabled", overrides=SHORT)
-    observation, _ = env.reset(seed=SEED)
-    returned, length, ended = np.zeros(env.num_envs), np.zeros(env.num_envs, int), np.zeros(env.num_envs, int)
-    under_way = np.ones(env.num_envs, bool)
-    for _ in range(DECISIONS):
-        observation, reward, terminated, truncated, infos = env.step(AtSpeeds().predict(observation)[0])
-        returned += np.where(under_way, reward, 0.0)
-        length += under_way
-        ended = infos["ended"]
-        under_way &= ~(terminated | truncated)
+    returned, length, ended = first_episodes(env, SEED, DECISIONS, lambda rows: AtSpeeds().predict(rows)[0])
     assert 0.1 < (ended > 0).mean() < 1.0 and len(set(length)) > 5  # there are parked vehicles to be miscounted
     assert (ended == 1).any()
     return {"return": returned, "length": length, "arrived": ended == 1}
