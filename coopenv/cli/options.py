@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from enum import Enum, StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -121,22 +121,16 @@ OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_obse
 """Completion and check of an argument or option."""
 
 
-def dotted_keys(model: type[Any]) -> Iterator[str]:
-    """Yield the dotted key of every setting below a pydantic model; `*` stands for any entry."""
-    for name, info in model.model_fields.items():
-        parts = list(_models_in(info.annotation))
-        if not parts:
-            yield name
-        between = ".*." if all(in_list for _, in_list in parts) else "."
-        yield from dict.fromkeys(f"{name}{between}{key}" for part, _ in parts for key in dotted_keys(part))
-
-
-def _models_in(annotation: Any, in_list: bool = False) -> Iterator[tuple[type[Any], bool]]:
-    """Yield the models that an annotation refers to, and whether as entries of a list."""
+def dotted_keys(annotation: Any) -> Iterator[str]:
+    """Yield the dotted key of every setting below a pydantic model, or below those of a type; `*`: any entry."""
     if hasattr(annotation, "model_fields"):
-        yield annotation, in_list
+        for name, info in annotation.model_fields.items():
+            parts = list(dict.fromkeys(dotted_keys(info.annotation)))
+            yield from (f"{name}.{key}" for key in parts) if parts else [name]
+        return
+    entries = "*." if get_origin(annotation) in (list, tuple, dict) else ""
     for argument in get_args(annotation):
-        yield from _models_in(argument, in_list or getattr(annotation, "__origin__", None) in (list, tuple, dict))
+        yield from (f"{entries}{key}" for key in dotted_keys(argument))
 
 
 MOST_WORLDS = 1_000_000

@@ -11,8 +11,6 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from coopenv.backends.base import Backend
     from coopenv.policies import Policy
     from coopenv.runs.live import Reel
@@ -110,31 +108,22 @@ def film(given: FilmOptions) -> None:
     """Film an episode from above: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
-    from coopenv.runs.scenes import check_film, write_film
+    from coopenv.runs.scenes import check_film, played_scene, title_of, write_film
 
     out, log = given.out, options.console(stderr=True)
     rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
     check_film(out)
     check_file(out)
-    record = given.saved() or scene(given, log)
+    record = given.saved()
+    if record is None:
+        with options.warned():
+            backend = given.open()
+        policy, driver = (None, "") if backend.capabilities.recorded else given.driver(backend.scenario)
+        record = played_scene(backend, title_of(given.environment), log, given.seed, policy, driver)
     with Progress(log, f"filming {out.name}", 1.0) as progress:
         pictures = write_film(record, out, rate, given.speed, given.width, not given.map_only, progress.update)
     size = out.stat().st_size / 1e6
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
-
-
-def scene(given: SceneOptions, log: "Console") -> "SceneRecord":
-    """Return the scene of an episode that runs now.
-
-    Raises:
-        CoopenvError: there is no such source, or an option is not for it.
-    """
-    from coopenv.runs.scenes import played_scene, title_of
-
-    with options.warned():
-        backend = given.open()
-    policy, driver = (None, "") if backend.capabilities.recorded else given.driver(backend.scenario)
-    return played_scene(backend, title_of(given.environment), log, given.seed, policy, driver)
 
 
 CARS = "svea"

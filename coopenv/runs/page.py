@@ -9,13 +9,14 @@ from coopenv.runs import scenario_text
 from coopenv.runs.scenario_text import drawn, graded
 from coopenv.runs.summary import cell_text, environment_rows, facts, shown_sections
 from coopenv.scenario import Scenario
-from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS, Term
+from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table; lines within a cell come one after the other, with semicolons between."""
-    lines = [_row(columns), "|---" * len(columns) + "|", *map(_row, rows)]
-    return "\n".join(lines)
+    cells = ([plain("; ".join(text.splitlines())).replace("|", "\\|") for text in row] for row in (columns, *rows))
+    heading, *lines = (f"| {' | '.join(row)} |" for row in cells)
+    return "\n".join([heading, "|---" * len(columns) + "|", *lines])
 
 
 def bullets(lines: Iterable[str]) -> str:
@@ -26,14 +27,6 @@ def bullets(lines: Iterable[str]) -> str:
 def plain(text: str) -> str:
     """Return a text on one line, without what would be read as a tag."""
     return " ".join(text.split()).replace("<", "&lt;")
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(_cell(cell) for cell in cells)} |"
-
-
-def _cell(text: str) -> str:
-    return plain("; ".join(text.splitlines())).replace("|", "\\|")
 
 
 GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
@@ -111,14 +104,14 @@ def _learning(scenario: Scenario) -> Iterator[str]:
     yield "## Reward"
     terms = REWARD_TERMS.known(scenario.reward.custom)
     weights = {name: weight for name, weight in scenario.reward.by_name.items() if weight}
-    rows = [(f"`{name}`", number(weight), terms[name].unit, _meaning(terms[name])) for name, weight in weights.items()]
+    privileged = {name: " (privileged)" if terms[name].privileged else "" for name in weights}
+    rows = [
+        (f"`{name}`", number(weight), terms[name].unit, terms[name].meaning + privileged[name])
+        for name, weight in weights.items()
+    ]
     yield table(("term", "weight", "unit", "meaning"), rows) if rows else "None: every weight is 0."
     yield "## Termination"
     yield bullets(_endings(scenario))
-
-
-def _meaning(term: Term) -> str:
-    return f"{term.meaning} (privileged)" if term.privileged else term.meaning
 
 
 def _endings(scenario: Scenario) -> Iterator[str]:

@@ -255,28 +255,21 @@ def serving(host: str, port: int | None) -> AbstractContextManager[tuple[Any, st
 
 def free_port(host: str, port: int | None) -> int:
     """Return a free port; arguments and errors as for `serving`."""
-    for candidate in (port,) if port is not None else range(PORT, PORT + PORTS):
-        reason = _obstacle(host, candidate)
-        if not reason:
+    for candidate in range(PORT, PORT + PORTS) if port is None else (port,):
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
             return candidate
-        if port is not None:
-            raise CoopenvError(f"--port {port}: {reason}")
+        except socket.gaierror:
+            raise CoopenvError(f"--host {host}: no such address") from None
+        except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise CoopenvError(f"--host {host}: is no address of this computer") from None
+            reason = "another program listens there"
+            if isinstance(error, PermissionError):
+                reason = "ports below 1024 are for the administrator"
+            if port is not None:
+                raise CoopenvError(f"--port {port}: {reason}; name another one") from None
     raise CoopenvError(f"--port: {PORT} to {PORT + PORTS - 1} are taken; name another one")
-
-
-def _obstacle(host: str, port: int) -> str:
-    """Return why a port cannot be used; empty: it can. Raises CoopenvError: there is no such address here."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except socket.gaierror:
-        raise CoopenvError(f"--host {host}: no such address") from None
-    except PermissionError:
-        return "ports below 1024 are for the administrator; name another one"
-    except OSError as error:
-        if error.errno == errno.EADDRNOTAVAIL:
-            raise CoopenvError(f"--host {host}: is no address of this computer") from None
-        return "another program listens there; name another one"
-    return ""
