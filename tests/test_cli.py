@@ -300,14 +300,6 @@ def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pyte
     assert "NaN" not in Path("lost/metrics.json").read_text()
 
 
-def test_the_table_says_what_settling_and_the_steady_state_are(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "busy_intersection", "--steps", "60", "--steady-from", "2", "--out", "here"]) == 0
-    out = capsys.readouterr().out
-    assert "Settles: stays below 0.5 m and 5 deg. Converges: stays below 0.1 m and 1 deg." in out
-    assert "RMSE and NEES: steady state, after 2 s" in out
-    assert max(len(line) for line in out.splitlines()) <= 80
-
-
 def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
     assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--out", "film"]) == 0

@@ -1,4 +1,4 @@
-"""`coopenv svea demo`: real processes in real time, none of which is left."""
+"""`coopenv svea demo` and `svea run` with fake cars: real processes in real time, none of which is left."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +15,18 @@ from typer.testing import CliRunner
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import Pacer
-from coopenv.cars.fake.fleet import free_port
+from coopenv.cars.codec import encode, make
+from coopenv.cars.fake.car import fault_topic
+from coopenv.cars.fake.fleet import fakes, free_port
+from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from coopenv.cli.svea import STOPPED
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.demo import FLEETS, Demo
+from tests.helpers.cars import write_fleet
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 
+OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"
 RESULTS = {"metrics.json", "trajectory.npz", "errors.png", "trajectories_2d.png", "topology.png"}
 
 ATTEMPTS = 3
@@ -85,7 +90,7 @@ def test_an_interrupt_leaves_no_process_and_what_has_been_driven(moment: str, tm
 @pytest.mark.slow
 def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
-    mine.write_text((ROOT / "examples" / "fleet" / "overtaking.toml").read_text())
+    mine.write_text(OVERTAKING.read_text())
     for _ in range(ATTEMPTS):
         process = demo(tmp_path, free_port(), "--fleet", "mine.toml", "--set", "horizon=3")
         printed, errors = process.communicate(timeout=4 * DEADLOCK)
@@ -105,7 +110,7 @@ def fleet_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable
     monkeypatch.chdir(tmp_path)
 
     def command(settings: str) -> list[str]:
-        text = (ROOT / "examples" / "fleet" / "overtaking.toml").read_text()
+        text = OVERTAKING.read_text()
         Path("mine.toml").write_text(text.replace("[safety]\n", f"[safety]\n{settings}\n"))
         return ["svea", "demo", "--fleet", "mine.toml", "--set", "horizon=3"]
 
@@ -157,3 +162,91 @@ def test_other_environments_have_no_demo() -> None:
     with pytest.raises(CoopenvError, match=r"svea_overtaken: has no fleet.*did you mean 'svea_overtaking'"):
         _ = Demo("svea_overtaken", Path("out")).fleet
     assert CliRunner().invoke(app, ["svea", "demo", "--environment", "facade"]).exit_code != 0
+
+
+ENOUGH = 200_000
+"""Bytes of a record in which an episode has begun."""
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
+    path = write_fleet(tmp_path_factory.mktemp("fleet"))
+    with fakes(path) as router:
+        yield path, router
+
+
+def interrupted(fleet: tuple[Path, str], folder: Path, number: signal.Signals) -> tuple[str, int]:
+    """Drive and record, send a signal on the way, and return what it says then and its status."""
+    path, router = fleet
+    options = ("--arm", "--policy", "route_follower", "--record", "drive.mcap", "--out", "out")
+    process = start((*COOPENV, "svea", "run", str(path), "--connect", router, *options), folder)
+    try:
+        drive = folder / "drive.mcap"
+        wait_until(lambda: process.poll() is not None or (drive.exists() and drive.stat().st_size > ENOUGH))
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=DEADLOCK)
+    finally:
+        process.kill()
+    return errors, process.returncode
+
+
+def replayed(folder: Path) -> tuple[str, str]:
+    process = start((*COOPENV, "run", "drive.mcap", "--no-figures", "--out", "again"), folder)
+    told, errors = process.communicate(timeout=2 * DEADLOCK)
+    assert process.returncode == 0, errors
+    return told, errors
+
+
+@pytest.mark.slow
+def test_what_an_interrupt_keeps_is_told_and_can_be_shown(fleet: tuple[Path, str], tmp_path: Path) -> None:
+    errors, status = interrupted(fleet, tmp_path, signal.SIGINT)
+    assert status == 130
+    assert errors.splitlines()[-1] == "interrupted; kept: drive.mcap, the drive up to here: coopenv run drive.mcap"
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
+    told, errors = replayed(tmp_path)
+    assert "Stopped: Interrupted\n" in told and "warning" not in errors
+    assert json.loads((tmp_path / "again" / "metrics.json").read_text())["policy"] == "recorded"
+
+
+@pytest.mark.slow
+def test_a_station_that_is_killed_leaves_its_drive(fleet: tuple[Path, str], tmp_path: Path) -> None:
+    _, status = interrupted(fleet, tmp_path, signal.SIGKILL)
+    assert status == -9
+    told, errors = replayed(tmp_path)
+    (warning,) = (line for line in errors.splitlines() if line.startswith("warning"))
+    assert "drive.mcap: cut off, the end of the MCAP file is missing: of what came after " in warning
+    assert "ended before its time" in told and "RMSE" in told
+
+
+PATIENT = "odometry_age = 2.0\nmissed_deadlines = 60\n"
+
+
+def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_zenoh("router", listen=[endpoint])
+    try:
+        command = ["svea", "run", str(OVERTAKING), "--connect", endpoint, "--steps", "3", "--no-figures"]
+        result = CliRunner().invoke(app, [*command, "--steady-from", "0"])
+        too_short = CliRunner().invoke(app, command)
+    finally:
+        router.close()
+    assert isinstance(result.exception, CoopenvError)
+    assert str(result.exception).startswith(f"nothing has come from svea7, svea1 by {endpoint}")
+    assert str(too_short.exception).startswith("steady_from 2 is not within the run of ")
+
+
+@pytest.mark.slow
+def test_a_car_that_is_killed_ends_the_run_with_a_status_of_its_own(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text(OVERTAKING.read_text().replace("[safety]\n", f"[safety]\n{PATIENT}"))
+    with fakes(mine) as endpoint:
+        command = ("svea", "run", "mine.toml", "--connect", endpoint, "--arm", "--policy", "route_follower")
+        station = start((*COOPENV, *command, "--record", "drive.mcap", "--no-figures"), tmp_path)
+        wait_until(lambda: (tmp_path / "drive.mcap").exists() and (tmp_path / "drive.mcap").stat().st_size > 100_000)
+        here = open_zenoh("client", [endpoint])
+        here.publish(fault_topic("svea1"), encode(make("std_msgs/msg/String", data="kill@0")), reliable=True)
+        printed, errors = station.communicate(timeout=DEADLOCK)
+        here.close()
+    assert station.returncode == STOPPED, errors
+    assert "Stopped: svea1: " in printed and "ended before its time" in printed
