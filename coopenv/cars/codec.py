@@ -1,6 +1,7 @@
 """Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
 
 import math
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -44,19 +45,6 @@ int8 steering
 int8 velocity
 int8 trans_diff
 int8 ctrl
-""",
-    "svea_msgs/msg/lli_emergency": """
-bool emergency
-uint32 sender_id
-""",
-    "svea_msgs/msg/VehicleState": """
-std_msgs/Header header
-string child_frame_id
-float64 x
-float64 y
-float64 yaw
-float32 v
-float64[16] covariance
 """,
 }
 
@@ -177,19 +165,35 @@ def _store(name: str, definitions: dict[str, str]) -> Any:
 
 
 def make(kind: str, **fields: Any) -> Any:
-    """Return a ROS 2 message of a type by its fields."""
-    return ros2().types[kind](**fields)
+    """Return a ROS 2 message of a type by its fields; those that are not given are zero and empty.
+
+    A message within it may be given by its fields, as a mapping or in their order: a vector as (x, y, z).
+    """
+    values = {name: _value(node, fields.get(name)) for name, node in ros2().fielddefs[kind][1]}
+    return ros2().types[kind](**{**fields, **values})
+
+
+def _value(node: Any, given: Any = None) -> Any:
+    """Return the value of a field; `node` is the field as rosbags describes it."""
+    kind, of = node
+    if kind.name == "NAME":
+        if given is None or isinstance(given, Mapping):
+            return make(of, **(given or {}))
+        if isinstance(given, tuple | list | np.ndarray):
+            parts = given.tolist() if isinstance(given, np.ndarray) else given
+            return make(of, **dict(zip((name for name, _ in ros2().fielddefs[of][1]), parts, strict=True)))
+        return given
+    if kind.name == "BASE":
+        return ("" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()) if given is None else given
+    element, length = of[0], of[1] if kind.name == "ARRAY" else 0
+    if element[0].name == "BASE" and element[1][0] != "string":
+        return np.zeros(length, dtype=element[1][0]) if given is None else np.ravel(given).astype(element[1][0])
+    return [_value(element, part) for part in (given or [None] * length)]
 
 
 def header(stamp: int, frame: str = "") -> Any:
     """Return a header with a stamp in ns."""
-    return make("std_msgs/msg/Header", stamp=make_time(stamp), frame_id=frame)
-
-
-def make_time(stamp: int) -> Any:
-    """Return a time in ns as a message."""
-    seconds, nanoseconds = divmod(stamp, 10**9)
-    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return make("std_msgs/msg/Header", stamp=divmod(stamp, 10**9), frame_id=frame)
 
 
 def stamp_of(message: Any) -> int:
@@ -233,13 +237,11 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
 
 def pose(rotation: Any, position: Any) -> Any:
     """Return a geometry_msgs/Pose of a rotation (3, 3), body to map, and a position (3,), m."""
-    x, y, z = (float(value) for value in position)
-    place = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    return make("geometry_msgs/msg/Pose", position=place, orientation=quaternion(rotation))
+    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(rotation))
 
 
-def quaternion(rotation: Any) -> Any:
-    """Return the quaternion of a rotation by its largest component; in plain numbers, as there are 200 a second."""
+def quaternion(rotation: Any) -> list[float]:
+    """Return x, y, z, w of a rotation by its largest component; in plain numbers, as there are 200 a second."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     rows = (
         (1.0 + a + e + i, h - f, c - g, d - b),
@@ -247,17 +249,17 @@ def quaternion(rotation: Any) -> Any:
         (c - g, b + d, 1.0 - a + e - i, f + h),
         (d - b, c + g, f + h, 1.0 - a - e + i),
     )  # 4 q q^T
-    largest = max(range(4), key=lambda k: rows[k][k])
-    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[largest])), rows[largest][0] or 1.0)
-    w, x, y, z = (scale * v for v in rows[largest])
-    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    k = max(range(4), key=lambda k: rows[k][k])
+    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[k])), rows[k][0] or 1.0)
+    w, x, y, z = (scale * v for v in rows[k])
+    return [x, y, z, w]
 
 
 @cache
 def _warm_up(types: frozenset[str]) -> None:
     store = ros2()
     for kind in types:
-        store.deserialize_cdr(store.serialize_cdr(empty(kind), kind), kind)
+        store.deserialize_cdr(store.serialize_cdr(make(kind), kind), kind)
 
 
 def warm_up(profile: CarProfile = SVEA) -> None:
@@ -270,22 +272,3 @@ def warm_up(profile: CarProfile = SVEA) -> None:
         if topic.type not in ros2().types:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type} is not known")
     _warm_up(frozenset(topic.type for topic in profile.topics.values()))
-
-
-def empty(kind: str) -> Any:
-    """Return a ROS 2 message of a type whose fields are zero and empty."""
-    store = ros2()
-    return store.types[kind](**{name: _value(node) for name, node in store.fielddefs[kind][1]})
-
-
-def _value(node: Any) -> Any:
-    """Return the zero of a field, as rosbags describes it."""
-    kind, of = node
-    if kind.name == "NAME":
-        return empty(of)
-    if kind.name == "BASE":
-        return "" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()
-    element, length = of[0], of[1] if kind.name == "ARRAY" else 0
-    if element[0].name == "BASE" and element[1][0] != "string":
-        return np.zeros(length, dtype=element[1][0])
-    return [_value(element) for _ in range(length)]

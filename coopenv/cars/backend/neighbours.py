@@ -44,11 +44,11 @@ def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
     P = left_covariance(sent.rotation.T @ sent.position, sent.covariance)
     turn = np.zeros((6, 6))
     turn[:3, 3:] = turn[3:, :3] = sent.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    placed, covariance = pose(sent.rotation, sent.position + origin), (turn @ P @ turn.T).ravel()
+    placed, covariance = pose(sent.rotation, sent.position + origin), turn @ P @ turn.T
     return make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=header(stamp, "map"),
-        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=placed, covariance=covariance),
+        pose={"pose": placed, "covariance": covariance},
     )
 
 
@@ -60,20 +60,14 @@ def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | N
     m = sent.message
     if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
         return None
-    valid = m.position is not None and m.rotation is not None and m.covariance is not None
-    placed, odometry, covariance, depends_on = pose(np.eye(3), np.zeros(3)), pose(np.eye(3), np.zeros(3)), np.eye(6), 0
-    if m.position is not None and m.rotation is not None and m.covariance is not None:
-        placed, covariance = pose(m.rotation, m.position + origin), np.asarray(m.covariance, dtype=np.float64)
-        odometry, depends_on = pose(*from_six(m.extra["odometry"])), int(m.extra["depends_on"][0])
-    return make(
-        "coopenv_msgs/msg/RobustReport",
-        header=header(stamp, "map"),
-        valid=valid,
-        pose=placed,
-        covariance=covariance.ravel(),
-        odometry=odometry,
-        depends_on=depends_on,
-    )
+    if m.position is None or m.rotation is None or m.covariance is None:
+        unknown = pose(np.eye(3), np.zeros(3))
+        fields = {"pose": unknown, "covariance": np.eye(6), "odometry": unknown}
+    else:
+        placed, odometry = pose(m.rotation, m.position + origin), pose(*from_six(m.extra["odometry"]))
+        fields = {"valid": True, "pose": placed, "covariance": m.covariance, "odometry": odometry}
+        fields["depends_on"] = int(m.extra["depends_on"][0])
+    return make("coopenv_msgs/msg/RobustReport", header=header(stamp, "map"), **fields)
 
 
 def is_finite(sent: VehicleBroadcast) -> bool:

@@ -327,14 +327,12 @@ class Gates:
         limits = self._limits
         speed = min(max(speed, -limits.speed if limits.reverse else 0.0), limits.speed)
         steering = min(max(steering, -limits.steering), limits.steering)
-        drive = make(
-            "ackermann_msgs/msg/AckermannDrive",
-            steering_angle=steering,
-            steering_angle_velocity=limits.steering_rate,
-            speed=speed,
-            acceleration=min(acceleration, limits.acceleration),
-            jerk=0.0,
-        )
+        drive = {
+            "steering_angle": steering,
+            "steering_angle_velocity": limits.steering_rate,
+            "speed": speed,
+            "acceleration": min(acceleration, limits.acceleration),
+        }
         about = header(time.time_ns(), f"{self.session}:{self._sequence}")
         self._send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
 

@@ -14,15 +14,13 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, warm_up
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
-from coopenv.cars.fake.messages import Act, SensorPublisher, VehicleSensorPublisher
-from coopenv.cars.fake.sensors import CarSensors, Pixy
+from coopenv.cars.fake.sensors import Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.codec import Malformed, read_drive
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
-from coopenv.cars.samples import Calibration
 from coopenv.cars.transport.base import Arrival, Transport
 
 JITTER = 0.05  # of a period, largest deviation to either side of a regular time
@@ -123,13 +121,19 @@ class Fake:
         self._others = Neighbours(self.world, binding, name, transport)
         self._acts: dict[str, Act] = {}
         self._link: GateConnection | None = None
-        self._build(binding, transport, deployment.sensors.odometry)
+        if self._drives:  # the wheels measure a turn rate only where no other sensor does
+            self._pixy = Pixy(self.world, binding, self._others, self._faults)
+            self._sensors = CarSensors(self.world, differential=deployment.sensors.odometry == "wheel")
+            limits = scenario.limits[self.world.vehicle]
+            self._wheels = Actuators(limits.latency, self._profile.command.timeout)
+        vehicle = (self._pixy, self._sensors) if self._drives else None
+        publisher = SensorPublisher(name, self.world, self._profile, self._wire, transport, self._stamp, vehicle)
         self.begin(seed)
         self._warm_up()
         transport.subscribe(RESET_TOPIC, self._receive_reset)
         transport.subscribe(fault_topic(name), self._receive_fault)
-        rates = {name: rate for name, (rate, _) in self._publisher.acts.items()}
-        self._acts = {name: act for name, (_, act) in self._publisher.acts.items()}
+        rates = {name: rate for name, (rate, _) in publisher.acts.items()}
+        self._acts = {name: act for name, (_, act) in publisher.acts.items()}
         if self._drives and gate:
             car_clock = GateClock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
             identity = deployment.security.identity
@@ -146,22 +150,6 @@ class Fake:
         for fault in faults:
             self._faults.add(fault, clock.steady())
 
-    def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
-        """Put sensors and wheels on the car; the wheels measure a turn rate only where no other sensor does."""
-        whose = (self.name, self.world, self._wire, self._stamp, transport, self._profile)
-        self._publisher = SensorPublisher(*whose)
-        if self._drives:
-            vehicle, scenario = self.world.vehicle, self.world.scenario
-            carriers = {target: marker for marker, target in binding.targets.items()}
-            self._pixy = Pixy(
-                self.world, Calibration.of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
-            )
-            self._sensors = CarSensors(self.world, differential=odometry == "wheel")
-            self._wheels = Actuators(scenario.limits[vehicle].latency, binding.profile.command.timeout)
-            publisher = VehicleSensorPublisher(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
-            publisher.before_frame = self._others.place
-            self._publisher = publisher
-
     def begin(self, seed: int) -> None:
         """Go to the start of a seed; wheels and commands are as if nothing had been."""
         self._began = self._moved = self._clock.steady()
@@ -170,8 +158,8 @@ class Fake:
         self._others.begin()
         if self._drives:
             self._wheels.clear()
-            self._sensors.begin()
-            self._pixy.begin()
+            self._sensors.begin(self._rng)
+            self._pixy.begin(self._rng)
 
     def _warm_up(self) -> None:
         """Do once what takes long at the first time: kernels and codecs are compiled, or loaded."""

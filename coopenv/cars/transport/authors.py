@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, make, ros1, ros2
+from coopenv.cars.codec import decode, decode_ros1, encode, encode_ros1, make, ros1, ros2
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.profile import SVEA, CarProfile, CommandMessage, Drive, Role
@@ -122,7 +122,7 @@ class Route:
 
     def warm_up(self) -> None:
         """Translate once, since the first time compiles and takes a tenth of a second."""
-        translated = self.out(encode(empty(self.ours)))
+        translated = self.out(encode(make(self.ours)))
         if self.theirs.exact:
             self.back(translated)
 

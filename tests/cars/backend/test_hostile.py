@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.station import MOST_WAITING, Station
-from coopenv.cars.codec import MOST_BYTES, empty, encode, header, make
+from coopenv.cars.codec import MOST_BYTES, encode, header, make
 from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import SVEA, Role
@@ -32,7 +32,7 @@ def binding(only: str | None = None) -> Binding:
 
 def hostile(rng: np.random.Generator, kind: str) -> bytes:
     """Return bytes that are nearly a message of a type, or nothing like it."""
-    good = encode(empty(kind))
+    good = encode(make(kind))
     choice = rng.integers(6)
     if choice == 0:
         return rng.bytes(int(rng.integers(0, 200)))
@@ -77,7 +77,7 @@ def test_nothing_that_comes_stops_the_ticks_or_stays_in_memory() -> None:
     wheel = make(
         SVEA.topics[Role.WHEEL].type,
         header=header(now + 10**10),
-        twist=empty("geometry_msgs/msg/TwistWithCovariance"),
+        twist=make("geometry_msgs/msg/TwistWithCovariance"),
     )
     wheel.twist.twist.linear.x = 0.25
     arrival = Arrival(SVEA.topic_of("svea7", Role.WHEEL), encode(wheel), now + 10**10)
@@ -120,7 +120,7 @@ def test_what_others_have_not_signed_is_dropped_and_counted(tmp_path: Path) -> N
     verifier = Verifier({name: key.public_key() for name, key in keys.items() if name != "mallory"})
     topic, hub = SVEA.topic_of("svea1", Role.ESTIMATE), Hub()
     station = Station(hub.connect(), (topic,), verifier, {topic: ("svea1", "station")})
-    network, payload = hub.connect(), encode(empty(SVEA.topics[Role.ESTIMATE].type))
+    network, payload = hub.connect(), encode(make(SVEA.topics[Role.ESTIMATE].type))
     genuine = Signer("svea1", keys["svea1"]).sign(topic, payload)
     elsewhere = Signer("svea1", keys["svea1"]).sign(SVEA.topic_of("svea7", Role.ESTIMATE), payload)
     for signature in (
@@ -144,7 +144,7 @@ def test_replayed_messages_of_others_count_once() -> None:
     topic = SVEA.topic_of("svea7", Role.ESTIMATE)
 
     def say(stamp: int, received: int) -> Any:
-        pose = empty("geometry_msgs/msg/PoseWithCovariance")
+        pose = make("geometry_msgs/msg/PoseWithCovariance")
         pose.pose.orientation.w = 1.0
         message = make(SVEA.topics[Role.ESTIMATE].type, header=header(stamp), pose=pose)
         for sample in intake.samples(Arrival(topic, encode(message), received)):

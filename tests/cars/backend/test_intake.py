@@ -9,9 +9,8 @@ import pytest
 
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import bind
-from coopenv.cars.codec import encode
+from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Car, Sensors
-from coopenv.cars.fake.messages import imu, wheel
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.scenario import load_scenario
@@ -32,13 +31,14 @@ def test_the_wheels_turn_rate_counts_only_without_a_gyro(odometry: Any, turned: 
     assembler.begin(START)
     heading = 0.0
     for k in range(2001):
-        now, spoken = START + k * MS, []
+        now, spoken = START + k * MS, list[tuple[Role, dict[str, Any]]]()
         if k % 10 == 0:
-            spoken.append((Role.IMU, imu(now, "svea7", np.array([0.0, 0.0, 0.5]), 0.0)))
+            spoken.append((Role.IMU, {"angular_velocity": (0.0, 0.0, 0.5)}))
         if k % 20 == 3:
-            spoken.append((Role.WHEEL, wheel(now, "svea7", 0.2, 0.3, (0.0, 0.0))))
-        for role, message in spoken:
-            for sample in intake.samples(Arrival(SVEA.topic_of("svea7", role), encode(message), now)):
+            spoken.append((Role.WHEEL, {"twist": {"twist": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.3))}}))
+        for role, fields in spoken:
+            payload = encode(make(SVEA.topics[role].type, header=header(now), **fields))
+            for sample in intake.samples(Arrival(SVEA.topic_of("svea7", role), payload, now)):
                 assembler.put(sample)
         if k % 50 == 0 and k > 0:
             R = assembler.tick(k // 50, now).rotation[0]

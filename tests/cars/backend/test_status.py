@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numpy as np
 import pytest
 
 from coopenv.cars.backend import start
 from coopenv.cars.backend.start import StatusBoard
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote
-from coopenv.cars.fake import messages
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Hub
 
@@ -27,21 +25,19 @@ class Talk:
         self.board = StatusBoard(self.hub.connect(), (CAR,), Remote(), needed)
         self.network = self.hub.connect()
 
-    def say(self, role: Role, message: Any) -> None:
+    def say(self, role: Role, age: float, **fields: Any) -> None:
+        stamp = time.time_ns() - round(age * 1e9)
+        message = make(SVEA.topics[role].type, header=header(stamp), **fields)
         self.network.publish(SVEA.topic_of(CAR, role), encode(message))
 
     def remote(self, *pulses: int, rssi: int = 200, age: float = 0.0) -> None:
-        channels = np.array(pulses or (1500,) * 8, dtype=np.uint16)
-        stamp = time.time_ns() - round(age * 1e9)
-        self.say(Role.REMOTE, make("mavros_msgs/msg/RCIn", header=header(stamp), rssi=rssi, channels=channels))
+        self.say(Role.REMOTE, age, rssi=rssi, channels=pulses or (1500,) * 8)
 
     def state(self, mode: str = "MANUAL", armed: bool = True, age: float = 0.0) -> None:
-        message = messages.state(time.time_ns() - round(age * 1e9), armed)
-        message.mode = mode
-        self.say(Role.STATE, message)
+        self.say(Role.STATE, age, armed=armed, connected=True, mode=mode)
 
-    def battery(self, share: float = 0.8, age: float = 0.0) -> None:
-        self.say(Role.BATTERY, messages.battery(time.time_ns() - round(age * 1e9), share))
+    def battery(self, age: float = 0.0) -> None:
+        self.say(Role.BATTERY, age, percentage=0.8)
 
     def all_is_well(self) -> None:
         self.remote()

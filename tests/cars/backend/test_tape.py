@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from coopenv.base.errors import OutputError
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport
-from coopenv.cars.codec import TICK, empty, encode, header, make
+from coopenv.cars.codec import TICK, encode, header, make
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role
 from coopenv.cars.transport.base import Hub
 from tests.helpers.processes import DEADLOCK, start
@@ -35,11 +35,11 @@ def written(tmp_path: Path) -> Path:
     for k in range(20):
         now = 10**9 + k * 10**7
         twist = make(
-            TYPES[WHEEL], header=header(now - 5, "base_link"), twist=empty("geometry_msgs/msg/TwistWithCovariance")
+            TYPES[WHEEL], header=header(now - 5, "base_link"), twist=make("geometry_msgs/msg/TwistWithCovariance")
         )
         twist.twist.twist.linear.x = 0.1 * k
         recorder.write(WHEEL, encode(twist), now)
-        frame = make(TYPES[FRAMES], header=header(now), objects=[empty("pixy_camera/msg/ObjectInfo")] * (k % 3))
+        frame = make(TYPES[FRAMES], header=header(now), objects=[make("pixy_camera/msg/ObjectInfo")] * (k % 3))
         recorder.write(FRAMES, encode(frame), now)
         recorder.write("fleet/nobody/knows", b"123", now)
         recorder.tick(k + 1, now)
@@ -78,11 +78,11 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     others = hub.connect()
     for name in ("svea7", "stranger"):
         others.announce(f"fleet/alive/{name}")
-    others.publish(state, encode(empty(types[state])))
+    others.publish(state, encode(make(types[state])))
     others.publish(stop, encode(make(types[stop], data=True)))
-    others.publish(WHEEL, encode(empty(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
+    others.publish(WHEEL, encode(make(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
     others.close()
-    recorded.publish(WHEEL, encode(empty(TYPES[WHEEL])), b"signature")
+    recorded.publish(WHEEL, encode(make(TYPES[WHEEL])), b"signature")
     recorder.close()
     assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
     with AnyReader([tmp_path / "drive.mcap"]) as reader:
@@ -112,7 +112,7 @@ def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> Non
 
 def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Path) -> None:
     recorder, each, writers = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES), 500, 4
-    frame = encode(empty(TYPES[FRAMES]))
+    frame = encode(make(TYPES[FRAMES]))
 
     def write(number: int) -> None:
         for k in range(each):
@@ -140,10 +140,10 @@ import os, resource, sys, time
 from pathlib import Path
 from coopenv.cars.backend.drive import FLUSH, DriveRecorder
 from coopenv.cars.codec import encode
-from coopenv.cars.codec import empty
+from coopenv.cars.codec import make
 recorder = DriveRecorder(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
 recorder.begin(1, 0, 0)
-frame = encode(empty("{TYPES[FRAMES]}"))
+frame = encode(make("{TYPES[FRAMES]}"))
 """
 KILLED = """
 recorder.write("frames", frame, 2)
@@ -195,7 +195,7 @@ def test_a_full_disk_is_one_line_and_what_is_written_can_be_read(tmp_path: Path)
 
 def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
     recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
-    recorder.write(FRAMES, encode(empty(TYPES[FRAMES])), 1)
+    recorder.write(FRAMES, encode(make(TYPES[FRAMES])), 1)
     recorder.close()
     assert not list(tmp_path.iterdir())
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from coopenv.cars.codec import MOST_BYTES, empty, encode
+from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cli.svea import next_status
@@ -29,7 +29,7 @@ class Crowded:
 
 
 def status() -> bytes:
-    return encode(empty(SVEA.topics[Role.GATE].type))
+    return encode(make(SVEA.topics[Role.GATE].type))
 
 
 def heard(payloads: Iterator[bytes]) -> Any:

@@ -14,6 +14,7 @@ from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, CarPose, CarStatus, Detections, RobustReport, Twist
+from coopenv.cars.transport.authors import to_ros1
 from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
@@ -32,7 +33,7 @@ def make(kind: str, ros: int = 2, **fields: Any) -> Any:
 
 
 def head(ros: int = 2) -> Any:
-    return codec.header(5) if ros == 2 else codec.ros1().types["std_msgs/msg/Header"](0, codec.make_time(5), "")
+    return codec.header(5) if ros == 2 else to_ros1(codec.header(5))
 
 
 def vector(*xyz: float) -> Any:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, header, make
+from coopenv.cars.codec import decode, decode_ros1, encode, encode_ros1, header, make
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
@@ -82,7 +82,7 @@ def test_what_the_gate_lets_through_is_what_the_low_level_takes(
     y: float, z: float, steering: int, velocity: int
 ) -> None:
     authors, _, heard = ends()
-    message = empty(SVEA.topics[Role.MANUAL].type)
+    message = make(SVEA.topics[Role.MANUAL].type)
     message.y, message.z, message.aux3 = y, z, 1000.0
     authors.publish(SVEA.topic_of("svea1", Role.MANUAL), encode(message))
     sent = {arrival.topic: arrival.payload for arrival in heard}["agent7/lli/ctrl_request"]
@@ -93,7 +93,7 @@ def test_what_the_gate_lets_through_is_what_the_low_level_takes(
 def test_commands_reach_the_low_level_only_through_the_gate() -> None:
     authors, _, heard = ends()
     topic = SVEA.topic_of("svea1", Role.COMMAND)
-    authors.publish(topic, encode(empty(SVEA.topics[Role.COMMAND].type)), b"signed")
+    authors.publish(topic, encode(make(SVEA.topics[Role.COMMAND].type)), b"signed")
     assert [(arrival.topic, arrival.attachment) for arrival in heard] == [(topic, b"signed")]
 
 
@@ -109,7 +109,7 @@ NAMES = {
 
 def filled(kind: str, draw: Any) -> Any:
     """Return a message of a type full of numbers."""
-    message = empty(kind)
+    message = make(kind)
 
     def fill(part: Any) -> None:
         for name, value in vars(part).items():
@@ -147,7 +147,7 @@ def test_exact_counterparts_come_back_as_the_bytes_they_were(data: st.DataObject
 
 
 def test_matrices_of_a_camera_keep_their_values() -> None:
-    info = empty("sensor_msgs/msg/CameraInfo")
+    info = make("sensor_msgs/msg/CameraInfo")
     info.k[:], info.d = np.arange(9.0), np.arange(5.0)
     told = to_ros1(info)
     np.testing.assert_array_equal(told.K, np.arange(9.0))

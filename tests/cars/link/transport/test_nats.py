@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.codec import empty, encode
+from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import nats
@@ -160,7 +160,7 @@ def test_a_deployment_reaches_cars_over_the_authors_wire(tmp_path: Path) -> None
         car, station = open_transport(fleet), open_transport(fleet)
         heard: list[Arrival] = []
         station.subscribe("fleet/svea1/**", heard.append)
-        sent = encode(empty(SVEA.topics[Role.BEARINGS].type))
+        sent = encode(make(SVEA.topics[Role.BEARINGS].type))
         car.publish(bearings, sent, b"signed")
         car.publish(gate, b"status", reliable=True)
         wait_until(lambda: len(heard) == 2)
