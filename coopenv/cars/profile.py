@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -72,19 +73,9 @@ def inside(corners: Sequence[Point], x: float, y: float) -> bool:
 
 def is_simple(corners: Sequence[Point]) -> bool:
     """Return whether corners enclose something, and no two edges of theirs cross or touch beyond a common corner."""
-    edges = _edges(corners)
-    if len(edges) < 3 or any(a == b for a, b in edges):
+    if len(corners) < 3 or len(set(corners)) < len(corners):
         return False
-    for i, (a, b) in enumerate(edges):
-        for j in range(i + 1, len(edges)):
-            c, d = edges[j]
-            if j == i + 1 and not _turns_back(a, b, d):
-                continue
-            if i == 0 and j == len(edges) - 1 and not _turns_back(c, d, b):
-                continue
-            if _meet(a, b, c, d):
-                return False
-    return True
+    return not any(_meet(*first, *second) for first, second in combinations(_edges(corners), 2))
 
 
 def _edges(corners: Sequence[Point]) -> list[tuple[Point, Point]]:
@@ -96,22 +87,16 @@ def _side(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def _turns_back(a: Point, b: Point, c: Point) -> bool:
-    """Return whether the way a-b-c goes back over itself."""
-    along = (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1])
-    return _side(a, b, c) == 0.0 and along < 0.0
-
-
 def _meet(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Return whether two segments have a point in common."""
+    """Return whether two segments have a point in common that is no common end."""
     if _side(a, b, c) * _side(a, b, d) < 0.0 and _side(c, d, a) * _side(c, d, b) < 0.0:
         return True
     return any(_on(p, q, r) for p, q, r in ((a, b, c), (a, b, d), (c, d, a), (c, d, b)))
 
 
 def _on(a: Point, b: Point, c: Point) -> bool:
-    """Return whether c is on the segment a-b."""
-    if _side(a, b, c) != 0.0:
+    """Return whether c is on the segment a-b and none of its ends."""
+    if _side(a, b, c) != 0.0 or c in (a, b):
         return False
     return min(a[0], b[0]) <= c[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= c[1] <= max(a[1], b[1])
 

@@ -15,8 +15,7 @@ from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, load_deployment
-from coopenv.cars.gate.codec import read_drive
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, USUAL, CarProfile, Drive, Role, load_profile
 from coopenv.cars.transport.base import Arrival, Hub

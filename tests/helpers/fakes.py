@@ -9,8 +9,7 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.gate.codec import write_drive
-from coopenv.cars.gate.core import GateClock
+from coopenv.cars.gate.core import GateClock, write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Drive, Role
 from coopenv.cars.transport.base import Arrival, Hub
 from coopenv.scenario import Scenario, load_scenario

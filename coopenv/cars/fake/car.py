@@ -16,8 +16,7 @@ from coopenv.cars.deployment import Deployment
 from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
-from coopenv.cars.gate.codec import Malformed, read_drive
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, Malformed, read_drive
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import RESET_TOPIC, Role, presence_of

@@ -1,4 +1,4 @@
-"""The decisions of the gate, without threads, clocks or a network of its own.
+"""The decisions of the gate, without threads, clocks or a network of its own, and its few messages as CDR.
 
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
 new one after every start, arming, disarming and stop, so that an arming counts once, and only if its sender knew of
@@ -15,22 +15,148 @@ is a car that stands. Its `false` does nothing.
 
 import math
 import secrets
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
-from coopenv.cars.gate.codec import (
-    DriveCommand,
-    GateStatus,
-    Malformed,
-    read_arm,
-    read_bool,
-    read_command,
-    write_drive,
-    write_status,
-)
+from coopenv.base.errors import CoopenvError
 from coopenv.cars.keys import Verifier, is_identity
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Drive, Limits, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Drive, Limits, Role
+
+ENCAPSULATION = b"\0\1\0\0"
+LONGEST_PADDING = 3  # bytes after the last field, which some writers add
+STAMP, TEXT = "S", "T"  # ns; UTF-8
+KINDS = {
+    **{"bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
+    **{"int32": "i", "uint32": "I", "float32": "f", "float64": "d"},
+}
+"""Kinds of the module struct by type of ROS."""
+
+
+class Malformed(CoopenvError):  # noqa: N818
+    """Bytes are not the message that they should be."""
+
+
+def read(payload: bytes, fields: Iterable[str]) -> list[Any]:
+    """Return the fields of CDR bytes: kinds of the module struct, `STAMP` or `TEXT`. Raises Malformed."""
+    if payload[:2] != ENCAPSULATION[:2] or len(payload) < len(ENCAPSULATION):
+        raise Malformed("no little-endian CDR")
+    body, place, found = payload[len(ENCAPSULATION) :], 0, list[Any]()
+
+    def number(kind: str) -> Any:
+        nonlocal place
+        size = struct.calcsize(kind)
+        start = -(-place // size) * size
+        place = start + size
+        if place > len(body):
+            raise Malformed("too short")
+        return struct.unpack_from(f"<{kind}", body, start)[0]
+
+    for field in fields:
+        if field == STAMP:
+            seconds, nanoseconds = number("i"), number("I")
+            if nanoseconds >= 10**9:
+                raise Malformed("a stamp has more than a second of nanoseconds")
+            found.append(seconds * 10**9 + nanoseconds)
+        elif field == TEXT:  # its length with the zero byte at its end, its bytes, the zero byte
+            length = number("I")
+            raw = body[place : place + length]
+            place += length
+            if len(raw) != length or raw[-1:] != b"\0":
+                raise Malformed("a text has no end")
+            try:
+                found.append(raw[:-1].decode())
+            except UnicodeDecodeError:
+                raise Malformed("a text is not UTF-8") from None
+        else:
+            found.append(number(field))
+    if len(body) - place > LONGEST_PADDING:
+        raise Malformed("too long")
+    return found
+
+
+def write(fields: Iterable[str], *values: Any) -> bytes:
+    """Return the CDR bytes of values; fields as for `read`."""
+    body = bytearray()
+
+    def put(kind: str, value: float) -> None:
+        body.extend(bytes(-len(body) % struct.calcsize(kind)) + struct.pack(f"<{kind}", value))
+
+    for field, value in zip(fields, values, strict=True):
+        if field == STAMP:
+            for kind, part in zip("iI", divmod(value, 10**9), strict=True):
+                put(kind, part)
+        elif field == TEXT:
+            raw = value.encode() + b"\0"
+            put("I", len(raw))
+            body.extend(raw)
+        else:
+            put(field, value)
+    return ENCAPSULATION + bytes(body)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveCommand:
+    """ackermann_msgs/AckermannDriveStamped."""
+
+    stamp: int  # ns
+    frame: str
+    steering: float  # rad
+    steering_rate: float  # rad/s
+    speed: float  # m/s
+    acceleration: float  # m/s^2
+    jerk: float  # m/s^3
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """coopenv_msgs/Arm."""
+
+    stamp: int  # ns
+    frame: str
+    session: str
+    nonce: str
+    armed: bool
+
+
+def read_command(payload: bytes) -> DriveCommand:
+    """Return a command; may hold numbers that are not finite. Raises Malformed: the bytes are none."""
+    return DriveCommand(*read(payload, (STAMP, TEXT, *"fffff")))
+
+
+def read_arm(payload: bytes) -> Arm:
+    """Return a message that arms or disarms. Raises Malformed: the bytes are none."""
+    return Arm(*read(payload, (STAMP, TEXT, TEXT, TEXT, "?")))
+
+
+def read_bool(payload: bytes) -> bool:
+    """Return a std_msgs/Bool. Raises Malformed: the bytes are none."""
+    return bool(read(payload, "?")[0])
+
+
+def write_drive(stamp: int, message: CommandMessage, drive: Drive) -> bytes:
+    """Return the message from the gate to the car for a finite command, with a stamp in ns."""
+    kinds, values = [kind for kind, _ in message.neutral.values()], message.values(drive).values()
+    numbers = [v if kind.startswith("float") else int(v) for kind, v in zip(kinds, values, strict=True)]
+    return write((STAMP, TEXT, *(KINDS[kind] for kind in kinds)), stamp, "", *numbers)
+
+
+def read_drive(payload: bytes, message: CommandMessage) -> Drive:
+    """Return the command in a message from a gate to its car. Raises Malformed: the bytes are none."""
+    kinds = [KINDS[kind] for kind, _ in message.neutral.values()]
+    _, _, *values = read(payload, (STAMP, TEXT, *kinds))
+    return message.drive(dict(zip(message.neutral, values, strict=True)))
+
+
+def write_status(
+    stamp: int, session: str, nonce: str, state: str, accepted: int, last_sequence: int, rejections: Mapping[str, int]
+) -> bytes:
+    """Return a coopenv_msgs/GateStatus; rejections are counts by reason."""
+    n, counts = len(rejections), rejections.values()
+    fields = (STAMP, *[TEXT] * 4, *"QQ", "I", *[TEXT] * n, "I", *"Q" * n)
+    return write(fields, stamp, "", session, nonce, state, accepted, last_sequence, n, *rejections, n, *counts)
 
 
 class GateMode(StrEnum):
@@ -166,7 +292,7 @@ class Gate:
         state = self.state
         session = self._session if state in (GateMode.ARMED, GateMode.TIMED_OUT) else ""
         last, counts = max(self._sequence, 0), {str(reason): count for reason, count in self._counts.items()}
-        return write_status(GateStatus(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts))
+        return write_status(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts)
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
         command = read_command(payload)

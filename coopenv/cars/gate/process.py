@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.cars.gate.codec import write_bool
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, write
 from coopenv.cars.keys import (
     LONGEST_IDENTITY,
     Signer,
@@ -85,7 +84,7 @@ class GateConnection:
         signature = b"" if self._signer is None else self._signer.sign(self._topics[Role.GATE], status)
         self._send(Role.GATE, status, signature)
         if state is GateMode.STOPPED:
-            self._send(Role.STOP, write_bool(True), self._own)
+            self._send(Role.STOP, write("?", True), self._own)
 
     def neutral(self) -> bytes:
         """Close the gate for good and send the car a neutral command, which is returned."""

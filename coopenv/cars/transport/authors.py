@@ -16,7 +16,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, decode_ros1, encode, encode_ros1, make, ros1, ros2
 from coopenv.cars.deployment import Car, DeploymentError
-from coopenv.cars.gate.codec import read_drive
+from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import SVEA, CarProfile, CommandMessage, Drive, Role
 from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, ros2
-from coopenv.cars.gate.codec import read_drive, write_drive
+from coopenv.cars.gate.core import read_drive, write_drive
 from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Limits, Role
 from coopenv.cars.transport.authors import low_level
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.cars.codec import decode
-from coopenv.cars.gate.codec import read_drive
+from coopenv.cars.gate.core import read_drive
 from coopenv.cars.keys import Signer
 from coopenv.cars.profile import SVEA, Drive, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, encode, header, make
-from coopenv.cars.gate.codec import (
-    GateStatus,
+from coopenv.cars.gate.core import (
     Malformed,
     read_arm,
     read_bool,
     read_command,
-    write_bool,
+    write,
     write_drive,
     write_status,
 )
@@ -48,7 +47,7 @@ def test_armings_are_read_as_they_were_written(stamp: int, frame: str, session: 
 
 @pytest.mark.parametrize("value", [True, False])
 def test_stops_are_those_of_rosbags(value: bool) -> None:
-    assert write_bool(value) == stop(value)
+    assert write("?", value) == stop(value)
     assert read_bool(stop(value)) is value
 
 
@@ -73,7 +72,7 @@ def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], but
 def test_the_status_is_that_of_rosbags(
     stamp: int, session: str, nonce: str, state: str, accepted: int, last: int, counts: dict[str, int]
 ) -> None:
-    payload = write_status(GateStatus(stamp, session, nonce, state, accepted, last, counts))
+    payload = write_status(stamp, session, nonce, state, accepted, last, counts)
     fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
     fields |= {"accepted": accepted, "last_sequence": last}
     fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}
