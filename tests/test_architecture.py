@@ -90,7 +90,7 @@ LINES_AND_FILES = {
     "backends": (3320, 17),
     "base": (1371, 8),
     "bench": (4730, 20),
-    "cars": (8570, 40),
+    "cars": (7815, 35),
     "cli": (2100, 7),
     "estimation": (1811, 11),
     "evaluation": (450, 3),
