@@ -61,7 +61,7 @@ def links_report(backend: Svea, out: Console) -> None:
         refused = str(sum(backend.intake.rejected[notes["name"]].values()))
         table.add_row(notes["name"], notes["gate"], offset, refused, str(sum(notes["gate_rejections"].values())))
     out.print(table)
-    late = 1e3 * backend.lateness(0.99)
+    late = 1e3 * backend.pacer.late(0.99)
     out.print(
         f"{health.received} messages, {health.ticks} ticks, {health.missed} missed deadlines, "
         f"wake-up lateness p99 {late:.2f} ms",
@@ -256,7 +256,7 @@ class Demo:
         decisions = -(-run.ticks_recorded // run.scenario.ticks_per_decision)
         self.decisions += decisions
         self.missed += backend.link.missed if known else decisions
-        self.delays.extend(backend.delays)
+        self.delays.extend(backend.pacer.lateness)
 
     def _simulate(self, scenario: Scenario, episodes: int, log: Console) -> list[Rows]:
         """Return the figures of the same seeds under the same policy in the simulation."""

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.binding import Binding
-from coopenv.cars.backend.neighbours import NeighbourInbox
+from coopenv.cars.backend.binding import Binding, NeighbourInbox
 from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors

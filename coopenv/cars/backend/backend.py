@@ -13,18 +13,24 @@ import numpy as np
 from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
-from coopenv.cars.backend.assembler import BROADCAST, Assembler, Intake
-from coopenv.cars.backend.binding import Binding, bind, reset_options
+from coopenv.cars.backend.assembler import Assembler
+from coopenv.cars.backend.binding import (
+    Binding,
+    bind,
+    estimate_message,
+    is_finite,
+    report_message,
+    reset_options,
+)
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
-from coopenv.cars.backend.neighbours import estimate_message, is_finite, report_message
-from coopenv.cars.backend.start import ROLES, Fleet, Start, StatusBoard
-from coopenv.cars.backend.station import Gates, Pacer, Station
-from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog
+from coopenv.cars.backend.start import ROLES, Links
+from coopenv.cars.backend.station import Pacer
+from coopenv.cars.backend.watchdog import Trip
 from coopenv.cars.codec import encode, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
-from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
+from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.zenoh import open_transport
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, load_scenario
@@ -42,7 +48,7 @@ class LinkHealth(Health):
     refused: dict[str, int] = field(default_factory=dict)  # samples that were not used, by reason
 
 
-class Svea:
+class Svea(Links):
     """Cars as a source of ticks.
 
     `reset(options={"arm": True})` lets them drive; without it everything happens but that commands are sent. An episode
@@ -68,11 +74,7 @@ class Svea:
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
         """
-        self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self._signer = transport, signer
         self.recorder = recorder
-        names = binding.names
-        self._local = {names[i]: i for i in binding.local}
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
@@ -83,55 +85,19 @@ class Svea:
         )
         self.link = LinkHealth()
         self.health: Health = self.link
-        self.intake = Intake(binding, deployment.sensors)
-        own = deployment.security.identity
-        fleet_names = (*binding.cars, *binding.leaders)
-        signers = {binding.profile.topic_of(name, role): (name, own) for name in fleet_names for role in BROADCAST}
-        self.station = Station(transport, self.intake.topics, verifier, signers)
-        self.gates = Gates(transport, tuple(self._local), deployment.limits, signer, verifier, binding.profile)
-        self.board = StatusBoard(
-            transport, tuple(self._local), deployment.remote, deployment.conditions, binding.profile
-        )
-        rates = self.scenario.rates
-        self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
+        self.pacer = Pacer(1.0 / binding.scenario.rates.camera, binding.scenario.ticks_per_decision)
         self._assembler = Assembler(binding)
-        self._origin = np.array(self.scenario.map.origin)
-        safety, self.monitor = deployment.safety, LinkMonitor(deployment.safety.judge)
-        self._odometry = VELOCITY[deployment.sensors.odometry]
-        self._others = tuple(name for name in fleet_names if name not in self._local)
-        self.watchdog = Watchdog(
-            safety,
-            self.station,
-            self.gates,
-            self.monitor,
-            tuple(self._local),
-            self._others,
-            self._odometry,
-            1.0 / rates.decision,
-            binding.profile,
-        )
-        calibrations = {name: self.intake.calibrations[name] for name in self._local}
-        fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.monitor, self._others)
-        self._start = Start(fleet, transport, self.gates, self.watchdog, self._odometry, self._drain)
-        transport.watch(presence_of("*"), self._presence)
-        self.watchdog.happened = self.board.happened
-        self.watchdog.on_stop = self._write_down
+        self._origin = np.array(binding.scenario.map.origin)
         self._armed, self._began, self._index = False, 0, 0
         self._key, self._episode = 0, 0
-        self._presented = presence_of(deployment.security.identity)
-        transport.announce(self._presented)
         self._closed = threading.Lock()
+        super().__init__(deployment, binding, transport, signer, verifier, self._write_down)
         warm_up(binding.profile)
-
-    def _presence(self, key: str, there: bool) -> None:
-        name = key.rsplit("/", 1)[-1]
-        if name in self._local:
-            self.watchdog.set_present(name, there)
 
     @property
     def clock(self) -> float:
         """Time since the reset, s."""
-        return (self._pacer.now() - self._began) * 1e-9 if self._began else 0.0
+        return (self.pacer.now() - self._began) * 1e-9 if self._began else 0.0
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
         """Begin an episode; cars move only with the option `arm`.
@@ -140,16 +106,16 @@ class Svea:
             CoopenvError: an option is not known, or a condition of arming does not hold.
         """
         self.stop("reset")
-        given = reset_options(options)
-        self._start.prepare(0 if seed is None else seed)
-        self.monitor.begin(self._pacer.now())
-        self._start.listen(given.arm)
+        arm, release = reset_options(options)
+        self.prepare(0 if seed is None else seed)
+        self.monitor.begin(self.pacer.now())
+        self.listen(arm)
         self.station.dropped.clear()
-        if given.arm:
-            self._start.arm(given.release)
+        if arm:
+            self.arm(release)
             self._armed = True
-        self._drain()
-        self._began, self._index = self._pacer.start(), 0
+        self.drain()
+        self._began, self._index = self.pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
         if self.recorder is not None:
             self.recorder.begin(self._began, self._key % 2**64, self._episode)
@@ -157,9 +123,9 @@ class Svea:
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
-        self._pacer.decide()
-        self.link.missed = self._pacer.missed
-        self.watchdog.beat(self._pacer.in_a_row)
+        self.pacer.decide()
+        self.link.missed = self.pacer.missed
+        self.watchdog.beat(self.pacer.in_a_row)
         if self._armed:
             self.gates.next()
             for name, i in self._local.items():
@@ -169,26 +135,24 @@ class Svea:
             if self._armed and self.watchdog.trip is not None:
                 self._armed = False
                 return
-            now = self._pacer.wait()
-            self._drain()
+            now = self.pacer.wait()
+            self.drain()
             self._index += 1
             if self.recorder is not None:
                 self.recorder.tick(self._index, now)
             yield self._counted(self._assembler.tick(self._index, now))
 
-    def _drain(self) -> None:
+    def drain(self) -> None:
+        """Take the messages that have come."""
         arrivals = self.station.drain()
         self.health.received += len(arrivals)
         for arrival in arrivals:
-            self._take(arrival)
-        self.monitor.looked = self._pacer.now()
-
-    def _take(self, arrival: Arrival) -> None:
-        if self.recorder is not None:
-            self.recorder.write(arrival.topic, arrival.payload, arrival.received)
-        for sample in self.intake.samples(arrival):
-            self._assembler.put(sample)
-            self.monitor.put(sample)
+            if self.recorder is not None:
+                self.recorder.write(arrival.topic, arrival.payload, arrival.received)
+            for sample in self.intake.samples(arrival):
+                self._assembler.put(sample)
+                self.monitor.put(sample)
+        self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
         local = list(self.binding.local)
@@ -235,22 +199,13 @@ class Svea:
             "gate_rejections": {} if gate is None else self.gates.refused(name),
             "rejections": dict(self.link.refused),
             "missed_deadlines": self.link.missed,
-            "lateness": self._pacer.lateness[-1] if self._pacer.lateness else 0.0,
+            "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,
             "clock_offset": float("nan") if offset is None else offset,
         }
 
-    @property
-    def delays(self) -> tuple[float, ...]:
-        """By how much each tick of this episode came after its time, s."""
-        return tuple(self._pacer.lateness)
-
-    def lateness(self, share: float) -> float:
-        """Return by how much at most that share of the ticks came after their time, s."""
-        return self._pacer.late(share)
-
     def _write_down(self, trip: Trip) -> None:
         if self.recorder is not None:
-            self.recorder.stopped(trip.reason, trip.car or "", self._pacer.now())
+            self.recorder.stopped(trip.reason, trip.car or "", self.pacer.now())
 
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""

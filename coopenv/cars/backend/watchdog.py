@@ -147,6 +147,8 @@ class Watchdog:
         odometry: Collection[Role],
         decision: float,
         profile: CarProfile = SVEA,
+        happened: Callable[[str], str] = lambda car: "",
+        stopped: Callable[[Trip], None] = lambda trip: None,
     ) -> None:
         """Begin to look.
 
@@ -158,21 +160,20 @@ class Watchdog:
             cars: those that are driven here.
             others: the other ones of the fleet.
             odometry: what each car has to measure.
-            profile: make of the cars.
             decision: s between decisions.
+            profile: make of the cars.
+            happened: returns the reason to stop a car by its own conditions; empty: none.
+            stopped: called when the cars are stopped.
         """
         self._safety, self._station, self._gates, self._monitor = safety, station, gates, monitor
         self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
-        self._profile = profile
+        self._profile, self._happened, self._stopped = profile, happened, stopped
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
-        self.on_stop: Callable[[Trip], None] = lambda trip: None
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
         self._present: dict[str, bool] = {}
-        self.happened: Callable[[str], str] = lambda car: ""
-        """Returns the reason to stop a car by its own conditions; empty: none."""
         self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
         self._thread.start()
 
@@ -210,7 +211,7 @@ class Watchdog:
             self.trip = trip = Trip(reason, car, time.monotonic())
         try:
             self._gates.stop()
-            self.on_stop(trip)
+            self._stopped(trip)
         finally:
             self._gates.end()
 
@@ -274,5 +275,5 @@ class Watchdog:
                 yield Trip(f"{car}: no usable new message on {topic} for {age:.2f} s", car)
         if self._present.get(car) is False:
             yield Trip(f"{car}: is gone", car)
-        if why := self.happened(car):
+        if why := self._happened(car):
             yield Trip(f"{car}: {why}", car)

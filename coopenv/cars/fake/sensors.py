@@ -131,8 +131,8 @@ class Pixy:
         blocks = []
         for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
             number, near = self._markers[agent], MARKER / max(self._world.distance(agent), MARKER)
-            sides = [max(1, round(f * near)) for f in c.focal_length]
-            blocks.append(_block(number, x, y, *sides, index=number - 1, age=self._ages[agent]))
+            width, height = (max(1, round(f * near)) for f in c.focal_length)
+            blocks.append(_block(number, x, y, width, height, number - 1, self._ages[agent]))
         return blocks
 
     def _with_faults(self, blocks: list[Any], now: int) -> list[Any]:
@@ -142,16 +142,12 @@ class Pixy:
             blocks = [replace(b, signature=n) for b, n in zip(blocks, reversed(numbers), strict=True)]
         if share := faults.value("duplicate_blocks", now):
             doubled = [block for block in blocks if rng.random() < share]
-            blocks = blocks + [
-                replace(
-                    b,
-                    center_x=min(b.center_x + 3, width - 1),
-                    width=max(1, b.width // 2),
-                    height=max(1, b.height // 2),
-                    age=1,
+            for b in doubled:
+                x, sides = (
+                    min(b.center_x + 3, width - 1),
+                    {"width": max(1, b.width // 2), "height": max(1, b.height // 2)},
                 )
-                for b in doubled
-            ]
+                blocks = [*blocks, replace(b, center_x=x, **sides, age=1)]
         if rate := faults.value("false_blocks", now):
             for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
                 x, y = int(rng.integers(width)), int(rng.integers(height))

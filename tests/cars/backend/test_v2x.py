@@ -9,7 +9,7 @@ import pytest
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.cars.backend.assembler import Assembler
-from coopenv.cars.backend.neighbours import estimate_message, report_message
+from coopenv.cars.backend.binding import estimate_message, report_message
 from coopenv.cars.codec import decode, encode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
