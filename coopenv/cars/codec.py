@@ -255,11 +255,7 @@ def quaternion(rotation: Any) -> list[float]:
     return [x, y, z, w]
 
 
-@cache
-def _warm_up(types: frozenset[str]) -> None:
-    store = ros2()
-    for kind in types:
-        store.deserialize_cdr(store.serialize_cdr(make(kind), kind), kind)
+_warm: set[str] = set()
 
 
 def warm_up(profile: CarProfile = SVEA) -> None:
@@ -271,4 +267,6 @@ def warm_up(profile: CarProfile = SVEA) -> None:
     for role, topic in profile.topics.items():
         if topic.type not in ros2().types:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type} is not known")
-    _warm_up(frozenset(topic.type for topic in profile.topics.values()))
+        if topic.type not in _warm:
+            decode(encode(make(topic.type)), topic.type)
+            _warm.add(topic.type)

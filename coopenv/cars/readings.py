@@ -1,8 +1,10 @@
 """Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2; rays of a camera's pixels."""
 
+import math
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +12,126 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.profile import CarProfile, Role
-from coopenv.cars.samples import (
-    Array,
-    Calibration,
-    CarPose,
-    CarStatus,
-    Detections,
-    RobustReport,
-    Twist,
-    Value,
-    covariance_of,
-    numbers_of,
-    rotation_of,
-    rotation_vector_of,
-    vector,
-)
 from coopenv.estimation.lens import undistort
+from coopenv.estimation.poses import Array, log_so3
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """A frame of a camera; at most one detection per marker."""
+
+    markers: tuple[int, ...]  # m numbers of markers (colour signatures)
+    bearings: Array  # (m, 3) unit vectors camera -> target, optical frame, without the lens's distortion
+    dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """A body's velocity, base_link; None: the sensor does not measure it."""
+
+    linear: Array | None  # (3,) m/s
+    angular: Array | None  # (3,) rad/s
+
+
+@dataclass(frozen=True, slots=True)
+class CarPose:
+    """A pose of base_link in the map."""
+
+    position: Array  # (3,) m
+    rotation: Array | None = None  # (3, 3) body to map
+    covariance: Array | None = None  # (6, 6) position then rotation about the map's axes, as ROS has it
+
+
+@dataclass(frozen=True, slots=True)
+class RobustReport:
+    """Report of the observer `robust`, see `coopenv.observers.robust.messages`."""
+
+    position: Array | None  # None: the sender has no position
+    rotation: Array | None
+    covariance: Array | None
+    extra: dict[str, NDArray[np.float64] | NDArray[np.uint64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Intrinsics of a camera: plumb-bob model."""
+
+    image_size: tuple[int, int]
+    focal_length: tuple[float, float]
+    principal_point: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+
+    @classmethod
+    def of(cls, camera: Any) -> Self:
+        """Return the intrinsics of a camera of the scenario."""
+        return cls(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
+
+
+@dataclass(frozen=True, slots=True)
+class CarStatus:
+    """Condition of a car."""
+
+    armed: bool | None = None
+    mode: str | None = None  # of the autopilot
+    pulses: tuple[int, ...] | None = None  # us, of the remote control's channels; empty: it has no signal
+    battery: float | None = None  # share that is left
+
+
+Value = Detections | Twist | CarPose | RobustReport | Calibration | CarStatus
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Value of one message."""
+
+    car: str
+    role: Role
+    stamp: int  # ns, clock of the sender
+    received: int  # ns, clock of the receiver
+    value: Value
+
+
+def vector(value: Any, field: str, most: float) -> Array:
+    """Return x, y, z as (3,), none of them larger than `most`."""
+    return numbers_of((value.x, value.y, value.z), field, most)
+
+
+def numbers_of(values: Any, field: str, most: float) -> Array:
+    """Return numbers as an array. Raises CoopenvError: one is not finite, or larger than `most`."""
+    numbers = np.array(values, dtype=np.float64)
+    if not (np.abs(numbers) <= most).all():
+        raise CoopenvError(f"{field}: {shown(numbers.tolist())} is not finite, or beyond {most:g}")
+    return numbers
+
+
+def covariance_of(values: Any, field: str) -> Array:
+    """Return (6, 6) numbers whose diagonal is not negative and that are symmetric."""
+    matrix = numbers_of(values, field, 1e12).reshape(6, 6)
+    if not matrix.any():  # often: not known
+        return matrix
+    if (matrix.diagonal() < 0.0).any() or (np.abs(matrix - matrix.T) > 1e-9 + 1e-6 * np.abs(matrix.T)).any():
+        raise CoopenvError(f"{field}: is no covariance (symmetric, no negative variance)")
+    return matrix
+
+
+UNIT = 1e-3
+"""How far from 1 the length of a quaternion or a bearing may be: single precision and rounded decimals are nearer."""
+
+
+def rotation_of(quaternion: Any, field: str) -> Array:
+    """Return the rotation matrix (3, 3) of a message's quaternion. Raises CoopenvError: its length is not 1."""
+    w, x, y, z = (float(getattr(quaternion, part)) for part in "wxyz")
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not abs(length - 1.0) <= UNIT:
+        raise CoopenvError(f"{field}: no unit quaternion, its length is {length:.6g}")
+    w, x, y, z = w / length, x / length, y / length, z / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
@@ -44,7 +150,8 @@ def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.boo
     )
     inside = ((pixels >= 0.0) & (pixels < size)).all(axis=-1)
     flat, there = undistort((pixels - centre) / focal, calibration.distortion)
-    return directions(flat), inside & there
+    through = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
+    return through / np.linalg.norm(through, axis=-1, keepdims=True), inside & there
 
 
 @lru_cache(maxsize=2**17)
@@ -55,18 +162,8 @@ def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, floa
     return (x, y, z) if there[0] else None
 
 
-def directions(points: Array) -> Array:
-    """Return the unit vectors (m, 3) through normalised image points (m, 2)."""
-    through = np.concatenate([points, np.ones((len(points), 1))], axis=-1)
-    unit: Array = through / np.linalg.norm(through, axis=-1, keepdims=True)
-    return unit
-
-
 MOST = 1000
 """Blocks of a frame."""
-
-UNIT = 1e-3
-"""How far from 1 the length of a bearing may be."""
 
 
 def detections(message: Any, calibration: Calibration, known: Collection[int] | None) -> Detections:
@@ -203,19 +300,14 @@ def read(
     if kind not in readers:
         raise CoopenvError(f"{role}: type {shown(kind)} is none of {listed(list(readers)) or 'those that are read'}")
     try:
-        if role is Role.DETECTIONS:
-            return detections(message, _needed(calibration), known)
-        if role is Role.BEARINGS:
-            return bearings(message, _needed(calibration) if distorted else None, known)
-        return readers[kind](message)
+        if role not in (Role.DETECTIONS, Role.BEARINGS):
+            return readers[kind](message)
+        needed = role is Role.DETECTIONS or distorted
+        if needed and calibration is None:
+            raise CoopenvError("the camera's calibration is not known")
+        return readers[kind](message, calibration if needed else None, known)
     except CoopenvError as error:
         raise CoopenvError(f"{role}: {error}") from None
-
-
-def _needed(calibration: Calibration | None) -> Calibration:
-    if calibration is None:
-        raise CoopenvError("the camera's calibration is not known")
-    return calibration
 
 
 def _twist(message: Any) -> Twist:
@@ -224,15 +316,6 @@ def _twist(message: Any) -> Twist:
     linear, angular = _velocities(with_covariance.twist)
     variances = np.asarray(with_covariance.covariance, dtype=np.float64).reshape(6, 6).diagonal()
     return Twist(None if variances[0] < 0.0 else linear, None if variances[5] < 0.0 else angular)
-
-
-def _plain_twist(message: Any) -> Twist:
-    return Twist(*_velocities(message.twist))
-
-
-def _own_odometry(message: Any) -> Twist:
-    """Return the twist of an Odometry, which is in the child frame."""
-    return Twist(*_velocities(message.twist.twist))
 
 
 def _velocities(twist: Any) -> tuple[Array, Array]:
@@ -246,10 +329,6 @@ def _turning(message: Any) -> Twist:
     return Twist(None, vector(message.angular_velocity, "angular_velocity", SPINNING))
 
 
-def _pose(message: Any) -> CarPose:
-    return _placed(message.pose)
-
-
 def _pose_with_covariance(message: Any) -> CarPose:
     """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros means unknown."""
     pose = _placed(message.pose.pose)
@@ -261,17 +340,13 @@ def _placed(pose: Any) -> CarPose:
     return CarPose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
-def _point(message: Any) -> CarPose:
-    return CarPose(vector(message.point, "point", FARTHEST))
-
-
 def _report(message: Any) -> RobustReport:
     """Return what `robust` sent; `extra` as its messages have it."""
     if not message.valid:
         return RobustReport(None, None, None, {})
     pose, odometry = _placed(message.pose), message.odometry
     moved = vector(odometry.position, "odometry.position", FARTHEST)
-    turned = rotation_vector_of(odometry.orientation, "odometry.orientation")
+    turned = log_so3(rotation_of(odometry.orientation, "odometry.orientation"))
     extra: dict[str, Any] = {
         "odometry": np.concatenate([turned, moved]),
         "depends_on": np.array([message.depends_on], dtype=np.uint64),
@@ -283,14 +358,14 @@ def _report(message: Any) -> RobustReport:
 
 
 POSES: dict[str, Callable[[Any], Value]] = {
-    "geometry_msgs/msg/PoseStamped": _pose,
+    "geometry_msgs/msg/PoseStamped": lambda message: _placed(message.pose),
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_with_covariance,
     "nav_msgs/msg/Odometry": _pose_with_covariance,
 }
 TWISTS: dict[str, Callable[[Any], Value]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
-    "geometry_msgs/msg/TwistStamped": _plain_twist,
-    "nav_msgs/msg/Odometry": _own_odometry,
+    "geometry_msgs/msg/TwistStamped": lambda message: Twist(*_velocities(message.twist)),
+    "nav_msgs/msg/Odometry": lambda message: Twist(*_velocities(message.twist.twist)),  # in the child frame
 }
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.DETECTIONS: {"pixy_camera/msg/ObjectInfoArrayStamped": detections},
@@ -300,7 +375,7 @@ READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.WHEEL: TWISTS,
     Role.IMU: {"sensor_msgs/msg/Imu": _turning},
     Role.ESTIMATE: POSES,
-    Role.POINT: {"geometry_msgs/msg/PointStamped": _point},
+    Role.POINT: {"geometry_msgs/msg/PointStamped": lambda message: CarPose(vector(message.point, "point", FARTHEST))},
     Role.REPORT: {"coopenv_msgs/msg/RobustReport": _report},
     Role.TRUTH: POSES,
     Role.STATE: {"mavros_msgs/msg/State": state_of},

@@ -18,8 +18,9 @@ from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, USUAL, CarProfile, Drive, Role, load_profile
-from coopenv.cars.transport.base import Arrival, Hub
+from coopenv.cars.transport.base import Arrival
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
+from tests.helpers.hub import Hub
 
 ROVER = Path(__file__).parent / "rover.toml"
 FLEET = f"""

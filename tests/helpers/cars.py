@@ -12,8 +12,9 @@ from coopenv.cars.backend.backend import Svea, open_svea
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import Fake, fault_topic
-from coopenv.cars.fake.fleet import open_fake, run
-from coopenv.cars.transport.base import Hub
+from coopenv.cars.fake.fleet import prepare_fake, run
+from coopenv.cars.transport.base import Transport
+from tests.helpers.hub import Hub
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow
@@ -42,6 +43,11 @@ def write_fleet(folder: Path, text: str = OVERTAKING, safety: str = PATIENT) -> 
     path = folder / "fleet.toml"
     path.write_text(text + safety)
     return path
+
+
+def open_fake(path: Path, car: str, transport: Transport, station: str | None = None, **options: Any) -> Fake:
+    """Return a fake of a car of a deployment file."""
+    return prepare_fake(path, car, station=station)(transport, **options)
 
 
 @contextmanager

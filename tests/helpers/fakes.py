@@ -11,8 +11,9 @@ from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.gate.core import GateClock, write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Drive, Role
-from coopenv.cars.transport.base import Arrival, Hub
+from coopenv.cars.transport.base import Arrival
 from coopenv.scenario import Scenario, load_scenario
+from tests.helpers.hub import Hub
 
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 OVERTAKING = (Car(name="svea7", marker=7), Car(name="svea8", marker=6))

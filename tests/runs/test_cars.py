@@ -18,12 +18,12 @@ from coopenv.cars.backend.backend import open_svea
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.transport.base import Hub
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
+from tests.helpers.hub import Hub
 
 NEAR = {"vehicles.vehicle_1.goal.radius": 3.7, "horizon": 9.0}
 """The first vehicle arrives after some two seconds, and the other one never."""

@@ -20,8 +20,7 @@ from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import VELOCITY, Role
-from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, CarPose, Detections, RobustReport, Sample, Twist
+from coopenv.cars.readings import Calibration, CarPose, Detections, RobustReport, Sample, Twist, read
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.poses import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
@@ -112,11 +111,7 @@ class Assembler:
             car.moment, car.lag, car.exposed = now - self._period, 0, None
             car.odometer.increment(now - self._period, now - self._period)
         self._inbox.forget()
-        return self._sensed(0, now)
-
-    def tick(self, index: int, now: int) -> Sensed:
-        """Return tick number `index` at a time in ns."""
-        return self._sensed(index, now)
+        return self.tick(0, now)
 
     def moment(self, vehicle: int) -> int:
         """Return the time in ns for which the present tick of a vehicle holds, on the receiver's clock."""
@@ -127,11 +122,8 @@ class Assembler:
         """Return the mean of the moments of the vehicles estimated here: when their frames were exposed."""
         return sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
 
-    def truth(self, vehicle: int, now: int) -> tuple[Array, Array]:
-        """Return the rotation and position of a vehicle by motion capture, NaN where it is not known."""
-        return self._cars[vehicle].track.at(now)
-
-    def _sensed(self, index: int, now: int) -> Sensed:
+    def tick(self, index: int, now: int) -> Sensed:
+        """Return tick number `index` at a time in ns."""
         N, T = len(self._cars), len(self.binding.scenario.target_names)
         rotation, translation = np.tile(np.eye(3), (N, 1, 1)), np.zeros((N, 3))
         velocity, angular_velocity = np.zeros((N, 3)), np.zeros((N, 3))

@@ -118,7 +118,7 @@ class Svea(Links):
         self._began, self._index = self.pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
         if self.recorder is not None:
-            self.recorder.begin(self._began, self._key % 2**64, self._episode)
+            self.recorder.tick(0, self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
 
     def advance(self, command: Command) -> Iterator[Sensed]:

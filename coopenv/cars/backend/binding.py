@@ -13,8 +13,7 @@ from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make, pose
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import check_types
-from coopenv.cars.samples import CarPose, RobustReport
+from coopenv.cars.readings import CarPose, RobustReport, check_types
 from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six

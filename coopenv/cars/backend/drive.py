@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,18 +82,14 @@ class DriveRecorder:
         self._thread = threading.Thread(target=self._write_all, name="coopenv recorder", daemon=True)
         self._thread.start()
 
-    def begin(self, now: int, key: int, episode: int) -> None:
-        """Mark that tick 0 of an episode was made at a time in ns; key and episode fix what was drawn."""
-        self._mark(0, now, key, episode)
-        self.begun = True
+    def tick(self, index: int, now: int, key: int = 0, episode: int = 0) -> None:
+        """Mark that a tick was made at a time in ns of what had come before.
 
-    def tick(self, index: int, now: int) -> None:
-        """Mark that a tick was made at a time in ns of what had come before."""
-        self._mark(index, now, 0, 0)
-
-    def _mark(self, index: int, now: int, key: int, episode: int) -> None:
+        With tick 0 an episode begins; its key and number fix what was drawn.
+        """
         message = make(TICK, header=header(now), index=index, key=key, episode=episode)
         self._queue.put((TICK_TOPIC, encode(message), now))
+        self.begun |= index == 0
 
     def write(self, topic: str, payload: bytes, now: int) -> None:
         """Write a message that came, or went, at a time in ns; of unknown topics none are."""
@@ -177,24 +172,6 @@ def is_drive(path: str | Path) -> bool:
     return NAME in (metadata_names(path) or ())
 
 
-@dataclass(frozen=True)
-class Mark:
-    """That a tick was made, at a time in ns; the key of the draws and the number of the episode count at its start."""
-
-    index: int
-    time: int
-    key: int
-    episode: int
-
-
-@dataclass(frozen=True)
-class Stopped:
-    """That the watchdog stopped the cars."""
-
-    reason: str
-    time: int
-
-
 class Drive(TickGenerator):
     """A drive as a backend: actions change nothing. Every reset goes on to its next episode, and round again.
 
@@ -234,7 +211,7 @@ class Drive(TickGenerator):
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
         self._messages = list(self._read(container))
-        indices = [message.index for message in self._messages if isinstance(message, Mark)]
+        indices = [m.index for m in self._messages if not isinstance(m, Arrival) and m.__msgtype__ == TICK]
         if 0 not in indices:
             raise DataError(nothing)
         if container.cut_off:
@@ -263,7 +240,7 @@ class Drive(TickGenerator):
 
     def _warn(self) -> None:
         """Warn of the time at which the file breaks off."""
-        times = [message.received if isinstance(message, Arrival) else message.time for message in self._messages]
+        times = [m.received if isinstance(m, Arrival) else stamp_of(m) for m in self._messages]
         seconds = (max(times) - min(times)) * 1e-9
         warnings.warn(
             f"{self._where}: {CUT_OFF}: nothing after {seconds:.1f} s is replayed",
@@ -271,16 +248,13 @@ class Drive(TickGenerator):
             stacklevel=3,
         )
 
-    def _read(self, container: "Container") -> Iterator[Arrival | Mark | Stopped]:
+    def _read(self, container: "Container") -> Iterator[Any]:
+        """Yield the arrivals, and decoded marks of ticks and stops among them."""
         try:
             for channel, _, message in container.messages():
                 topic = channel.topic.lstrip("/")
-                if topic == TICK_TOPIC:
-                    mark = decode(message.data, TICK)
-                    yield Mark(int(mark.index), stamp_of(mark), int(mark.key), int(mark.episode))
-                elif topic == STOPPED_TOPIC:
-                    stop = decode(message.data, STOPPED)
-                    yield Stopped(stop.reason, stamp_of(stop))
+                if kind := {TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}.get(topic):
+                    yield decode(message.data, kind)
                 else:
                     yield Arrival(topic, bytes(message.data), message.log_time)
         except CoopenvError as error:
@@ -299,7 +273,7 @@ class Drive(TickGenerator):
                 for sample in intake.samples(message):
                     assembler.put(sample)
                 continue
-            if isinstance(message, Stopped):
+            if message.__msgtype__ == STOPPED:
                 self.stopped = message.reason if number == wanted else ""
                 continue
             if message.index == 0:
@@ -307,9 +281,9 @@ class Drive(TickGenerator):
                 if number > wanted:
                     return
                 self.drawn = message.key, message.episode
-                tick = assembler.begin(message.time)
+                tick = assembler.begin(stamp_of(message))
             else:
-                tick = assembler.tick(message.index, message.time)
+                tick = assembler.tick(message.index, stamp_of(message))
             if number == wanted:
                 yield tick
 

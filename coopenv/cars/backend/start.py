@@ -17,8 +17,7 @@ from coopenv.cars.codec import decode, encode, make, stamp_of
 from coopenv.cars.deployment import Deployment, Remote
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import RESET_TOPIC, SVEA, VELOCITY, CarProfile, Role, presence_of
-from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, CarStatus
+from coopenv.cars.readings import Calibration, CarStatus, read
 from coopenv.cars.transport.base import Arrival, Transport
 
 ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)

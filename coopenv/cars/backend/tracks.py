@@ -6,7 +6,7 @@ from itertools import islice
 
 import numpy as np
 
-from coopenv.cars.samples import CarPose, Detections, Twist
+from coopenv.cars.readings import CarPose, Detections, Twist
 from coopenv.estimation.poses import Array, exp_so3, log_so3, rigid_exp
 
 MOST_SAMPLES = 512

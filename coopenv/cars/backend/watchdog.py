@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.profile import SVEA, CarProfile, Role, inside
-from coopenv.cars.samples import CarPose, RobustReport, Sample
+from coopenv.cars.readings import CarPose, RobustReport, Sample
 from coopenv.estimation.poses import Array
 
 AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
@@ -106,17 +107,10 @@ def misplaced(
             x, y = float(places[car][0]), float(places[car][1])
             if not inside(safety.geofence, x, y):
                 yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
-    if safety.separation > 0.0:
-        yield from _too_close(safety.separation, places, cars)
-
-
-def _too_close(least: float, places: dict[str, Array], cars: Collection[str]) -> Iterator[tuple[str, str]]:
-    names = list(places)
-    for i, car in enumerate(names):
-        for other in names[i + 1 :]:
-            distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
-            if distance < least and (car in cars or other in cars):
-                yield car, f"{distance:.2f} m from {other}, {least:g} m is the least"
+    for car, other in combinations(places, 2) if apart else ():
+        distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
+        if distance < safety.separation and (car in cars or other in cars):
+            yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"
 
 
 PERIOD = 0.01  # s between looks

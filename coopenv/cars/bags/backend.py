@@ -10,10 +10,10 @@ from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWa
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.bags.files import check_extra
-from coopenv.cars.bags.log import NS, BagLog, read_log
+from coopenv.cars.bags.log import NS, read_log
 from coopenv.cars.bags.topic_map import TopicMap, load_map
 from coopenv.cars.profile import Role
-from coopenv.cars.samples import Sample
+from coopenv.cars.readings import Sample
 from coopenv.scenario import Scenario, load_scenario
 
 AHEAD = 100_000_000
@@ -108,27 +108,15 @@ class Bag(TickGenerator):
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the bags tick by tick; the option `arm` has no effect."""
         reset_options(options)
-        assembler, feed = Assembler(self.binding), _SampleQueue(self.log)
+        assembler, samples, following = Assembler(self.binding), sorted(self.log.samples, key=_used), 0
         for k in range(self.scenario.horizon_ticks + 1):
             now = self._begin + round(k * NS / self._rate)
-            for sample in feed.until(now):
-                assembler.put(sample)
+            while following < len(samples) and _used(samples[following]) <= now:
+                assembler.put(samples[following])
+                following += 1
             yield assembler.begin(now) if k == 0 else assembler.tick(k, now)
 
 
-class _SampleQueue:
-    """Samples in the order in which they are used."""
-
-    def __init__(self, log: BagLog) -> None:
-        self._samples = sorted(log.samples, key=_used)
-        self._next = 0
-
-    def until(self, now: int) -> Iterator[Sample]:
-        """Yield those for a tick at a time in ns that have not been yielded before."""
-        while self._next < len(self._samples) and _used(self._samples[self._next]) <= now:
-            yield self._samples[self._next]
-            self._next += 1
-
-
 def _used(sample: Sample) -> int:
+    """Return when a sample is put in, ns."""
     return sample.stamp - AHEAD if sample.role is Role.TRUTH else sample.stamp

@@ -1,15 +1,21 @@
-"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all through rosbags, within limits."""
+"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all by rosbags, which unpacks within limits."""
 
 import warnings
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Self
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Self
 
 from coopenv.backends.mcap.format import CUT_OFF, MENDED, REPAIR, is_cut_off
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
 from coopenv.cars import codec
+
+if TYPE_CHECKING:
+    from coopenv.backends.mcap.container import Allowance
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
@@ -55,7 +61,6 @@ class BagFile:
         from rosbags.highlevel import AnyReader
 
         from coopenv.backends.mcap.container import Allowance
-        from coopenv.cars.bags.limits import limited
 
         try:
             with limited(Allowance(self._bytes)):
@@ -93,13 +98,17 @@ class BagFile:
         DataWarning is given.
         """
         from coopenv.backends.mcap.container import Allowance
-        from coopenv.cars.bags.limits import each_limited, is_too_large
 
         connections = [c for c in self._reader.connections if c.topic in topics]
-        last, first = None, None
+        last, first, allowance = None, None, Allowance(self._bytes)
         try:
             found = iter(self._reader.messages(connections) if connections else ())
-            for connection, received, data in each_limited(found, Allowance(self._bytes)):
+            while True:
+                with limited(allowance):
+                    message = next(found, None)
+                if message is None:
+                    return
+                connection, received, data = message
                 first = received if first is None else first
                 last = received
                 yield Raw(connection.topic, connection.msgtype, received, self._decoder(connection, data))
@@ -127,8 +136,6 @@ class BagFile:
         return decode
 
     def _unreadable(self, error: Exception) -> DataError:
-        from coopenv.cars.bags.limits import is_too_large
-
         if is_too_large(error):
             return DataError(f"{self.path}: {error}")
         repair = next((REPAIRS[part.suffix] for part in self._parts if part.suffix in REPAIRS), None)
@@ -142,3 +149,97 @@ def check_extra() -> None:
         import rosbags.highlevel  # noqa: F401
     except ImportError:
         raise CoopenvError("ROS bags need an extra: pip install '.[log]'") from None
+
+
+_allowance: ContextVar["Allowance | None"] = ContextVar("_allowance", default=None)
+"""What the bag that is read now may still unpack to; None: rosbags reads for another program."""
+
+
+@contextmanager
+def limited(allowance: "Allowance") -> Iterator[None]:
+    """Let rosbags unpack no more than is allowed, and SQLite return no value above `AT_ONCE`.
+
+    Raises:
+        CoopenvError: this version of rosbags unpacks in another way.
+    """
+    _guard_rosbags()
+    token = _allowance.set(allowance)
+    try:
+        yield
+    finally:
+        _allowance.reset(token)
+
+
+def is_too_large(error: Exception) -> bool:
+    """Return whether an error is about a part of a bag that is too large."""
+    import apsw
+
+    from coopenv.backends.mcap.container import TooLargeError
+
+    return isinstance(error, TooLargeError | apsw.TooBigError)
+
+
+@cache
+def _guard_rosbags() -> None:
+    """Replace the functions with which rosbags unpacks by some that respect `_allowance`."""
+    from coopenv.backends.mcap.container import AT_ONCE, Allowance
+
+    try:
+        import apsw
+        from rosbags.rosbag1.reader import decompressors
+        from rosbags.rosbag2 import reader as rosbag2_reader
+        from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+
+        reader: Any = rosbag2_reader
+        unpack_message, open_file = reader.zstd.decompress, reader.zstd.open
+    except (ImportError, AttributeError):
+        raise CoopenvError(
+            "this version of rosbags would unpack without limits; pip install 'rosbags==0.11.9'"
+        ) from None
+
+    def message(data: bytes) -> bytes:
+        allowance = _allowance.get()
+        return unpack_message(data) if allowance is None else allowance.unpack("zstd", data)
+
+    def file(stream: Any, mode: str) -> Any:
+        return open_file(stream, mode) if _allowance.get() is None else _Counted(open_file(stream, mode))
+
+    def chunk(original: Callable[..., bytes], compression: str, data: bytes, size: int) -> bytes:
+        allowance = _allowance.get()
+        return original(data, size) if allowance is None else allowance.unpack(compression, data, size)
+
+    def ros1_chunk(original: Callable[..., bytes], compression: str, data: bytes) -> bytes:
+        if _allowance.get() is None:
+            return original(data)
+        return Allowance(len(data)).unpack(compression, data)  # rosbags holds one at a time, and may come back to it
+
+    def connected(database: Any) -> None:
+        if _allowance.get() is not None:
+            database.limit(apsw.SQLITE_LIMIT_LENGTH, AT_ONCE)
+
+    reader.zstd = SimpleNamespace(decompress=message, open=file)
+    tables: tuple[tuple[Any, Any], ...] = ((DECOMPRESSORS, chunk), (decompressors, ros1_chunk))
+    for table, limited_form in tables:
+        table.update({name: partial(limited_form, original, name) for name, original in table.items()})
+    apsw.connection_hooks.append(connected)
+
+
+class _Counted:
+    """A file that is unpacked while it is read; what it gives is counted."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int = -1) -> bytes:
+        """Return the next bytes. Raises TooLargeError: there are more than the bag may unpack to."""
+        data = bytes(self._stream.read(size))
+        allowance = _allowance.get()
+        if allowance is not None:
+            allowance.take(len(data))
+        return data

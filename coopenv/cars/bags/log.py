@@ -25,8 +25,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, CarPose, Sample, Twist, Value
+from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
 
 Delays = Mapping[str, int]
@@ -140,21 +139,12 @@ def in_frame(pose: CarPose, frame: MapFrame) -> CarPose:
 WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its topic before it is left out
 
 
-@dataclass(frozen=True, slots=True)
-class TimedValue:
-    """A message that was read."""
-
-    stamp: int  # ns, clock of its source; 0: none
-    received: int  # ns, clock of the recorder
-    value: Value
-
-
 @dataclass
 class Track:
     """The messages of one topic, and why some were left out."""
 
     chosen: Chosen
-    entries: list[TimedValue] = field(default_factory=list)
+    entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -172,7 +162,8 @@ def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: ValueReader, 
         try:
             message = raw.decode()
             stamp = stamp_of(message) if stamped else 0
-            track.entries.append(TimedValue(stamp, raw.received, values.read(track.chosen, message)))
+            value, entry = values.read(track.chosen, message), track.chosen
+            track.entries.append(Sample(entry.car, entry.sample_role, stamp, raw.received, value))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
@@ -340,11 +331,10 @@ def _samples(tracks: Sequence[Mapping[str, Track]], clocks: Clocks) -> tuple[Sam
     found: dict[tuple[str, int], Sample] = {}
     for file, recorder in zip(tracks, clocks.recorders, strict=True):
         for name, track in file.items():
-            chosen = track.chosen
             for entry in track.entries:
-                added = clocks.shifts[chosen.source].added if entry.stamp else recorder
+                added = clocks.shifts[track.chosen.source].added if entry.stamp else recorder
                 time = (entry.stamp or entry.received) + added
-                found.setdefault((name, time), Sample(chosen.car, chosen.sample_role, time, time, entry.value))
+                found.setdefault((name, time), replace(entry, stamp=time, received=time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 

@@ -98,6 +98,7 @@ class Wire:
             seed: of what is lost.
         """
         self._transport, self._faults, self._steady = transport, faults, steady
+        self.announce, self.watch = transport.announce, transport.watch
         self._rng, self._lock = random.Random(seed), threading.Lock()
         self._late: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
@@ -115,14 +116,6 @@ class Wire:
             self._pass_on(lambda: callback(arrival))
 
         self._transport.subscribe(pattern, arrive)
-
-    def announce(self, name: str) -> None:
-        """Announce, see `Transport`."""
-        self._transport.announce(name)
-
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`."""
-        self._transport.watch(pattern, callback)
 
     def close(self) -> None:
         """Forget what is under way."""

@@ -8,20 +8,18 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.fault_text import Fault
 from coopenv.base.interrupts import before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
 from coopenv.cars.fake.car import REAL, Fake
 from coopenv.cars.gate.process import GateSettings
-from coopenv.cars.transport.base import Transport
 
 READY = 300.0
 """s that fakes have until they can be seen: the first ones on a computer compile the simulation's kernels."""
@@ -161,21 +159,6 @@ before_a_hard_end(_kill_all)
 
 REST = 0.004
 """s between two looks at the clock, at least: what falls due meanwhile is done together."""
-
-
-def open_fake(
-    path: str | Path,
-    car: str,
-    transport: Transport,
-    *,
-    seed: int = 0,
-    faults: Iterable[Fault] = (),
-    gate: bool = True,
-    station: str | None = None,
-    complain: Callable[[str], None] = lambda _: None,
-) -> Fake:
-    """Return a fake of a car of a deployment file; arguments as for `prepare_fake` and `Fake`."""
-    return prepare_fake(path, car, gate, station)(transport, seed=seed, faults=faults, complain=complain)
 
 
 def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:

@@ -13,7 +13,7 @@ from coopenv.cars.codec import encode, header, make, pose
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import CarProfile, Role
-from coopenv.cars.samples import Calibration
+from coopenv.cars.readings import Calibration
 from coopenv.cars.transport.base import Transport
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import Array

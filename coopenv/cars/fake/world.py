@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import NEUTRAL, Drive, Role
-from coopenv.cars.samples import rotation_of
+from coopenv.cars.readings import rotation_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array

@@ -77,53 +77,54 @@ def low_level(drive: Drive, command: CommandMessage) -> Any:
     return kind(round(PER_PERCENT * steering), round(PER_PERCENT * speed), LOW_GEAR, 0)
 
 
-@dataclass(frozen=True)
-class Counterpart:
-    """The authors' topic with the content of one of ours."""
-
-    name: str  # with {agent}, the agent's number, or {car}, the car's name
-    type: str  # of ROS 1
-    convert: Callable[[Any], Any] | None = to_ros1  # from our message to theirs; None: `low_level`
-    exact: bool = True  # nothing is lost, and the way back is `to_ros2`; else it is only for them
-
-
-COUNTERPARTS = {
-    Role.DETECTIONS: Counterpart("agent{agent}/pixy_node/objectsInfo", SVEA.topics[Role.DETECTIONS].type),
-    Role.BEARINGS: Counterpart("agent{agent}/pixy_landmark_detection/objectsBearing", SVEA.topics[Role.BEARINGS].type),
-    Role.CAMERA_INFO: Counterpart("agent{agent}/pixy_node/camera_info", SVEA.topics[Role.CAMERA_INFO].type),
-    Role.WHEEL: Counterpart("agent{agent}/actuation_twist", SVEA.topics[Role.WHEEL].type),
-    Role.TRUTH: Counterpart("qualisys/{car}/odom", SVEA.topics[Role.TRUTH].type),
-    Role.POINT: Counterpart("agent{agent}/riccatiPoint", SVEA.topics[Role.POINT].type),
-    Role.ESTIMATE: Counterpart("agent{agent}/riccatiPoint", SVEA.topics[Role.POINT].type, point_of, exact=False),
-    Role.MANUAL: Counterpart("agent{agent}/lli/ctrl_request", "svea_msgs/msg/lli_ctrl", None, exact=False),
+NAMES = {
+    Role.DETECTIONS: "agent{agent}/pixy_node/objectsInfo",
+    Role.BEARINGS: "agent{agent}/pixy_landmark_detection/objectsBearing",
+    Role.CAMERA_INFO: "agent{agent}/pixy_node/camera_info",
+    Role.WHEEL: "agent{agent}/actuation_twist",
+    Role.TRUTH: "qualisys/{car}/odom",
+    Role.POINT: "agent{agent}/riccatiPoint",
+    Role.ESTIMATE: "agent{agent}/riccatiPoint",
+    Role.MANUAL: "agent{agent}/lli/ctrl_request",
 }
-"""By role. Commands are not among them: they go to the gate, and what the gate has let through to the low level."""
+"""The authors' topics with the content of ours, by the agent's number and the car's name.
+
+Commands are not among them: they go to the gate, and what the gate has let through to the low level."""
+LOSSY = {Role.ESTIMATE: SVEA.topics[Role.POINT].type, Role.MANUAL: "svea_msgs/msg/lli_ctrl"}
+"""ROS 1 types of those that lose something, and are only for the authors; the others' types are SVEA's."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """A topic of one car and its counterpart."""
+    """A topic of one car and the authors' topic with its content."""
 
+    role: Role
     topic: str
     ours: str  # ROS 2 type
     name: str
-    theirs: Counterpart
+    theirs: str  # ROS 1 type
     command: CommandMessage  # of the topic `manual`
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing is lost, so that there is a way back."""
+        return self.role not in LOSSY
 
     def out(self, payload: bytes) -> bytes:
         """Return ROS 1 bytes for CDR bytes. Raises CoopenvError: they are no such message."""
-        if self.theirs.convert is None:
+        if self.role is Role.MANUAL:
             return encode_ros1(low_level(read_drive(payload, self.command), self.command))
-        return encode_ros1(self.theirs.convert(decode(payload, self.ours)))
+        message = decode(payload, self.ours)
+        return encode_ros1(point_of(message) if self.role is Role.ESTIMATE else to_ros1(message))
 
     def back(self, payload: bytes) -> bytes:
         """Return CDR bytes for ROS 1 bytes, likewise."""
-        return encode(to_ros2(decode_ros1(payload, self.theirs.type)))
+        return encode(to_ros2(decode_ros1(payload, self.theirs)))
 
     def warm_up(self) -> None:
         """Translate once, since the first time compiles and takes a tenth of a second."""
         translated = self.out(encode(make(self.ours)))
-        if self.theirs.exact:
+        if self.exact:
             self.back(translated)
 
 
@@ -134,13 +135,10 @@ def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[Route, ...]:
         raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
     return tuple(
         Route(
-            profile.topic_of(car.name, role),
-            profile.topics[role].type,
-            other.name.format(agent=agent, car=car.name),
-            other,
-            profile.command,
+            *(role, profile.topic_of(car.name, role), profile.topics[role].type),
+            *(name.format(agent=agent, car=car.name), LOSSY.get(role, SVEA.topics[role].type), profile.command),
         )
-        for role, other in COUNTERPARTS.items()
+        for role, name in NAMES.items()
     )
 
 
@@ -154,12 +152,13 @@ class Authors:
     def __init__(self, wire: Transport, routes: Iterable[Route]) -> None:
         """Take a network with the authors' messages, which is closed with this, and what is translated."""
         self._wire = wire
+        self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
         self._routes = {route.topic: route for route in routes}
         self._names = {route.name for route in self._routes.values()}
         self._lock = threading.Lock()
         self.refused: Counter[str] = Counter()
         """Messages that are not of their topic's type, by topic, ours or theirs."""
-        warmed = {(route.ours, route.theirs.type): route for route in self._routes.values()}
+        warmed = {(route.ours, route.theirs): route for route in self._routes.values()}
         for route in warmed.values():
             route.warm_up()
 
@@ -168,22 +167,22 @@ class Authors:
     ) -> None:
         """Send, see `Transport`."""
         route = self._routes.get(topic)
-        if route is None or not route.theirs.exact:
+        if route is None or not route.exact:
             self._wire.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
         if route is None:
             return
         translated = self._translated(route.out, payload, topic)
         if translated is not None:
-            beside = attachment if route.theirs.exact else b""
+            beside = attachment if route.exact else b""
             self._wire.publish(route.name, translated, beside, urgent=urgent, reliable=reliable)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
         matches = matcher(pattern)
         for route in self._routes.values():
-            if route.theirs.exact and matches(route.topic):
+            if route.exact and matches(route.topic):
                 self._wire.subscribe(route.name, self._translating(route, callback))
-        if pattern in self._routes and self._routes[pattern].theirs.exact:
+        if pattern in self._routes and self._routes[pattern].exact:
             return
 
         def pass_on(arrival: Arrival) -> None:
@@ -207,15 +206,3 @@ class Authors:
             with self._lock:
                 self.refused[name] += 1
             return None
-
-    def announce(self, name: str) -> None:
-        """Announce, see `Transport`."""
-        self._wire.announce(name)
-
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`."""
-        self._wire.watch(pattern, callback)
-
-    def close(self) -> None:
-        """End the connection."""
-        self._wire.close()

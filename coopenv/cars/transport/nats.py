@@ -10,7 +10,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.transport.base import (
@@ -49,11 +49,6 @@ def subjects_of(pattern: str) -> tuple[str, ...]:
         return (">",)
     alone = all(part == "**" for part in parts[first:])
     return (before, f"{before}.>") if alone else (f"{before}.>",)
-
-
-def headers_of(attachment: bytes) -> dict[str, str] | None:
-    """Return the headers of a message (None: it needs none)."""
-    return {ATTACHMENT: base64.b64encode(attachment).decode()} if attachment else None
 
 
 def attachment_of(headers: dict[str, str] | None) -> bytes:
@@ -136,12 +131,8 @@ class Presence:
                 callback(name, there)
 
 
-class QueuedMessage(NamedTuple):
-    """A message in the outbox."""
-
-    topic: str
-    payload: bytes
-    attachment: bytes
+Letter = tuple[str, bytes, bytes]
+"""A message in the outbox: topic, payload, attachment."""
 
 
 class Outbox:
@@ -155,11 +146,11 @@ class Outbox:
             patience: s that the sender of a reliable message waits before that.
         """
         self._most, self._patience = most, patience
-        self._urgent: deque[QueuedMessage] = deque()
-        self._other: deque[QueuedMessage] = deque()
+        self._urgent: deque[Letter] = deque()
+        self._other: deque[Letter] = deque()
         self._changed = threading.Condition()
 
-    def put(self, letter: QueuedMessage, *, urgent: bool, patient: bool) -> None:
+    def put(self, letter: Letter, *, urgent: bool, patient: bool) -> None:
         """Add a message; if there is no room, a patient sender waits for some, and then the oldest goes."""
         queue = self._urgent if urgent else self._other
         with self._changed:
@@ -169,7 +160,7 @@ class Outbox:
                 queue.popleft()
             queue.append(letter)
 
-    def take(self) -> QueuedMessage | None:
+    def take(self) -> Letter | None:
         """Return the next message; None: there is none."""
         with self._changed:
             queue = self._urgent or self._other
@@ -224,7 +215,7 @@ class Nats:
         if self._closed:
             return
         patient = reliable and threading.current_thread() is not self._thread
-        self._outbox.put(QueuedMessage(topic, payload, attachment), urgent=urgent or reliable, patient=patient)
+        self._outbox.put((topic, payload, attachment), urgent=urgent or reliable, patient=patient)
         with suppress(RuntimeError):  # closed meanwhile
             self._loop.call_soon_threadsafe(self._wake.set)
 
@@ -236,10 +227,11 @@ class Nats:
                 if self._client.is_connected:  # else it is lost: it would be too old later
                     await self._post(letter)
 
-    async def _post(self, letter: QueuedMessage) -> None:
-        headers = headers_of(letter.attachment)
+    async def _post(self, letter: Letter) -> None:
+        topic, payload, attachment = letter
+        headers = {ATTACHMENT: base64.b64encode(attachment).decode()} if attachment else None
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
-            await self._client.publish(subject_of(letter.topic), letter.payload, headers=headers)
+            await self._client.publish(subject_of(topic), payload, headers=headers)
 
     async def _beat(self) -> None:
         while True:

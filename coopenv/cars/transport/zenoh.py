@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.deployment import Deployment, DeploymentError, Tls
+from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport.base import (
     NO_ANSWER,
     SECURE,
@@ -162,26 +162,19 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
         CoopenvError: an extra is not installed.
     """
     network, certificates = deployment.network, certificates_of(deployment)
-    if network.kind == "ros1":
-        from coopenv.cars.transport.ros1 import open_ros1
+    if network.kind == "zenoh":
+        return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
+    from coopenv.cars.transport.authors import Authors, routes_of
 
-        return _translated(lambda types: open_ros1(network.connect[0], types, timeout), deployment)
+    routes = [route for car in deployment.cars for route in routes_of(car, deployment.profile)]  # before any is opened
     if network.kind == "nats":
         from coopenv.cars.transport.nats import open_nats
 
-        return _translated(lambda _: open_nats(network.connect, certificates, timeout), deployment)
+        return Authors(open_nats(network.connect, certificates, timeout), routes)
+    from coopenv.cars.transport.ros1 import open_ros1
 
-    return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
-
-
-def _translated(connect: Callable[[dict[str, str]], Transport], deployment: Deployment) -> Transport:
-    """Return a connection to the authors' cars under our names."""
-    from coopenv.cars.transport.authors import Authors, routes_of
-
-    routes = [
-        route for car in deployment.cars for route in routes_of(car, deployment.profile)
-    ]  # before anything is opened
-    return Authors(connect({route.name: route.theirs.type for route in routes}), routes)
+    types = {route.name: route.theirs for route in routes}
+    return Authors(open_ros1(network.connect[0], types, timeout), routes)
 
 
 def certificates_of(deployment: Deployment) -> Certificates | None:
@@ -189,13 +182,8 @@ def certificates_of(deployment: Deployment) -> Certificates | None:
     tls = deployment.network.tls
     if tls is None:
         return None
+    own, key = (None if file is None else deployment.folder / file for file in (tls.certificate, tls.key))
     try:
-        return _found(tls, deployment)
+        return Certificates(deployment.folder / tls.root_ca, own, key)
     except CoopenvError as error:
         raise DeploymentError(f"network.{error}") from None
-
-
-def _found(tls: Tls, deployment: Deployment) -> Certificates:
-    own = None if tls.certificate is None else deployment.folder / tls.certificate
-    key = None if tls.key is None else deployment.folder / tls.key
-    return Certificates(deployment.folder / tls.root_ca, own, key)

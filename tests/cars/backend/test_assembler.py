@@ -12,10 +12,10 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import Binding, bind
-from coopenv.cars.backend.tracks import LONGEST_GAP
+from coopenv.cars.backend.tracks import LONGEST_GAP, PoseTrack
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.samples import CarPose, Detections, RobustReport, Sample, Twist, Value
+from coopenv.cars.readings import CarPose, Detections, RobustReport, Sample, Twist, Value
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -327,21 +327,23 @@ def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearin
 
 
 def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:
-    assembler = Assembler(binding())
+    track = PoseTrack()
     for k in (0, 1, 30, 31):
-        assembler.put(sample(Role.TRUTH, START + k * 10 * MS, CarPose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3))))
-    known = [np.isfinite(assembler.truth(0, START + t * MS)[1]).all() for t in (5, 150, 305, 310)]
+        assert track.put(START + k * 10 * MS, CarPose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3)))
+    known = [np.isfinite(track.at(START + t * MS)[1]).all() for t in (5, 150, 305, 310)]
     assert known == [True, False, True, True]
-    np.testing.assert_allclose(assembler.truth(0, START + 5 * MS)[1], [0.05, 0.0, 0.0])
-    assert not np.isfinite(assembler.truth(0, START + 310 * MS + LONGEST_GAP + MS)[1]).any()
+    np.testing.assert_allclose(track.at(START + 5 * MS)[1], [0.05, 0.0, 0.0])
+    assert not np.isfinite(track.at(START + 310 * MS + LONGEST_GAP + MS)[1]).any()
 
 
 def test_origins_of_maps_are_taken_off() -> None:
     bound = binding(map={"origin": [1.0, 2.0, 0.0]})
     assembler = Assembler(bound)
     assembler.put(sample(Role.TRUTH, START, CarPose(np.array([1.5, 2.5, 0.0]), np.eye(3))))
-    np.testing.assert_allclose(assembler.truth(0, START)[1], [0.5, 0.5, 0.0])
-    np.testing.assert_allclose(assembler.begin(START).landmarks[0], np.array(LANDMARKS["A"]) - [1.0, 2.0, 0.0])
+    tick = assembler.begin(START + 20 * MS)
+    assert tick.truth is not None
+    np.testing.assert_allclose(tick.truth.position[0], [0.5, 0.5, 0.0])
+    np.testing.assert_allclose(tick.landmarks[0], np.array(LANDMARKS["A"]) - [1.0, 2.0, 0.0])
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,9 @@ from coopenv.cars.codec import MOST_BYTES, encode, header, make
 from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Arrival, Hub
+from coopenv.cars.transport.base import Arrival
 from coopenv.scenario import load_scenario
+from tests.helpers.hub import Hub
 
 CARS = [Car(name="svea7", marker=7), Car(name="svea1", marker=6)]
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}

@@ -17,8 +17,9 @@ from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Gate, GateClock
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.samples import CarPose, Sample, Twist
-from coopenv.cars.transport.base import Arrival, Hub
+from coopenv.cars.readings import CarPose, Sample, Twist
+from coopenv.cars.transport.base import Arrival
+from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
 
 WHEEL = SVEA.topic_of("a", Role.WHEEL)

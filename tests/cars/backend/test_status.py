@@ -12,7 +12,7 @@ from coopenv.cars.backend.start import StatusBoard
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport.base import Hub
+from tests.helpers.hub import Hub
 
 CAR = "svea7"
 

@@ -21,7 +21,7 @@ from coopenv.base.errors import OutputError
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport
 from coopenv.cars.codec import TICK, encode, header, make
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role
-from coopenv.cars.transport.base import Hub
+from tests.helpers.hub import Hub
 from tests.helpers.processes import DEADLOCK, start
 
 WHEEL, FRAMES = SVEA.topic_of("svea7", Role.WHEEL), SVEA.topic_of("svea7", Role.DETECTIONS)
@@ -31,7 +31,7 @@ TYPES = {WHEEL: SVEA.topics[Role.WHEEL].type, FRAMES: SVEA.topics[Role.DETECTION
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     recorder = DriveRecorder(tmp_path / "drive.mcap", json.dumps({"cars": 1}).encode(), TYPES)
-    recorder.begin(10**9, 2**64 - 1, 3)
+    recorder.tick(0, 10**9, 2**64 - 1, 3)
     for k in range(20):
         now = 10**9 + k * 10**7
         twist = make(
@@ -74,7 +74,7 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     for topic in (state, wheels):
         recorded.subscribe(topic, read.append)
     recorded.watch("fleet/alive/*", lambda name, there: None)
-    recorder.begin(1, 0, 0)
+    recorder.tick(0, 1)
     others = hub.connect()
     for name in ("svea7", "stranger"):
         others.announce(f"fleet/alive/{name}")
@@ -99,7 +99,7 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
 
 def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> None:
     recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
-    recorder.begin(10**9, 0, 0)
+    recorder.tick(0, 10**9)
     recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
     recorder.close()
     with AnyReader([tmp_path / "drive.mcap"]) as reader:
@@ -121,7 +121,7 @@ def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Pa
     threads = [threading.Thread(target=write, args=(number,)) for number in range(writers)]
     for thread in threads:
         thread.start()
-    recorder.begin(1, 0, 0)
+    recorder.tick(0, 1)
     for k in range(1, each):
         recorder.tick(k, k)
     for thread in threads:
@@ -142,7 +142,7 @@ from coopenv.cars.backend.drive import FLUSH, DriveRecorder
 from coopenv.cars.codec import encode
 from coopenv.cars.codec import make
 recorder = DriveRecorder(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
-recorder.begin(1, 0, 0)
+recorder.tick(0, 1)
 frame = encode(make("{TYPES[FRAMES]}"))
 """
 KILLED = """

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from coopenv.cars.backend.tracks import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
-from coopenv.cars.samples import Twist
+from coopenv.cars.readings import Twist
 
 NS = 10**9
 

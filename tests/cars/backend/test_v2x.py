@@ -12,8 +12,7 @@ from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import estimate_message, report_message
 from coopenv.cars.codec import decode, encode
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import read
-from coopenv.cars.samples import Sample
+from coopenv.cars.readings import Sample, read
 from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
 from tests.cars.backend.test_assembler import MS, START, binding

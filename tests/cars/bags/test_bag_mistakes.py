@@ -21,7 +21,7 @@ from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
-from coopenv.cars.samples import Detections
+from coopenv.cars.readings import Detections
 from coopenv.cli import main
 from coopenv.scenario import load_scenario
 from tests.helpers import bags

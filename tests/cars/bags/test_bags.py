@@ -274,7 +274,7 @@ def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path, reference: li
     drive = bags.messages(bags.drive())
     path = tmp_path / "recorder.mcap"
     recorder = DriveRecorder(path, b"{}", {names[m.topic]: m.kind for m in drive})
-    recorder.begin(bags.BEGIN, 0, 0)  # a recorder in which nothing begins leaves no file
+    recorder.tick(0, bags.BEGIN)  # a recorder in which nothing begins leaves no file
     for number, m in enumerate(drive):
         recorder.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
     recorder.close()

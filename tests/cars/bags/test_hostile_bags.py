@@ -11,7 +11,7 @@ import pytest
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import container
 from coopenv.cars import codec
-from coopenv.cars.bags import files, limits
+from coopenv.cars.bags import files
 from coopenv.cli import main
 from tests.helpers import bags
 
@@ -107,6 +107,6 @@ def test_a_version_of_rosbags_that_cannot_be_limited(tmp_path: Path, monkeypatch
 
     path = bags.write(tmp_path / "drive", bags.messages(bags.drive(0.5)), "mcap")
     monkeypatch.delattr(reader, "zstd")
-    limits._guard_rosbags.cache_clear()
+    files._guard_rosbags.cache_clear()
     with pytest.raises(CoopenvError, match=r"^this version of rosbags would unpack without limits"):
         read(path)

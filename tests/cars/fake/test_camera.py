@@ -9,8 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import bearings, detections, read
-from coopenv.cars.samples import Calibration
+from coopenv.cars.readings import Calibration, bearings, detections, read
 from tests.helpers.fakes import CROSSING, EXACT, MARKERS, OVERTAKING, Stage
 
 FOCAL, CENTRE, SIZE = (213.161906, 213.521038), (154.841998, 114.98398), (316, 208)

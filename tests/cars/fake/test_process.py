@@ -16,12 +16,14 @@ from typer.testing import CliRunner
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import decode, encode, make
-from coopenv.cars.fake.fleet import open_fake, run
+from coopenv.cars.fake.fleet import run
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import RESET_TOPIC, SVEA, Limits, Role, presence_of
-from coopenv.cars.transport.base import Arrival, Hub, Transport
+from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
+from tests.helpers.cars import open_fake
+from tests.helpers.hub import Hub
 from tests.helpers.processes import COOPENV, start, wait_until
 from tests.helpers.wire import free_port
 

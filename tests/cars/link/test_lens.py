@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from coopenv.cars.readings import rays
-from coopenv.cars.samples import Calibration
+from coopenv.cars.readings import Calibration, rays
 from coopenv.estimation.lens import distort, largest_radius, undistort
 from coopenv.world.camera import undistort as simulated
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from coopenv import CoopenvError
 from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import read
-from coopenv.cars.samples import Calibration, CarPose, CarStatus, Detections, RobustReport, Twist
+from coopenv.cars.readings import Calibration, CarPose, CarStatus, Detections, RobustReport, Twist, read
 from coopenv.cars.transport.authors import to_ros1
 from coopenv.estimation.lens import distort
 

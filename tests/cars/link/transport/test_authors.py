@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from coopenv.cars.codec import decode, decode_ros1, encode, encode_ros1, header, make
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import read
-from coopenv.cars.samples import CarPose
-from coopenv.cars.transport.authors import COUNTERPARTS, Authors, routes_of, to_ros1
-from coopenv.cars.transport.base import Arrival, Hub, HubTransport
+from coopenv.cars.readings import CarPose, read
+from coopenv.cars.transport.authors import Authors, routes_of, to_ros1
+from coopenv.cars.transport.base import Arrival
+from tests.helpers.hub import Hub, HubTransport
 
 CAR = Car(name="svea1", agent=7)
 STAMP = 3_000_000_004
@@ -190,4 +190,4 @@ def test_a_car_has_the_number_of_its_marker_or_needs_one() -> None:
 def test_every_counterpart_has_another_name_unless_it_is_of_the_same_thing() -> None:
     names = [route.name for route in routes_of(CAR)]
     assert len(names) == len(set(names)) + 1
-    assert {role for role, other in COUNTERPARTS.items() if other.exact} == set(NAMES)
+    assert {route.role for route in routes_of(CAR) if route.exact} == set(NAMES)

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cars.transport.base import Arrival, Hub, Transport
+from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.nats import open_nats
 from coopenv.cars.transport.ros1 import open_ros1
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.brokers import nats_server, ros_master
+from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port
 

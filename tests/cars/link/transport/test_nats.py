@@ -23,9 +23,9 @@ from coopenv.cars.transport.base import Arrival, Certificates, LinkError, matche
 from coopenv.cars.transport.nats import (
     LEASE,
     MOST_WAITING,
+    Letter,
     Outbox,
     Presence,
-    QueuedMessage,
     open_nats,
     subject_of,
     subjects_of,
@@ -234,8 +234,8 @@ def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.Monke
     assert seen[2:] == [("fleet/alive/svea7", True)]
 
 
-def letter(number: int) -> QueuedMessage:
-    return QueuedMessage("t", bytes([number]), b"")
+def letter(number: int) -> Letter:
+    return "t", bytes([number]), b""
 
 
 def test_urgent_ones_overtake_and_the_oldest_go_first_when_there_is_no_room() -> None:
