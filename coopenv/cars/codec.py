@@ -1,7 +1,7 @@
 """Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -167,28 +167,46 @@ def _store(name: str, definitions: dict[str, str]) -> Any:
 def make(kind: str, **fields: Any) -> Any:
     """Return a ROS 2 message of a type by its fields; those that are not given are zero and empty.
 
-    A message within it may be given by its fields, as a mapping or in their order: a vector as (x, y, z).
+    A message within it may be given by its fields, as a dictionary or in their order: a vector as (x, y, z).
     """
-    values = {name: _value(node, fields.get(name)) for name, node in ros2().fielddefs[kind][1]}
-    return ros2().types[kind](**{**fields, **values})
+    made, known = _type(kind)
+    for name, value in known:
+        fields[name] = value(fields.get(name))
+    return made(**fields)
 
 
-def _value(node: Any, given: Any = None) -> Any:
-    """Return the value of a field; `node` is the field as rosbags describes it."""
+@cache
+def _type(kind: str) -> tuple[Any, list[tuple[str, Callable[[Any], Any]]]]:
+    """Return the class of a type, and what makes the value of each field of what is given, or of None."""
+    store = ros2()
+    return store.types[kind], [(name, _field(node)) for name, node in store.fielddefs[kind][1]]
+
+
+def _field(node: Any) -> Callable[[Any], Any]:
+    """Return what makes a field's value; `node` is the field as rosbags describes it."""
     kind, of = node
     if kind.name == "NAME":
-        if given is None or isinstance(given, Mapping):
-            return make(of, **(given or {}))
-        if isinstance(given, tuple | list | np.ndarray):
-            parts = given.tolist() if isinstance(given, np.ndarray) else given
-            return make(of, **dict(zip((name for name, _ in ros2().fielddefs[of][1]), parts, strict=True)))
-        return given
+
+        def nested(given: Any) -> Any:
+            if given is None:
+                return make(of)
+            if isinstance(given, dict):
+                return make(of, **given)
+            if isinstance(given, tuple | list | np.ndarray):
+                parts = given.tolist() if isinstance(given, np.ndarray) else given
+                return make(of, **{name: part for (name, _), part in zip(_type(of)[1], parts, strict=True)})
+            return given
+
+        return nested
     if kind.name == "BASE":
-        return ("" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()) if given is None else given
-    element, length = of[0], of[1] if kind.name == "ARRAY" else 0
-    if element[0].name == "BASE" and element[1][0] != "string":
-        return np.zeros(length, dtype=element[1][0]) if given is None else np.ravel(given).astype(element[1][0])
-    return [_value(element, part) for part in (given or [None] * length)]
+        zero = "" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()
+        return lambda given: zero if given is None else given
+    (name, element), length = of[0], of[1] if kind.name == "ARRAY" else 0
+    if name.name == "BASE" and element[0] != "string":
+        dtype = np.dtype(element[0])
+        return lambda given: np.zeros(length, dtype) if given is None else np.asarray(given, dtype).ravel()
+    part = _field(of[0])
+    return lambda given: [part(entry) for entry in given or [None] * length]
 
 
 def header(stamp: int, frame: str = "") -> Any:

@@ -41,13 +41,7 @@ class Tls(Section):
         return self
 
 
-def _endpoint(text: str) -> str:
-    """Refuse what is no endpoint such as tcp/127.0.0.1:7447."""
-    address_of(text)
-    return text
-
-
-Endpoint = Annotated[str, AfterValidator(_endpoint)]
+Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 
 WIRES = {
     "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp")),
@@ -57,11 +51,11 @@ WIRES = {
 """Kinds of networks: default endpoints, and protocols."""
 
 
-def refuse_foreign(kind: str, endpoints: tuple[str, ...]) -> None:
+def refuse_foreign(kind: str, endpoints: tuple[str, ...], field: str) -> None:
     """Refuse endpoints of a protocol that a kind of network does not have, with a ValueError that names it."""
     for endpoint in endpoints:
         if address_of(endpoint).protocol not in WIRES[kind][1]:
-            raise ValueError(f"connect: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
+            raise ValueError(f"{field}: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
 
 
 class Network(Section):
@@ -81,7 +75,7 @@ class Network(Section):
     def _endpoints_fit(self) -> Self:
         if self.kind == "ros1" and len(self.connect) > 1:
             raise ValueError("connect: there is one ROS master, more than one endpoint is given")
-        refuse_foreign(self.kind, self.connect)
+        refuse_foreign(self.kind, self.connect, "connect")
         for endpoint in self.connect:
             secure = address_of(endpoint).protocol in SECURE
             if secure and self.tls is None:
@@ -310,10 +304,7 @@ class Deployment(Section):
 
     @model_validator(mode="after")
     def _gates_speak_like_the_cars(self) -> Self:
-        try:
-            refuse_foreign(self.network.kind, self.gate_connect)
-        except ValueError as error:
-            raise ValueError(f"gate.{error}") from None
+        refuse_foreign(self.network.kind, self.gate_connect, "gate.connect")
         return self
 
     @property

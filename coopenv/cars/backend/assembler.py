@@ -32,8 +32,8 @@ NS = 1e-9
 class _Car:
     """The samples of one car."""
 
-    def __init__(self) -> None:
-        self.odometer, self.frames, self.track = Odometer(), Frames(), PoseTrack()
+    def __init__(self, refused: Counter[str]) -> None:
+        self.odometer, self.frames, self.track = Odometer(refused), Frames(refused), PoseTrack()
         self.moment: int | None = None
         self.lag = 0  # ns by which the last frame was behind its tick
         self.exposed: int | None = None  # when the last frame was
@@ -56,10 +56,10 @@ class Assembler:
         self._period = round(1e9 / scenario.rates.camera)
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
         self._to_body = [camera.to_body() for camera in scenario.cameras]
-        self._cars = [_Car() for _ in scenario.vehicles]
         self._begin = 0
         self.refused: Counter[str] = Counter()
         """Samples that were not used, by reason."""
+        self._cars = [_Car(self.refused) for _ in scenario.vehicles]
         self._inbox = NeighbourInbox(binding, self.refused)
 
     def put(self, sample: Sample) -> None:
@@ -89,25 +89,11 @@ class Assembler:
         elif isinstance(value, CarPose | RobustReport) and vehicle not in self.binding.local:
             self._inbox.put_vehicle(vehicle, role, stamp, value)
 
-    def _count(self) -> None:
-        """Count the samples that odometers and frame queues have dropped since the last call."""
-        for car in self._cars:
-            odometer, frames = car.odometer, car.frames
-            counts = {
-                "odometry out of order": odometer.disordered,
-                "frame out of order": frames.disordered,
-                "frame left out": frames.skipped,
-            }
-            odometer.disordered = frames.disordered = frames.skipped = 0
-            self.refused.update({why: count for why, count in counts.items() if count})
-
     def begin(self, now: int) -> Sensed:
         """Return tick 0 at a time in ns; earlier samples give the present state of the cars."""
         self._begin = now
         for car in self._cars:
-            while car.frames.take(-1, now) is not None:
-                pass
-            car.frames.skipped = 0  # no tick took frames since the last episode
+            car.frames.forget(now)  # no tick took frames since the last episode
             car.moment, car.lag, car.exposed = now - self._period, 0, None
             car.odometer.increment(now - self._period, now - self._period)
         self._inbox.forget()
@@ -146,7 +132,6 @@ class Assembler:
             if frame is not None:
                 late[i] = car.lag > self._late
                 self._see(i, frame, now, bearings[i], visible[i])
-        self._count()
         return Sensed(
             index=index,
             dt=1.0 / self.binding.scenario.rates.camera,
@@ -202,14 +187,6 @@ BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 """Messages between cars."""
 
 
-def roles_of(sensors: Sensors, local: bool) -> tuple[Role, ...]:
-    """Return the roles that are read of a car, estimated here (`local`) or elsewhere."""
-    truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
-    if not local:
-        return (*truth, *BROADCAST)
-    return (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
-
-
 @dataclass
 class ClockOffset:
     """Least delay of a car's messages between stamp and reception; times in ns."""
@@ -243,11 +220,13 @@ class Intake:
         """Messages that could not be used, by car and role."""
         self.calibrations = {name: Calibration.of(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
         """Of the environment, by car."""
+        truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
+        own = (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
         for name, vehicle in binding.cars.items():
-            for role in roles_of(sensors, vehicle in binding.local):
+            for role in own if vehicle in binding.local else (*truth, *BROADCAST):
                 self._topics[binding.profile.topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
-            for role in (Role.ESTIMATE, Role.POINT, *((Role.TRUTH,) if sensors.truth else ())):
+            for role in (Role.ESTIMATE, Role.POINT, *truth):
                 self._topics[binding.profile.topic_of(name, role)] = name, role, None
 
     @property

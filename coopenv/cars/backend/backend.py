@@ -297,17 +297,12 @@ def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapp
     try:
         return load_scenario(environment or own, {**deployment.overrides, **overrides})
     except ScenarioError as error:
-        raise _of_the_file(deployment, environment or own) or error from None
-
-
-def _of_the_file(deployment: Deployment, environment: str) -> CoopenvError | None:
-    """Return the error of a deployment's own overrides; None: they are valid."""
-    try:
-        load_scenario(environment, deployment.overrides)
-    except ScenarioError as error:
-        if str(error).startswith("override"):
-            return CoopenvError(f"{deployment.file.name}: {str(error).replace(OVERRIDES, 'overrides', 1)}")
-    return None
+        try:
+            load_scenario(environment or own, deployment.overrides)
+        except ScenarioError as of_the_file:
+            if str(of_the_file).startswith("override"):
+                raise CoopenvError(f"{file}: {str(of_the_file).replace(OVERRIDES, 'overrides', 1)}") from None
+        raise error
 
 
 def _keys(deployment: Deployment, binding: Binding, car: str | None) -> tuple[Signer | None, Verifier | None]:

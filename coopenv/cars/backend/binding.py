@@ -253,7 +253,7 @@ class NeighbourInbox:
         places: Array = self._landmarks.copy()
         for landmark, track in self._led.items():
             if track.stamp >= 0:
-                places[landmark] = track.last if self.is_lost(landmark, now) else track.at(when)
+                places[landmark] = track.at(track.stamp if self.is_lost(landmark, now) else when)
         return places
 
     def messages(self, now: int) -> dict[tuple[int, int], Received]:

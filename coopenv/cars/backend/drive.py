@@ -123,7 +123,13 @@ class DriveRecorder:
     def _write_all(self) -> None:
         due = time.monotonic() + FLUSH
         try:
-            while (item := self._next(due)) is not None:
+            while True:
+                try:
+                    item = self._queue.get(timeout=max(0.0, due - time.monotonic()))
+                except queue.Empty:
+                    item = "", b"", 0
+                if item is None:
+                    return
                 topic, payload, now = item
                 if topic:
                     self._sequence += 1
@@ -135,13 +141,6 @@ class DriveRecorder:
             self._error = error
             while self._queue.get() is not None:
                 pass
-
-    def _next(self, until: float) -> tuple[str, bytes, int] | None:
-        """Return what is to be written next; nothing, without a topic, where nothing comes until then."""
-        try:
-            return self._queue.get(timeout=max(0.0, until - time.monotonic()))
-        except queue.Empty:
-            return "", b"", 0
 
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
@@ -215,7 +214,9 @@ class Drive(TickGenerator):
         if 0 not in indices:
             raise DataError(nothing)
         if container.cut_off:
-            self._warn()
+            times = [m.received if isinstance(m, Arrival) else stamp_of(m) for m in self._messages]
+            over = f"nothing after {(max(times) - min(times)) * 1e-9:.1f} s is replayed"
+            warnings.warn(f"{path}: {CUT_OFF}: {over}", DataWarning, stacklevel=2)
         self._episodes, self._next = indices.count(0), 0
         self.drawn = (0, 0)
         self.stopped = ""
@@ -237,16 +238,6 @@ class Drive(TickGenerator):
         scenario = parse_scenario(raw, f"{self._where}: {ATTACHMENT}")
         deployment = parse_deployment(given, Path(self._where))
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
-
-    def _warn(self) -> None:
-        """Warn of the time at which the file breaks off."""
-        times = [m.received if isinstance(m, Arrival) else stamp_of(m) for m in self._messages]
-        seconds = (max(times) - min(times)) * 1e-9
-        warnings.warn(
-            f"{self._where}: {CUT_OFF}: nothing after {seconds:.1f} s is replayed",
-            DataWarning,
-            stacklevel=3,
-        )
 
     def _read(self, container: "Container") -> Iterator[Any]:
         """Yield the arrivals, and decoded marks of ticks and stops among them."""

@@ -20,6 +20,15 @@ MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""
 
 
+def refusal(arrival: Arrival, verifier: Verifier | None, signers: Collection[str] | None) -> str:
+    """Return why not to read a message: its length, or its signature where only some may sign it; empty: it is read."""
+    if len(arrival.payload) > MOST_BYTES:
+        return "too long"
+    if verifier is None or signers is None:
+        return ""
+    return "" if verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in signers else "signature"
+
+
 class Station:
     """Keeps messages by topic; its callbacks run in threads of the transport and only store."""
 
@@ -51,27 +60,15 @@ class Station:
         waiting = self._waiting.get(arrival.topic)
         if waiting is None:
             return
-        if len(arrival.payload) > MOST_BYTES:
-            self._drop("too long")
-            return
-        if not self._is_genuine(arrival):
-            self._drop("signature")
-            return
+        why = refusal(arrival, self._verifier, self._signers.get(arrival.topic))
         with self._lock:
+            if why:
+                self.dropped[why] += 1
+                return
             if len(waiting) == MOST_WAITING:
                 self.dropped["overflow"] += 1
             waiting.append(arrival)
             self._last[arrival.topic] = time.monotonic()
-
-    def _drop(self, why: str) -> None:
-        with self._lock:
-            self.dropped[why] += 1
-
-    def _is_genuine(self, arrival: Arrival) -> bool:
-        expected = self._signers.get(arrival.topic)
-        if self._verifier is None or expected is None:
-            return True
-        return self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in expected
 
     def drain(self) -> list[Arrival]:
         """Return the messages since the last call, in the order of reception."""
@@ -227,12 +224,9 @@ class Gates:
         return dict(counts) if any(count < 0 for count in since.values()) else since  # the gate was started anew
 
     def _receive(self, arrival: Arrival) -> None:
-        car, v = self._cars[arrival.topic], self._verifier
-        if len(arrival.payload) > MOST_BYTES:
-            self.dropped[car]["too long"] += 1
-            return
-        if v is not None and v.signer(arrival.topic, arrival.payload, arrival.attachment) != car:
-            self.dropped[car]["signature"] += 1
+        car = self._cars[arrival.topic]
+        if why := refusal(arrival, self._verifier, (car,)):
+            self.dropped[car][why] += 1
             return
         try:
             m = decode(arrival.payload, GATE_TYPES[Role.GATE])

@@ -1,7 +1,7 @@
 """Samples of one body at any time between: odometry, motion capture, moving landmarks, camera frames."""
 
 from bisect import bisect_right
-from collections import deque
+from collections import Counter, deque
 from itertools import islice
 
 import numpy as np
@@ -16,13 +16,13 @@ MOST_SAMPLES = 512
 class Odometer:
     """Held twists of one car; times in ns on one clock."""
 
-    def __init__(self) -> None:
+    def __init__(self, refused: Counter[str]) -> None:
+        """Begin with nothing; samples that are older than one of the same kind before are counted in `refused`."""
+        self._refused = refused
         self._samples: deque[tuple[int, Array, Array]] = deque()  # since when, v m/s, omega rad/s
         self._now: tuple[Array, Array] = (np.zeros(3), np.zeros(3))  # held at the last time asked for
         self._newest: tuple[Array | None, Array | None] = (None, None)
         self._stamps: dict[str, int] = {}
-        self.disordered = 0
-        """Samples that were older than one of the same kind before."""
 
     @property
     def stamp(self) -> int | None:
@@ -40,7 +40,7 @@ class Odometer:
         parts = {"linear": twist.linear, "angular": twist.angular}
         known = [name for name, part in parts.items() if part is not None]
         if any(stamp <= self._stamps.get(name, -1) for name in known):
-            self.disordered += 1
+            self._refused["odometry out of order"] += 1
             return
         self._stamps.update(dict.fromkeys(known, stamp))
         v, w = self._newest
@@ -145,11 +145,6 @@ class PlaceTrack:
         """Time of the last position; -1: none was received."""
         return self._places[-1][0] if self._places else -1
 
-    @property
-    def last(self) -> Array:
-        """(3,) the last received position."""
-        return self._places[-1][1]
-
     def put(self, stamp: int, position: Array) -> bool:
         """Take a position (3,); return False where it is older than one before."""
         if stamp <= self.stamp:
@@ -181,30 +176,37 @@ then two come within a tick. More mean that the computer lags behind, and the ol
 class Frames:
     """The queue of one car; times in ns on one clock."""
 
-    def __init__(self) -> None:
+    def __init__(self, refused: Counter[str]) -> None:
+        """Begin with nothing; frames that are not used are counted in `refused`."""
+        self._refused = refused
         self._waiting: deque[tuple[int, Detections]] = deque()
         self._newest = -1
-        self.disordered = 0
-        """Frames that were older than one before."""
-        self.skipped = 0
-        """Frames that were left out because too many waited."""
+        self._skipped = 0  # because too many waited, since the last one was taken
 
     def put(self, stamp: int, frame: Detections) -> None:
         """Take a frame."""
         if stamp <= self._newest:
-            self.disordered += 1
+            self._refused["frame out of order"] += 1
             return
         self._newest = stamp
         self._waiting.append((stamp, frame))
         while len(self._waiting) > MOST_WAITING + 1:
             self._waiting.popleft()
-            self.skipped += 1
+            self._skipped += 1
 
     def take(self, after: int, until: int) -> tuple[int, Detections] | None:
         """Return the oldest frame exposed after a time and by another one; None: there is none."""
+        self._refused["frame left out"] += self._skipped
+        self._skipped = 0
         while self._waiting and self._waiting[0][0] <= after:
             self._waiting.popleft()
-            self.disordered += 1
+            self._refused["frame out of order"] += 1
         if not self._waiting or self._waiting[0][0] > until:
             return None
         return self._waiting.popleft()
+
+    def forget(self, now: int) -> None:
+        """Leave out all frames exposed by now, uncounted."""
+        self._skipped = 0
+        while self._waiting and self._waiting[0][0] <= now:
+            self._waiting.popleft()

@@ -223,20 +223,17 @@ class Watchdog:
                 continue
             try:
                 if self._armed:
-                    self._look()
+                    try:
+                        found = next(self._problems(), None)
+                    except Exception as error:  # a watchdog that fails has to stop the cars
+                        found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
+                    if found is not None:
+                        self.stop(found.reason, found.car)
                 elif self.trip is not None and looked - repeated > REPEAT:
                     repeated = looked
                     self._gates.stop()
             except Exception:  # of the network, during a stop: it is repeated
                 continue
-
-    def _look(self) -> None:
-        try:
-            found = next(self._problems(), None)
-        except Exception as error:  # a watchdog that fails has to stop the cars
-            found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
-        if found is not None:
-            self.stop(found.reason, found.car)
 
     def _problems(self) -> Iterator[Trip]:
         for car in self._cars:

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,16 +21,6 @@ METADATA = "metadata.yaml"
 
 REPAIRS = {".bag": "rosbag reindex", ".mcap": REPAIR, ".db3": "sqlite3 FILE .recover"}
 """By suffix, the tool that mends a file whose recording was cut off."""
-
-
-@dataclass(frozen=True)
-class Raw:
-    """A message as it stands in a bag."""
-
-    topic: str
-    type: str  # ROS 2 name
-    received: int  # ns, clock of the recorder
-    decode: Callable[[], Any]
 
 
 class BagFile:
@@ -91,8 +80,8 @@ class BagFile:
         if wanted - set(store.fielddefs):
             store.register({kind: known.fielddefs[kind] for kind in known.fielddefs if kind not in store.fielddefs})
 
-    def messages(self, topics: Collection[str]) -> Iterator[Raw]:
-        """Yield the messages of some topics in the order of their reception.
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+        """Yield topic, time of reception (ns, recorder's clock) and decoder of messages of some topics, as they came.
 
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
         DataWarning is given.
@@ -111,7 +100,7 @@ class BagFile:
                 connection, received, data = message
                 first = received if first is None else first
                 last = received
-                yield Raw(connection.topic, connection.msgtype, received, self._decoder(connection, data))
+                yield connection.topic, received, self._decoder(connection, data)
         except GeneratorExit:
             raise
         except Exception as error:

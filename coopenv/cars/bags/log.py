@@ -157,17 +157,17 @@ def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: ValueReader, 
     """Return what a file has on the chosen topics, by topic; `stamped`: whether stamps count."""
     wanted = {name for name, entry in chosen.items() if entry.role is not Role.CAMERA_INFO and name in file.topics}
     tracks = {name: Track(chosen[name]) for name in sorted(wanted)}
-    for raw in file.messages(wanted):
-        track = tracks[raw.topic]
+    for topic, received, decode in file.messages(wanted):
+        track = tracks[topic]
         try:
-            message = raw.decode()
+            message = decode()
             stamp = stamp_of(message) if stamped else 0
             value, entry = values.read(track.chosen, message), track.chosen
-            track.entries.append(Sample(entry.car, entry.sample_role, stamp, raw.received, value))
+            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, value))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
-            track.refused[f"{raw.type} has other fields than expected ({error})"] += 1
+            track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
         _leave_out_wild(track)
     return tracks
@@ -284,10 +284,11 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         values = ValueReader(given, binding, _calibrations(files, chosen), chosen.values())
         tracks = [tracks_of(file, chosen, values, given.clocks.mode != "received") for file in files]
     _check(tracks, chosen, where)
-    clocks = _clocks(tracks, given)
+    tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
+    stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
+    clocks = reconcile([delays_of(file) for file in tracks], tolerance, stated)
     samples = _samples(tracks, clocks)
-    notes = (*_refusals(tracks), *_offsets(clocks, given), *_unstamped(tracks, given))
-    return BagLog(samples, rows_of(files, chosen, samples, clocks), notes)
+    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)))
 
 
 def _calibrations(files: Sequence[BagFile], chosen: Mapping[str, Chosen]) -> dict[str, Calibration]:
@@ -295,9 +296,9 @@ def _calibrations(files: Sequence[BagFile], chosen: Mapping[str, Chosen]) -> dic
     found: dict[str, Calibration] = {}
     for file in files:
         for name in [n for n, entry in chosen.items() if entry.role is Role.CAMERA_INFO and n in file.topics]:
-            for raw in file.messages([name]):
+            for _, _, decode in file.messages([name]):
                 try:
-                    value = read(Role.CAMERA_INFO, raw.decode())
+                    value = read(Role.CAMERA_INFO, decode())
                 except CoopenvError as error:
                     raise DataError(f"{file.path}: topic {name}: {error}") from None
                 if isinstance(value, Calibration):
@@ -319,13 +320,6 @@ def _check(tracks: Sequence[Mapping[str, Track]], chosen: Mapping[str, Chosen], 
         raise DataError(f"{where}: topic {name} of {entry.car}: none of {refused.total()} messages is of use: {reason}")
 
 
-def _clocks(tracks: Sequence[Mapping[str, Track]], given: TopicMap) -> Clocks:
-    asked = given.clocks
-    tolerance = asked.tolerance * NS if asked.mode == "auto" else float("inf")
-    stated = {name: round(seconds * NS) for name, seconds in asked.offsets.items()}
-    return reconcile([delays_of(file) for file in tracks], tolerance, stated)
-
-
 def _samples(tracks: Sequence[Mapping[str, Track]], clocks: Clocks) -> tuple[Sample, ...]:
     """Return the samples in the order of their stamps; one that several files have is there once."""
     found: dict[tuple[str, int], Sample] = {}
@@ -338,27 +332,18 @@ def _samples(tracks: Sequence[Mapping[str, Track]], clocks: Clocks) -> tuple[Sam
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
-def _refusals(tracks: Sequence[Mapping[str, Track]]) -> Iterator[str]:
-    for file in tracks:
-        for name, track in file.items():
-            if track.refused:
-                reason, _ = track.refused.most_common(1)[0]
-                count, whole = track.refused.total(), track.refused.total() + len(track.entries)
-                yield f"topic {name}: {count} of {whole} messages left out: {reason}"
-
-
-def _offsets(clocks: Clocks, given: TopicMap) -> Iterator[str]:
+def _notes(tracks: Sequence[Mapping[str, Track]], clocks: Clocks, given: TopicMap) -> Iterator[str]:
+    """Yield what was left out, moved, or used unchanged."""
+    parts = [(name, track) for file in tracks for name, track in file.items()]
+    for name, track in parts:
+        if track.refused:
+            (reason, _), count = track.refused.most_common(1)[0], track.refused.total()
+            yield f"topic {name}: {count} of {count + len(track.entries)} messages left out: {reason}"
     for source, shift in sorted(clocks.shifts.items()):
         if shift.added and source not in given.clocks.offsets:
             yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
         elif not shift.linked:
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
-
-
-def _unstamped(tracks: Sequence[Mapping[str, Track]], given: TopicMap) -> Iterator[str]:
-    if given.clocks.mode == "received":
-        return
-    for file in tracks:
-        for name, track in file.items():
-            if track.entries and not all(entry.stamp for entry in track.entries):
-                yield f"topic {name}: messages without stamps count when they were received"
+    for name, track in parts if given.clocks.mode != "received" else ():
+        if not all(entry.stamp for entry in track.entries):
+            yield f"topic {name}: messages without stamps count when they were received"

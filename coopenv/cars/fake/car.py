@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -27,13 +26,6 @@ LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
 
 
-@dataclass
-class _Timer:
-    period: float  # ns
-    regular: float  # ns, the next time without jitter
-    due: int  # ns, with it
-
-
 class Schedule:
     """Times of several sensors; in ns on one clock."""
 
@@ -45,29 +37,29 @@ class Schedule:
             start: from when on.
             rng: of phases and jitter.
         """
-        self._rng, self._timers = rng, {}
-        for name, rate in rates.items():
-            period = 1e9 / rate
-            timer = _Timer(period, start + period * rng.uniform(0.1, 1.0), 0)
-            self._timers[name] = timer
-            self._draw(timer)
+        self._rng, self._periods = rng, {name: 1e9 / rate for name, rate in rates.items()}
+        self._regular, self._due = dict[str, float](), dict[str, int]()  # the next time, ns, without and with jitter
+        for name, period in self._periods.items():
+            self._regular[name] = start + period * rng.uniform(0.1, 1.0)
+            self._draw(name)
 
     @property
     def next(self) -> int:
         """When something is due next."""
-        return min([timer.due for timer in self._timers.values()])
+        return min(self._due.values())
 
     def until(self, now: int) -> Iterator[tuple[int, str]]:
         """Yield (when, name) of all that is due up to now, in the order of time."""
         while (due := self.next) <= now:
-            name, timer = next((name, timer) for name, timer in self._timers.items() if timer.due == due)
-            timer.regular += timer.period
-            self._draw(timer)
+            name = next(name for name, when in self._due.items() if when == due)
+            self._regular[name] += self._periods[name]
+            self._draw(name)
             if due >= now - LATE:
                 yield due, name
 
-    def _draw(self, timer: _Timer) -> None:
-        timer.due = int(timer.regular + timer.period * JITTER * self._rng.uniform(-1.0, 1.0))
+    def _draw(self, name: str) -> None:
+        jitter = self._periods[name] * JITTER * self._rng.uniform(-1.0, 1.0)
+        self._due[name] = int(self._regular[name] + jitter)
 
 
 REAL = GateClock(time.time_ns, time.monotonic_ns)

@@ -65,14 +65,10 @@ class Faults:
 
     def value(self, kind: str, now: int) -> float:
         """Return the value of a kind of fault, 0 where it does not happen; of several the last that was asked for."""
-        if not self._known:
-            return 0.0
         return next((f.value for _, f in self._active(kind, now)), 0.0)
 
     def clock_error(self, now: int) -> int:
         """Return how far the car's clock is ahead, ns."""
-        if not self._known:
-            return 0
         offset = self.value("clock_offset", now) * 1e9
         drifted = next((f.value * (now - begin) for begin, f in self._active("clock_drift", now)), 0.0)
         return round(offset + drifted)

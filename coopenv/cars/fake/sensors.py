@@ -52,7 +52,7 @@ class CarSensors:
         velocity, turn = self._world.twist
         slip = self._world.view("slip")[0, self._world.vehicle]
         scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
-        self._dead_reckon(now)
+        self.dead_reckon(now)
         self.speed = float(velocity[0] * scale * math.cos(slip[1]) + self._rng.normal() * self._factor * self.wheel_std)
         turned = float(turn[2] * scale + self._rng.normal() * self._factor * self.wheel_turn_std)
         return self.speed, turned if self._differential else 0.0
@@ -62,16 +62,12 @@ class CarSensors:
         _, turn = self._world.twist
         bias = self._world.view("gyro_bias")[0, self._world.vehicle]
         read: Array = turn + bias + self._rng.normal(size=3) * self._factor * self.gyro_std
-        self._dead_reckon(now)
+        self.dead_reckon(now)
         self.turn_rate = float(read[2])
         return read
 
-    def filtered(self, now: int) -> tuple[Array, float, float]:
-        """Return pose, speed and turn rate as the car's own filter has them: the last samples, held and summed."""
-        self._dead_reckon(now)
-        return self.pose.copy(), self.speed, self.turn_rate
-
-    def _dead_reckon(self, now: int) -> None:
+    def dead_reckon(self, now: int) -> None:
+        """Move the filter's pose to a time by the last samples, held and summed."""
         dt = (now - self._since) * 1e-9 if self._since else 0.0
         self._since = now
         middle = self.pose[2] + 0.5 * dt * self.turn_rate
@@ -275,9 +271,14 @@ class SensorPublisher:
         self._send(Role.IMU, "sensor_msgs/msg/Imu", stamp, f"{self._name}/imu", **fields, **unknown)
 
     def _odometry(self, due: int, stamp: int) -> None:
-        (x, y, heading), speed, turn = self._sensors.filtered(due)
+        s = self._sensors
+        s.dead_reckon(due)
+        x, y, heading = s.pose.tolist()
         turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
-        fields = {"pose": {"pose": ((x, y, 0.0), turned)}, "twist": {"twist": ((speed, 0.0, 0.0), (0.0, 0.0, turn))}}
+        fields = {
+            "pose": {"pose": ((x, y, 0.0), turned)},
+            "twist": {"twist": ((s.speed, 0.0, 0.0), (0.0, 0.0, s.turn_rate))},
+        }
         child = f"{self._name}/base_link"
         self._send(Role.ODOMETRY, ODOMETRY, stamp, f"{self._name}/odom", child_frame_id=child, **fields)
 

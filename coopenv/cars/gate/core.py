@@ -97,43 +97,11 @@ def write(fields: Iterable[str], *values: Any) -> bytes:
     return ENCAPSULATION + bytes(body)
 
 
-@dataclass(frozen=True, slots=True)
-class DriveCommand:
-    """ackermann_msgs/AckermannDriveStamped."""
-
-    stamp: int  # ns
-    frame: str
-    steering: float  # rad
-    steering_rate: float  # rad/s
-    speed: float  # m/s
-    acceleration: float  # m/s^2
-    jerk: float  # m/s^3
-
-
-@dataclass(frozen=True, slots=True)
-class Arm:
-    """coopenv_msgs/Arm."""
-
-    stamp: int  # ns
-    frame: str
-    session: str
-    nonce: str
-    armed: bool
-
-
-def read_command(payload: bytes) -> DriveCommand:
-    """Return a command; may hold numbers that are not finite. Raises Malformed: the bytes are none."""
-    return DriveCommand(*read(payload, (STAMP, TEXT, *"fffff")))
-
-
-def read_arm(payload: bytes) -> Arm:
-    """Return a message that arms or disarms. Raises Malformed: the bytes are none."""
-    return Arm(*read(payload, (STAMP, TEXT, TEXT, TEXT, "?")))
-
-
-def read_bool(payload: bytes) -> bool:
-    """Return a std_msgs/Bool. Raises Malformed: the bytes are none."""
-    return bool(read(payload, "?")[0])
+COMMAND = (STAMP, TEXT, *"fffff")
+"""AckermannDriveStamped: steering rad, its rate rad/s, speed m/s, acceleration m/s^2, jerk m/s^3."""
+ARM = (STAMP, TEXT, TEXT, TEXT, "?")
+"""Arm: session, nonce, whether to arm or to disarm."""
+BOOL = ("?",)
 
 
 def write_drive(stamp: int, message: CommandMessage, drive: Drive) -> bytes:
@@ -295,41 +263,46 @@ class Gate:
         return write_status(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts)
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
-        command = read_command(payload)
+        stamp, frame, *numbers = read(payload, COMMAND)
         if self.state not in (GateMode.ARMED, GateMode.TIMED_OUT):
             raise Rejected(Reason.NOT_ARMED)
-        session, _, digits = command.frame.rpartition(":")
+        session, _, digits = frame.rpartition(":")
         if session != self._session:
             raise Rejected(Reason.SESSION)
         if not (digits.isascii() and digits.isdigit() and len(digits) <= MOST_DIGITS):
             raise Rejected(Reason.MALFORMED)
         if int(digits) <= self._sequence:
             raise Rejected(Reason.SEQUENCE)
-        self._check_stamp(command.stamp)
+        self._check_stamp(stamp)
         self._check_signature(Role.COMMAND, payload, attachment)
-        self._check_values(command)
+        if not all(map(math.isfinite, numbers)):
+            self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
+            raise Rejected(Reason.NOT_FINITE)
+        steering, _, speed, _, _ = numbers
+        if not self._limits.permit(speed, steering):
+            raise Rejected(Reason.LIMITS)
         self._sequence, self._accepted = int(digits), self._accepted + 1
-        self._wanted, self._commanded = Drive(command.steering, command.speed), self._clock.steady()
+        self._wanted, self._commanded = Drive(steering, speed), self._clock.steady()
         self._state = GateMode.ARMED
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
-        message = read_arm(payload)
-        self._check_stamp(message.stamp)
+        stamp, _, session, nonce, armed = read(payload, ARM)
+        self._check_stamp(stamp)
         self._check_signature(Role.ARM, payload, attachment)
-        if not message.armed:
+        if not armed:
             if self.state is not GateMode.STOPPED:
                 self._come_to_a_stand(GateMode.DISARMED)
             return
-        if message.nonce != self._nonce:
+        if nonce != self._nonce:
             raise Rejected(Reason.NONCE)
-        if not is_identity(message.session):
+        if not is_identity(session):
             raise Rejected(Reason.SESSION)
-        if message.session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
-            self._session, self._sequence = message.session, -1
+        if session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
+            self._session, self._sequence = session, -1
         self._come_to_a_stand(GateMode.ARMED)
 
     def _stop(self, payload: bytes, _attachment: bytes) -> None:
-        if read_bool(payload) and self._state is not GateMode.STOPPED:
+        if read(payload, BOOL)[0] and self._state is not GateMode.STOPPED:
             self._come_to_a_stand(GateMode.STOPPED)
 
     def _come_to_a_stand(self, state: GateMode) -> None:
@@ -352,14 +325,6 @@ class Gate:
             and known.signer(self._profile.topic_of(self._car, role), payload, attachment) != self._station
         ):
             raise Rejected(Reason.SIGNATURE)
-
-    def _check_values(self, command: DriveCommand) -> None:
-        numbers = (command.steering, command.steering_rate, command.speed, command.acceleration, command.jerk)
-        if not all(map(math.isfinite, numbers)):
-            self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
-            raise Rejected(Reason.NOT_FINITE)
-        if not self._limits.permit(command.speed, command.steering):
-            raise Rejected(Reason.LIMITS)
 
     def _count(self, reason: Reason) -> Reason:
         self._counts[reason] += 1

@@ -59,13 +59,9 @@ class Transport(Protocol):
 
 def matcher(pattern: str) -> Callable[[str], bool]:
     """Return the test whether a topic matches: `*` stands for one part of it, `**` for any number, none included."""
-    parts = ("(?:[^/]+/)*" if part == "**" else _part(part) + "/" for part in pattern.split("/"))
-    expression = re.compile("".join(parts))
+    wild = {"*": "[^/]+/", "**": "(?:[^/]+/)*"}
+    expression = re.compile("".join(wild.get(part, f"{re.escape(part)}/") for part in pattern.split("/")))
     return lambda topic: expression.fullmatch(f"{topic}/") is not None
-
-
-def _part(part: str) -> str:
-    return "[^/]+" if part == "*" else re.escape(part)
 
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")

@@ -3,11 +3,11 @@
 import asyncio
 import base64
 import binascii
+import queue
 import ssl
 import threading
 import time
 import uuid
-from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from typing import Any
@@ -68,9 +68,9 @@ Change = Callable[[str, bool], None]
 class Presence:
     """Names announced by this end and by others, by heartbeats."""
 
-    def __init__(self, send: Callable[[str, bytes], None]) -> None:
-        """Take what sends a heartbeat: (name, payload)."""
-        self._send = send
+    def __init__(self, send: Callable[[str, bytes], None], listen: Callable[[], None] = lambda: None) -> None:
+        """Take what sends a heartbeat, (name, payload), and what begins to receive those of others."""
+        self._send, self._listen, self._listening = send, listen, False
         self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
         self._own: list[str] = []
         self._last: dict[tuple[str, bytes], float] = {}
@@ -90,6 +90,9 @@ class Presence:
             self._watchers.append((matches, callback))
             for name in sorted({name for name, _ in self._last if matches(name)}):
                 callback(name, True)
+            first, self._listening = not self._listening, True
+        if first:
+            self._listen()
 
     def receive(self, name: str, payload: bytes) -> None:
         """Take a heartbeat."""
@@ -145,29 +148,25 @@ class Outbox:
             most: messages of each queue; then the oldest is dropped.
             patience: s that the sender of a reliable message waits before that.
         """
-        self._most, self._patience = most, patience
-        self._urgent: deque[Letter] = deque()
-        self._other: deque[Letter] = deque()
-        self._changed = threading.Condition()
+        self._patience = patience
+        self._urgent, self._other = queue.Queue[Letter](most), queue.Queue[Letter](most)
 
     def put(self, letter: Letter, *, urgent: bool, patient: bool) -> None:
         """Add a message; if there is no room, a patient sender waits for some, and then the oldest goes."""
-        queue = self._urgent if urgent else self._other
-        with self._changed:
-            if patient:
-                self._changed.wait_for(lambda: len(queue) < self._most, self._patience)
-            if len(queue) >= self._most:
-                queue.popleft()
-            queue.append(letter)
+        letters = self._urgent if urgent else self._other
+        while True:
+            try:
+                return letters.put(letter, patient, self._patience)
+            except queue.Full:
+                with suppress(queue.Empty):
+                    letters.get_nowait()
 
     def take(self) -> Letter | None:
         """Return the next message; None: there is none."""
-        with self._changed:
-            queue = self._urgent or self._other
-            if not queue:
-                return None
-            self._changed.notify_all()
-            return queue.popleft()
+        for letters in (self._urgent, self._other):
+            with suppress(queue.Empty):
+                return letters.get_nowait()
+        return None
 
 
 HEARTBEATS = "presence/"
@@ -196,8 +195,8 @@ class Nats:
         self._client: Any = None
         self._outbox = Outbox(MOST_WAITING, PATIENCE)
         self._wake = asyncio.Event()
-        self._presence = Presence(lambda name, payload: self.publish(HEARTBEATS + name, payload))
-        self._watching = False
+        self._presence = Presence(lambda name, payload: self.publish(HEARTBEATS + name, payload), self._hear)
+        self.announce, self.watch = self._presence.announce, self._presence.watch
         self._closed = False
 
     def open(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
@@ -249,20 +248,11 @@ class Nats:
 
         self._listen(pattern, arrive)
 
-    def announce(self, name: str) -> None:
-        """Announce, see `Transport`."""
-        self._presence.announce(name)
+    def _hear(self) -> None:
+        async def receive(message: Any) -> None:
+            self._presence.receive(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
 
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`."""
-        self._presence.watch(pattern, callback)
-        if not self._watching:
-            self._watching = True
-
-            async def receive(message: Any) -> None:
-                self._presence.receive(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
-
-            self._listen(HEARTBEATS + "**", receive)
+        self._listen(HEARTBEATS + "**", receive)
 
     def _listen(self, pattern: str, arrive: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         async def subscribe() -> None:

@@ -7,7 +7,7 @@ import struct
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from http.client import HTTPConnection
@@ -145,8 +145,8 @@ class Ros1:
         self._publishers: dict[str, Any] = {}
         self._wanted: list[tuple[str, Callback]] = []
         self._subscribers: dict[tuple[int, str], Any] = {}  # by place in `_wanted` and topic
-        self._presence = Presence(lambda name, payload: self.publish(PRESENCE, payload, name.encode()))
-        self._watching = False
+        self._presence = Presence(lambda name, payload: self.publish(PRESENCE, payload, name.encode()), self._hear)
+        self.announce, self.watch = self._presence.announce, self._presence.watch
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="ros1", daemon=True)
         self._thread.start()
@@ -212,18 +212,10 @@ class Ros1:
                     if matches(topic) and (place, topic) not in self._subscribers and not self._ended.is_set():
                         self._subscribe(place, topic)
 
-    def announce(self, name: str) -> None:
-        """Announce, see `Transport`."""
-        self._presence.announce(name)
-
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`."""
-        self._presence.watch(pattern, callback)
+    def _hear(self) -> None:
         with self._lock:
-            if not self._watching:
-                self._watching = True
-                self._wanted.append((PRESENCE, self._heartbeat))
-                self._subscribe(len(self._wanted) - 1, PRESENCE)
+            self._wanted.append((PRESENCE, self._heartbeat))
+            self._subscribe(len(self._wanted) - 1, PRESENCE)
 
     def _heartbeat(self, arrival: Arrival) -> None:
         self._presence.receive(arrival.attachment.decode(errors="replace"), arrival.payload)
