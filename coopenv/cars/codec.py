@@ -169,23 +169,29 @@ def make(kind: str, **fields: Any) -> Any:
 
     A message within it may be given by its fields, as a dictionary or in their order: a vector as (x, y, z).
     """
-    made, known = _type(kind)
-    for name, value in known:
+    made, zeros, parts = _type(kind)
+    for name, value in parts:
         fields[name] = value(fields.get(name))
-    return made(**fields)
+    return made(**{**zeros, **fields})
 
 
 @cache
-def _type(kind: str) -> tuple[Any, list[tuple[str, Callable[[Any], Any]]]]:
-    """Return the class of a type, and what makes the value of each field of what is given, or of None."""
-    store = ros2()
-    return store.types[kind], [(name, _field(node)) for name, node in store.fielddefs[kind][1]]
+def _type(kind: str) -> tuple[Any, dict[str, Any], list[tuple[str, Callable[[Any], Any]]]]:
+    """Return the class of a type, the zeros of its numbers and texts, and what makes its other fields."""
+    store, zeros, parts = ros2(), dict[str, Any](), []
+    for name, node in store.fielddefs[kind][1]:
+        if node[0].name == "BASE":
+            zeros[name] = "" if node[1][0] == "string" else np.zeros(1, dtype=node[1][0])[0].item()
+        else:
+            parts.append((name, _field(node)))
+    return store.types[kind], zeros, parts
 
 
 def _field(node: Any) -> Callable[[Any], Any]:
-    """Return what makes a field's value; `node` is the field as rosbags describes it."""
+    """Return what makes a message or a list within a message; `node` is the field as rosbags describes it."""
     kind, of = node
     if kind.name == "NAME":
+        names = [name for name, _ in ros2().fielddefs[of][1]]
 
         def nested(given: Any) -> Any:
             if given is None:
@@ -193,20 +199,19 @@ def _field(node: Any) -> Callable[[Any], Any]:
             if isinstance(given, dict):
                 return make(of, **given)
             if isinstance(given, tuple | list | np.ndarray):
-                parts = given.tolist() if isinstance(given, np.ndarray) else given
-                return make(of, **{name: part for (name, _), part in zip(_type(of)[1], parts, strict=True)})
+                values = given.tolist() if isinstance(given, np.ndarray) else given
+                return make(of, **dict(zip(names, values, strict=True)))
             return given
 
         return nested
-    if kind.name == "BASE":
-        zero = "" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()
-        return lambda given: zero if given is None else given
     (name, element), length = of[0], of[1] if kind.name == "ARRAY" else 0
-    if name.name == "BASE" and element[0] != "string":
-        dtype = np.dtype(element[0])
-        return lambda given: np.zeros(length, dtype) if given is None else np.asarray(given, dtype).ravel()
-    part = _field(of[0])
-    return lambda given: [part(entry) for entry in given or [None] * length]
+    if name.name == "NAME":
+        part = _field(of[0])
+        return lambda given: [part(entry) for entry in given or [None] * length]
+    if element[0] == "string":
+        return lambda given: given or [""] * length
+    dtype = np.dtype(element[0])
+    return lambda given: np.zeros(length, dtype) if given is None else np.asarray(given, dtype).ravel()
 
 
 def header(stamp: int, frame: str = "") -> Any:

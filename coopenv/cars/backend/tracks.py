@@ -196,8 +196,9 @@ class Frames:
 
     def take(self, after: int, until: int) -> tuple[int, Detections] | None:
         """Return the oldest frame exposed after a time and by another one; None: there is none."""
-        self._refused["frame left out"] += self._skipped
-        self._skipped = 0
+        if self._skipped:
+            self._refused["frame left out"] += self._skipped
+            self._skipped = 0
         while self._waiting and self._waiting[0][0] <= after:
             self._waiting.popleft()
             self._refused["frame out of order"] += 1
