@@ -239,17 +239,28 @@ def test_a_camera_of_another_calibration_is_not_trusted(lab: Any, tmp_path: Path
     refuses(path, hub, "its camera publishes focal_length = .* the environment has")
 
 
-def test_cars_that_come_too_close_are_stopped(lab: Any, tmp_path: Path) -> None:
-    _, hub, _ = lab
-    env = env_of(cars(write_fleet(tmp_path, safety=PATIENT + "separation = 0.7\n"), hub))
+@pytest.mark.parametrize(
+    ("safety", "second", "why"),
+    [
+        ("separation = 0.7\n", -1.0, "m from svea1, 0.7 m is the least"),
+        ("geofence = [[-9, -9], [9, -9], [9, AHEAD], [-9, AHEAD]]\n", 1.0, "svea1: left the geofence at ("),
+    ],
+)
+def test_cars_that_break_a_rule_are_stopped(lab: Any, tmp_path: Path, safety: str, second: float, why: str) -> None:
+    path, hub, made = lab
+    env = env_of(cars(path, hub))
+    env.reset(seed=0)  # puts the cars at their start
+    env.close()
+    fence = safety.replace("AHEAD", str(max(place(made, car)[1] for car in made) + 0.4))
+    env = env_of(cars(write_fleet(tmp_path, safety=PATIENT + fence), hub))
     try:
         env.reset(seed=0, options={"arm": True})
         infos: dict[str, Any] = {}
         for _ in range(100):
             if not env.agents:
                 break
-            infos = env.step({"vehicle_1": np.array([1.0, 0.0]), "vehicle_2": np.array([-1.0, 0.0])})[-1]
-        assert not env.agents and "m from svea1, 0.7 m is the least" in infos["vehicle_1"]["car"]["stopped"]
+            infos = env.step({"vehicle_1": np.array([1.0, 0.0]), "vehicle_2": np.array([second, 0.0])})[-1]
+        assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
     finally:
         env.close()
 
