@@ -218,7 +218,6 @@ def test_covariances_turn_to_the_map_as_errors_do(coordinates: Coordinates) -> N
 
 def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> None:
     """Undistorted pixels of the annotations, by the calibration in the file, are the bearings again."""
-    from coopenv.cars.readings import directions
     from coopenv.estimation.lens import undistort
 
     made, _, log, _ = crossing
@@ -236,7 +235,8 @@ def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> 
             flat, there = undistort(((pixel - K[:2, 2]) / K[[0, 1], [0, 1]])[None], tuple(calibration.D))
             bearing = made.bearings[3 * n, 0, names.index(label.text)]
             assert there.all()
-            np.testing.assert_allclose(R @ directions(flat)[0], bearing, atol=1e-5)
+            ray = R @ np.append(flat[0], 1.0)
+            np.testing.assert_allclose(ray / np.linalg.norm(ray), bearing, atol=1e-5)
             seen += 1
     assert seen > 20
     (image,) = log["/vehicle_1/camera/image"]
