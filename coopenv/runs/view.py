@@ -14,7 +14,6 @@ from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
-from coopenv.viz.web.actors import SentProperties
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim, guarded_server
 from coopenv.viz.web.panel import NO_FAULT, History, Panel
@@ -46,7 +45,6 @@ class Viewer:
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
-        self._root = SentProperties(self._picture.ground.root)
         vehicles = {i: i for i in range(self._stage.vehicles)}
         self._picture.actors.cars.handle.on_click(
             lambda event: self._panel.wish("vehicle", event.instance_index, vehicles)
@@ -117,7 +115,7 @@ class Viewer:
             place = np.zeros(3)
             if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
                 place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
-            self._root.set(position=tuple(np.round(place, 4).tolist()))
+            self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
             self._panel.show(self._frame, self._history, now, exact=not self.playing)
         self._shown_at = now
         self.shown += 1

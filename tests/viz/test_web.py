@@ -17,9 +17,9 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source, Stage
-from coopenv.viz.web.actors import placed
-from coopenv.viz.web.ground import GAIN, linear, spacing_of
+from coopenv.viz.web.ground import linear, placed, spacing_of
 from coopenv.viz.web.page import has_viser, viser_module, write_replay
+from coopenv.viz.web.panel import GAIN
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, levels, useful_magnification
 
 msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
@@ -76,11 +76,10 @@ def test_titles_cannot_bring_code_along(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", coopenv.list_envs())
-def test_every_environment_can_be_drawn(name: str) -> None:
-    from coopenv.viz.web.page import replay_html
-
+def test_every_environment_can_be_drawn(name: str, tmp_path: Path) -> None:
     scenario = coopenv.load_scenario(name, {"horizon": 1.0})
-    length, _ = messages(replay_html(scene_of(Engine(scenario), Source.of(name, scenario, seed=1))))
+    path = write_replay(scene_of(Engine(scenario), Source.of(name, scenario, seed=1)), tmp_path / "replay.html")
+    length, _ = messages(path.read_text(encoding="utf-8"))
     assert length == pytest.approx(1.0, abs=0.21)
 
 

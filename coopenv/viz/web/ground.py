@@ -1,20 +1,16 @@
-"""The static part of the scene in the browser: floor, grid, roads and buildings; looks, legend and meshes."""
+"""Parts of the scene in the browser: meshes, nodes of copies and of lines; floor, grid, roads and buildings."""
 
 from dataclasses import dataclass
-from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
 from coopenv.viz.drawing import linear_light
-from coopenv.viz.scene import Source, Stage
-from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.scene import Stage
 from coopenv.viz.topview_geometry import road_corners
-from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF, TRAFFIC
-
-_AT_ONCE = 4  # names and fields of view in a frame while it plays
+from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
 
 
 @dataclass
@@ -36,16 +32,9 @@ class Look:
     names: bool = True
 
 
-def in_turn(turn: int | None, count: int) -> slice:
-    """Return which of so many names, or fields of view, are sent in a turn: half, at most four; None: all of them."""
-    parts = max(2, -(-count // _AT_ONCE))
-    return slice(None) if turn is None else slice(turn % parts, None, parts)
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
+def rgb(colour: str) -> np.ndarray:
     """Return a colour of Matplotlib as three whole numbers up to 255."""
-    r, g, b = (round(255 * part) for part in to_rgb(colour))
-    return r, g, b
+    return np.round(255.0 * np.array(to_rgb(colour))).astype(np.uint8)
 
 
 def linear(colours: np.ndarray) -> np.ndarray:
@@ -53,80 +42,8 @@ def linear(colours: np.ndarray) -> np.ndarray:
     return np.asarray(np.round(255.0 * linear_light(np.asarray(colours, float) / 255.0)), np.uint8)
 
 
-def vehicle_colours(count: int) -> np.ndarray:
-    """Return (N, 3) uint8, the colour of each vehicle."""
-    return np.array([rgb(vehicle_colour(i)) for i in range(count)], np.uint8).reshape(-1, 3)
-
-
-_ROW = "display:flex;gap:8px;align-items:center;line-height:1.45"
-GAIN = "P is a gain matrix of this observer, not a covariance: its ellipsoids are not bounds of the error."
-
-
-def ellipsoid_words(source: Source, magnification: float) -> str:
-    """Return the legend of an ellipsoid."""
-    times = f", {magnification:g} times as large" if magnification != 1.0 else ""
-    return f"3σ of the estimate{times}" if source.honest else f"observer's P{times} (gain, no covariance)"
-
-
-def marks(stage: Stage, source: Source, magnification: float) -> list[tuple[str, str]]:
-    """Return drawings and words of the marks that can occur."""
-    s = stage.scenario
-    sensed = s.topology.mode == "sensed"
-    entries = [
-        (True, _block(BLUE, 1.0), "vehicle, true"),
-        (True, _block(BLUE, 0.3), "its estimate; a dashed line joins both"),
-        (True, _disc(BLUE, 0.25), ellipsoid_words(source, magnification)),
-        (stage.sees_a_part, _block(BLUE, 0.15), "field of view"),
-        (True, _line(BLUE), "sees (colour of the observing vehicle)"),
-        (sensed and bool(s.obstacles), _line(GREY), "hidden by a building, where the line ends"),
-        (sensed, _line(INK), "hidden by a body, where the line ends"),
-        (any(camera.miss_probability > 0 for camera in s.cameras), _line(BLUE, "2 4"), "in view, but missed"),
-        (stage.landmarks > 0, _disc(DARK_BLUE, 1.0), "landmark"),
-        (stage.vehicles > 1, _disc(BLUE, 1.0, 3), "V2X message on its way"),
-        (any(vehicle.goal_radius > 0 for vehicle in s.vehicles), _ring(BLUE), "its goal, at the end of its route"),
-        (s.highway is not None, _block(TRAFFIC, 1.0), "other traffic"),
-    ]
-    return [(drawing, words) for occurs, drawing, words in entries if occurs]
-
-
-def legend_html(stage: Stage, source: Source, magnification: float) -> str:
-    """Return the legend as HTML."""
-    rows = "".join(
-        f'<div style="{_ROW}"><span style="flex:none">{drawing}</span><span>{escape(words)}</span></div>'
-        for drawing, words in marks(stage, source, magnification)
-    )
-    note = f'<div style="margin-top:6px;color:#8A3B00"><b>{escape(GAIN)}</b></div>' if not source.honest else ""
-    return rows + note
-
-
-def swatch(colour: str) -> str:
-    """Return a small square in a colour, beside which text stands in ink: many colours are too pale for text."""
-    look = f"width:9px;height:9px;background:{colour};border:1px solid {INK}"
-    return f'<span style="display:inline-block;{look}"></span>'
-
-
-def _svg(content: str) -> str:
-    return f'<svg width="22" height="12" viewBox="0 0 22 12" style="vertical-align:middle">{content}</svg>'
-
-
-def _block(colour: str, opacity: float) -> str:
-    look = f'fill="{colour}" fill-opacity="{opacity:g}" stroke="{colour}"'
-    return _svg(f'<rect x="2" y="2" width="18" height="8" {look}/>')
-
-
-def _disc(colour: str, opacity: float, radius: int = 5) -> str:
-    return _svg(f'<circle cx="11" cy="6" r="{radius}" fill="{colour}" fill-opacity="{opacity:g}" stroke="{colour}"/>')
-
-
-def _ring(colour: str) -> str:
-    return _svg(f'<circle cx="11" cy="6" r="5" fill="none" stroke="{colour}" stroke-width="2"/>')
-
-
-def _line(colour: str, dashes: str = "") -> str:
-    return _svg(f'<path d="M1 6H21" stroke="{colour}" stroke-width="2" stroke-dasharray="{dashes or "none"}"/>')
-
-
 Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (V, 3) and faces (F, 3)."""
 
 _SIDES = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7), (3, 2, 1, 0))
 _FACES = np.array([t for a, b, c, d in _SIDES for t in ((a, b, c), (a, c, d))], np.uint32)
@@ -140,12 +57,6 @@ def _prism(low: tuple[float, ...], high: tuple[float, ...], bottom: float, top: 
     return np.array(rings, np.float32), _FACES
 
 
-def _joined(*parts: Mesh) -> Mesh:
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
-    faces = [faces + np.uint32(offset) for (_, faces), offset in zip(parts, offsets, strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
-
-
 def box() -> Mesh:
     """Return a cube of edge 1 about the origin."""
     return _prism((-0.5, 0.5, 0.5), (-0.5, 0.5, 0.5), -0.5, 0.5)
@@ -153,8 +64,9 @@ def box() -> Mesh:
 
 def car() -> Mesh:
     """Return a car in the cube of edge 1, which looks along x: a hull, and a cabin nearer to the rear."""
-    hull = _prism((-0.5, 0.5, 0.5), (-0.48, 0.44, 0.46), -0.5, 0.05)
-    return _joined(hull, _prism((-0.42, 0.2, 0.42), (-0.34, 0.04, 0.33), 0.05, 0.5))
+    hull, _ = _prism((-0.5, 0.5, 0.5), (-0.48, 0.44, 0.46), -0.5, 0.05)
+    cabin, _ = _prism((-0.42, 0.2, 0.42), (-0.34, 0.04, 0.33), 0.05, 0.5)
+    return np.concatenate([hull, cabin]), np.concatenate([_FACES, _FACES + np.uint32(len(hull))])
 
 
 def arrow() -> Mesh:
@@ -164,57 +76,140 @@ def arrow() -> Mesh:
     return np.array([*bonnet, *roof], np.float32), np.array([(0, 1, 2), (3, 4, 5)], np.uint32)
 
 
+def _turned(radius: np.ndarray, height: np.ndarray, sides: int) -> Mesh:
+    """Return the surface of a profile, from above to below, that is turned about z."""
+    angle = np.linspace(0.0, 2 * np.pi, sides, endpoint=False)
+    rings = [np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), np.outer(height, np.ones(sides))]
+    i, j = np.meshgrid(np.arange(len(radius) - 1) * sides, np.arange(sides), indexing="ij")
+    a, b = i + j, i + (j + 1) % sides
+    faces = np.stack([a, a + sides, b, b, a + sides, b + sides], -1).reshape(-1, 3)
+    return np.stack(rings, axis=-1).reshape(-1, 3).astype(np.float32), faces.astype(np.uint32)
+
+
 def sphere(rings: int = 10) -> Mesh:
     """Return a sphere of radius 1."""
-    polar, around = np.linspace(0.0, np.pi, rings + 1), np.linspace(0.0, 2 * np.pi, 2 * rings, endpoint=False)
-    theta, phi = np.meshgrid(polar, around, indexing="ij")
-    points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    n = len(around)
-    i, j = np.meshgrid(np.arange(rings) * n, np.arange(n), indexing="ij")
-    a, b = i + j, i + (j + 1) % n
-    faces = np.stack([np.stack([a, a + n, b], -1), np.stack([b, a + n, b + n], -1)], -2).reshape(-1, 3)
-    return points.reshape(-1, 3).astype(np.float32), faces.astype(np.uint32)
+    polar = np.linspace(0.0, np.pi, rings + 1)
+    return _turned(np.sin(polar), np.cos(polar), 2 * rings)
 
 
-def pole(sides: int = 8) -> Mesh:
+def pole() -> Mesh:
     """Return a pole of radius 1 from z = 0 to 1."""
-    angle = np.linspace(0.0, 2 * np.pi, sides, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], axis=-1)
-    k = np.arange(sides)
-    n = (k + 1) % sides
-    faces = np.concatenate([np.stack([k, n, k + sides], -1), np.stack([n, n + sides, k + sides], -1)])
-    return np.concatenate([ring, ring + np.array([0.0, 0.0, 1.0])]).astype(np.float32), faces.astype(np.uint32)
+    return _turned(np.ones(2), np.array([1.0, 0.0]), 8)
 
 
-def quad(corners: np.ndarray, z: float) -> Mesh:
+def _quad(corners: np.ndarray, z: float) -> Mesh:
     """Return a flat quadrilateral of corners (4, 2), which follow one another, at a height; it is seen from above."""
-    points = np.column_stack([corners, np.full(4, z)])
-    first, second = corners[1] - corners[0], corners[2] - corners[0]
-    if first[0] * second[1] - first[1] * second[0] < 0:
-        points = points[::-1]
+    (x, y), (u, v) = corners[1] - corners[0], corners[2] - corners[0]
+    points = np.column_stack([corners, np.full(4, z)])[:: 1 if x * v - y * u >= 0 else -1]
     return points.astype(np.float32), np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 
 
-def circle(radius: float, points: int = 32) -> np.ndarray:
-    """Return a circle as segments (K, 2, 3) about the origin."""
-    angle = np.linspace(0.0, 2 * np.pi, points + 1)
-    ring = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(points + 1)], axis=-1)
-    return np.stack([ring[:-1], ring[1:]], axis=1)
+class Placed(NamedTuple):
+    """Where copies are; those that are not there have size zero."""
+
+    wxyzs: np.ndarray  # (N, 4)
+    positions: np.ndarray  # (N, 3) m
+    scales: np.ndarray  # (N, 3) m
+
+
+def placed(rotation: np.ndarray | None, position: np.ndarray, scale: np.ndarray, turn: float = 2.0**-11) -> Placed:
+    """Return copies at positions (N, 3) with rotations (N, 3, 3; None: upright) and sizes (N, 3), NaN: not there.
+
+    Quaternions are given in steps of `turn`.
+    """
+    R = np.broadcast_to(np.eye(3), (len(position), 3, 3)) if rotation is None else rotation
+    there = np.isfinite(np.concatenate([position, scale, R.reshape(-1, 9)], axis=1)).all(axis=1)[:, None]
+    whole = Rotation.from_matrix(np.where(there[..., None], R, np.eye(3)))
+    turned = fine(whole.as_quat(canonical=True, scalar_first=True), turn)
+    return Placed(turned, *(np.where(there, part, 0.0).astype(np.float32) for part in (position, scale)))
+
+
+def fine(values: np.ndarray, step: float) -> np.ndarray:
+    """Return values in whole steps, in single precision: a file of them can be packed better."""
+    return (np.round(np.asarray(values, float) / step) * step).astype(np.float32)
+
+
+class Batch:
+    """A node with copies of a mesh."""
+
+    def __init__(self, scene: Any, name: str, mesh: Mesh, colours: np.ndarray, **look: Any) -> None:
+        """Add them, one per colour (N, 3), to be placed; of none there is no node."""
+        count = len(colours)
+        self.handle: Any = None
+        """viser's."""
+        if count:
+            self.handle = scene.add_batched_meshes_simple(
+                name,
+                *mesh,
+                np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+                np.zeros((count, 3)),
+                batched_scales=np.zeros((count, 3)),
+                batched_colors=linear(colours),
+                lod="off",
+                **{**_FLAT, **look},
+            )
+
+    def put(self, places: Placed, shown: bool = True) -> None:
+        """Put the copies to their places."""
+        if self.handle is not None:
+            self.handle.visible = shown
+            if shown:
+                self.handle.batched_wxyzs, self.handle.batched_positions, self.handle.batched_scales = places
+
+
+Coloured = tuple[np.ndarray, np.ndarray]
+"""Segments (K, 2, 3), m, and their colours (K, 3) uint8."""
+NOTHING: Coloured = np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
+_GROWTH = 32  # segments by which the arrays grow
+
+
+class Segments:
+    """A node of line segments whose number changes.
+
+    Arrays have room for more, so that they seldom change their shape; unused segments lie in a single point.
+    """
+
+    def __init__(self, scene: Any, name: str, thickness: float, step: float) -> None:
+        """Begin with none; the thickness is in pixels, and ends are given in steps, m."""
+        self._scene, self._name, self._step = scene, name, step
+        self._handle: Any = None
+        self._look = {"thickness": thickness, "thickness_units": "screen"}
+        self._room = 0
+
+    def show(self, segments: Coloured) -> None:
+        """Show segments; those with NaN are left out."""
+        points, colours = fine(segments[0], self._step), segments[1]
+        good = np.isfinite(points).all(axis=(1, 2))
+        points, colours = points[good], colours[good]
+        if self._handle is not None:
+            self._handle.visible = len(points) > 0
+        if not len(points):
+            return
+        grown = len(points) > self._room
+        if grown:
+            self._room = -(-len(points) // _GROWTH) * _GROWTH
+        rest = self._room - len(points)
+        whole = np.concatenate([points, np.broadcast_to(points[0, 0], (rest, 2, 3))])
+        shade = linear(np.concatenate([colours, np.tile(colours[:1], (rest, 1))]))[:, None].repeat(2, axis=1)
+        if grown:
+            self._handle = self._scene.add_line_segments(self._name, whole, shade, **self._look)
+        else:
+            self._handle.points, self._handle.colors = whole, shade
+
+
+def dashes(start: np.ndarray, end: np.ndarray, count: int, share: float) -> np.ndarray:
+    """Return lines from start to end (K, 3) in so many dashes, which take up a share of them: (count K, 2, 3)."""
+    at = np.arange(count)[:, None, None] / count
+    return np.stack([start + at * (end - start), start + (at + share / count) * (end - start)], axis=2).reshape(
+        -1, 2, 3
+    )
 
 
 ROOT = "/world"
 """The node that everything hangs on; moving it moves the world."""
-SOLID, FADED = 0.8, 0.15
-"""Opacity of buildings, and of buildings in front of the picked vehicle."""
+_SOLID, _FADED = 0.8, 0.15  # opacity of buildings, and of those in front of the picked vehicle
 _GRID = "#DEDBD1"
-
-
-def height_of(stage: Stage) -> float:
-    """Return the height of the floor, m: below the vehicles as they start, and no higher than the map's own."""
-    size, center = stage.bodies
-    starts = [v.initial_pose.position[2] for v in stage.scenario.vehicles if v.initial_pose and v.initial_pose.position]
-    lowest = min(starts, default=stage.origin[2]) - stage.origin[2]
-    return float(lowest + np.min(center[:, 2] - size[:, 2] / 2))
+_FLAT = {"cast_shadow": False, "receive_shadow": False}
 
 
 def spacing_of(side: float) -> float:
@@ -223,83 +218,78 @@ def spacing_of(side: float) -> float:
     return float(power * max(factor for factor in (1, 2, 5) if factor * power <= side / 10 + 1e-9))
 
 
-def _light(scene: Any, side: float) -> None:
-    """Light the scene evenly, so that colours are those of the figures."""
-    scene.configure_environment_map(None)
-    scene.configure_default_lights(False, False)
-    scene.add_light_ambient("/light/everywhere", intensity=3.0)
-    scene.add_light_directional("/light/sun", intensity=0.9, position=(-0.5 * side, -0.9 * side, 1.6 * side))
-
-
 class Ground:
     """Floor, roads and buildings."""
 
     def __init__(self, scene: Any, stage: Stage) -> None:
         """Draw them; `scene` is viser's."""
-        self._stage, self.z = stage, height_of(stage)
-        self.spacing = spacing_of(stage.side)
+        self._scene, self._stage = scene, stage
+        size, center = stage.bodies
+        starts = [
+            v.initial_pose.position[2] for v in stage.scenario.vehicles if v.initial_pose and v.initial_pose.position
+        ]
+        lowest = min(starts, default=stage.origin[2]) - stage.origin[2]
+        self.z = float(lowest + np.min(center[:, 2] - size[:, 2] / 2))
+        """Height of the floor, m: below the vehicles as they start, and no higher than the map's own."""
+        self.step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
+        """Of positions, m."""
         self.root = scene.add_frame(ROOT, show_axes=False)
         """viser's handle of the node that everything hangs on."""
-        _light(scene, stage.side)
-        self._floor(scene)
-        self._roads(scene)
-        self.buildings = [self._building(scene, i) for i in range(len(stage.scenario.obstacles))]
+        scene.configure_environment_map(None)  # light is even, so that colours are those of the figures
+        scene.configure_default_lights(False, False)
+        scene.add_light_ambient("/light/everywhere", intensity=3.0)
+        sun = tuple(stage.side * np.array([-0.5, -0.9, 1.6]))
+        scene.add_light_directional("/light/sun", intensity=0.9, position=sun)
+        self._add_floor()
+        self._add_roads()
+        self._buildings = [
+            scene.add_box(
+                f"{ROOT}/buildings/{i}",
+                dimensions=tuple(building.size),
+                color=rgb(ROOF),
+                opacity=_SOLID,
+                position=tuple(building.center),
+                wxyz=tuple(Rotation.from_matrix(building.rotation).as_quat(scalar_first=True)),
+                cast_shadow=False,
+            )
+            for i, building in enumerate(stage.buildings)
+        ]
 
     def fade(self, hidden: set[int]) -> None:
         """Make the buildings of these indices transparent, and all other ones solid."""
-        for i, building in enumerate(self.buildings):
-            building.opacity = FADED if i in hidden else SOLID
+        for i, building in enumerate(self._buildings):
+            building.opacity = _FADED if i in hidden else _SOLID
 
-    def _floor(self, scene: Any) -> None:
-        side, spacing = self._stage.side, self.spacing
+    def _add_floor(self) -> None:
+        side, spacing = self._stage.side, spacing_of(self._stage.side)
         middle = (self._stage.low + self._stage.high) / 2
-        even = np.round(middle / spacing) * spacing
-        flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         corners = middle + 0.75 * side * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        floor = quad(corners, self.z - 0.004 * side)
-        scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **flat)
+        floor = _quad(corners, self.z - 0.004 * side)
+        self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **_FLAT)
         count = int(np.ceil(0.7 * side / spacing))
         at, reach = spacing * np.arange(-count, count + 1), spacing * count
         lines = [np.array([(x, -reach, 0.0), (x, reach, 0.0)]) for x in at]
         lines += [line[:, [1, 0, 2]] for line in lines]
-        place = (*even, self.z - 0.003 * side)
+        place = (*(np.round(middle / spacing) * spacing), self.z - 0.003 * side)
         look = {"thickness": 1.0, "thickness_units": "screen", "position": place}
-        scene.add_line_segments(f"{ROOT}/grid", np.array(lines), linear(np.array(rgb(_GRID))), **look)
+        self._scene.add_line_segments(f"{ROOT}/grid", np.array(lines), linear(rgb(_GRID)), **look)
         edge = (float(middle[0]), float(self._stage.low[1] + 0.02 * side), self.z)
         unit = f"grid {spacing:g} m" if spacing >= 1 else f"grid {100 * spacing:g} cm"
-        scene.add_label(f"{ROOT}/scale", unit, position=edge, font_screen_scale=0.85, anchor="top-center")
+        self._scene.add_label(f"{ROOT}/scale", unit, position=edge, font_screen_scale=0.85, anchor="top-center")
 
-    def _roads(self, scene: Any) -> None:
+    def _add_roads(self) -> None:
         side, origin = self._stage.side, self._stage.origin[:2]
+        marks = [np.zeros((0, 2, 3))]
         for i, road in enumerate(self._stage.scenario.roads):
-            z = self.z - side * (2e-3 - 1e-4 * (i % 8))
-            mesh = quad(road_corners(road.start, road.end, road.width) - origin, z)
-            scene.add_mesh_simple(
-                f"{ROOT}/roads/{i}", *mesh, color=rgb(ASPHALT), cast_shadow=False, receive_shadow=False
+            mesh = _quad(
+                road_corners(road.start, road.end, road.width) - origin, self.z - side * (2e-3 - 1e-4 * (i % 8))
             )
-        dashes = [dash for road in self._stage.scenario.roads if road.marked for dash in self._dashes(road)]
-        if dashes:
-            points = np.array(dashes)
-            scene.add_line_segments(f"{ROOT}/marks", points, (255, 255, 255), thickness=2.0, thickness_units="screen")
-
-    def _dashes(self, road: Any) -> list[np.ndarray]:
-        start, end = (np.array([*p, 0.0]) - [*self._stage.origin[:2], 0.0] for p in (road.start, road.end))
-        count = max(1, int(np.linalg.norm(end - start) / (0.04 * self._stage.side)))
-        share = np.arange(count)[:, None] / count
-        first = start + share * (end - start)
-        dashes = np.stack([first, first + 0.55 * (end - start) / count], axis=1)
-        dashes[..., 2] = self.z - 5e-4 * self._stage.side
-        return list(dashes)
-
-    def _building(self, scene: Any, index: int) -> Any:
-        box = self._stage.buildings[index]
-        quaternion = Rotation.from_matrix(box.rotation).as_quat(scalar_first=True)
-        return scene.add_box(
-            f"{ROOT}/buildings/{index}",
-            dimensions=tuple(box.size),
-            color=rgb(ROOF),
-            opacity=SOLID,
-            position=tuple(box.center),
-            wxyz=tuple(quaternion),
-            cast_shadow=False,
-        )
+            self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(ASPHALT), **_FLAT)
+            if road.marked:
+                start, end = (np.array([[*(p - origin), self.z - 5e-4 * side]]) for p in (road.start, road.end))
+                count = max(1, int(np.linalg.norm(end - start) / (0.04 * side)))
+                marks.append(dashes(start, end, count, 0.55))
+        points = np.concatenate(marks)
+        if len(points):
+            look = {"thickness": 2.0, "thickness_units": "screen"}
+            self._scene.add_line_segments(f"{ROOT}/marks", points, (255, 255, 255), **look)

@@ -19,7 +19,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.viz.scene import SceneRecord, Stage
-from coopenv.viz.web.ground import Look, legend_html
+from coopenv.viz.web.ground import Look
+from coopenv.viz.web.panel import legend_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification
 
 TOKEN_BYTES = 12
@@ -150,16 +151,6 @@ def write_replay(
         CoopenvError: the extra `view` is not installed.
         OutputError: the file cannot be written.
     """
-    replace_text(path, replay_html(record, on_progress, others))
-    return path
-
-
-def replay_html(
-    record: SceneRecord,
-    on_progress: Callable[[float], None] = lambda share: None,
-    others: Mapping[str, str] | None = None,
-) -> str:
-    """Return the page of an episode; arguments and errors as for `write_replay`."""
     record = record.of(np.unique(np.linspace(0, len(record) - 1, min(len(record), MOST_FRAMES)).round().astype(int)))
     stage = Stage(record.scenario)
     sigma = np.array([record.frame(k).three_sigma for k in range(0, len(record), max(1, len(record) // 20))])
@@ -175,7 +166,8 @@ def replay_html(
             picture.show(record.frame(k))
             on_progress(k / len(record))
         page = recording.as_html()
-    return _dressed(page, record, stage, look, others or {})
+    replace_text(path, _dressed(page, record, stage, look, others or {}))
+    return path
 
 
 def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""The panel beside the live scene: switches, numbers and plots."""
+"""The panel beside the live scene: switches, numbers, plots and the legend."""
 
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,10 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Source, Stage
-from coopenv.viz.style import BLUE, GREY, VEHICLE_COLOURS, vehicle_colour
+from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, vehicle_colour
 from coopenv.viz.topview_geometry import semi_axes
-from coopenv.viz.web.ground import Look, legend_html, swatch
+from coopenv.viz.topview_ground import TRAFFIC
+from coopenv.viz.web.ground import Look
 
 _LONGEST = 600  # frames that are kept
 _LEAST = 1e-4  # on a logarithmic axis
@@ -62,15 +63,13 @@ class Plots:
     def __init__(self, gui: Any, source: Source) -> None:
         """Add them, empty."""
         self._terms = source.terms[:_MOST_TERMS]
-        sigma = "3σ" if source.honest else "P, a gain"
-        start = np.array([0.0, 1.0])
         log: dict[str, Any] = {**_X, "y": {"distr": 3, "log": 10, "auto": True}}
         start, one = np.array([0.0, 1.0]), np.ones(2)
-        error, pair = ("error", BLUE), (start, one, one)
-        title = f"Position error [m]; dashed: {sigma}"
-        self._error = gui.add_uplot(pair, _series(error, ("3σ", GREY)), title=title, scales=log, **_LOOK)
-        title, bounds = "NEES; dashed: 95 % if consistent", (("from", GREY), ("to", GREY))
-        self._nees = gui.add_uplot((*pair, one), _series(("NEES", BLUE), *bounds), title=title, scales=log, **_LOOK)
+        title = f"Position error [m]; dashed: {'3σ' if source.honest else 'P, a gain'}"
+        series = _series(("error", BLUE), ("3σ", GREY))
+        self._error = gui.add_uplot((start, one, one), series, title=title, scales=log, **_LOOK)
+        title, series = "NEES; dashed: 95 % if consistent", _series(("NEES", BLUE), ("from", GREY), ("to", GREY))
+        self._nees = gui.add_uplot((start, one, one, one), series, title=title, scales=log, **_LOOK)
         self._reward: Any = None
         if self._terms:
             named = list(zip(self._terms, VEHICLE_COLOURS, strict=False))
@@ -293,6 +292,60 @@ class Panel:
             self._image.image = camera_image(self._stage, frame, self.picked)
             self._vehicle_words.content = sight_words(self._stage, frame, self.picked)
             self._plots.show(history, self.picked)
+
+
+_ROW = "display:flex;gap:8px;align-items:center;line-height:1.45"
+GAIN = "P is a gain matrix of this observer, not a covariance: its ellipsoids are not bounds of the error."
+_DRAWINGS = {
+    "block": '<rect x="2" y="2" width="18" height="8" fill="{0}" fill-opacity="{1:g}" stroke="{0}"/>',
+    "disc": '<circle cx="11" cy="6" r="5" fill="{0}" fill-opacity="{1:g}" stroke="{0}"/>',
+    "bead": '<circle cx="11" cy="6" r="3" fill="{0}" fill-opacity="1" stroke="{0}"/>',
+    "ring": '<circle cx="11" cy="6" r="5" fill="none" stroke="{0}" stroke-width="2"/>',
+    "line": '<path d="M1 6H21" stroke="{0}" stroke-width="2" stroke-dasharray="{1}"/>',
+}
+
+
+def legend_html(stage: Stage, source: Source, magnification: float) -> str:
+    """Return the legend of the marks that can occur as HTML."""
+    s = stage.scenario
+    sensed = s.topology.mode == "sensed"
+    times = f", {magnification:g} times as large" if magnification != 1.0 else ""
+    ellipsoid = f"3σ of the estimate{times}" if source.honest else f"observer's P{times} (gain, no covariance)"
+    entries: list[tuple[object, str, str, object, str]] = [
+        (True, "block", BLUE, 1.0, "vehicle, true"),
+        (True, "block", BLUE, 0.3, "its estimate; a dashed line joins both"),
+        (True, "disc", BLUE, 0.25, ellipsoid),
+        (stage.sees_a_part, "block", BLUE, 0.15, "field of view"),
+        (True, "line", BLUE, "none", "sees (colour of the observing vehicle)"),
+        (sensed and s.obstacles, "line", GREY, "none", "hidden by a building, where the line ends"),
+        (sensed, "line", INK, "none", "hidden by a body, where the line ends"),
+        (any(camera.miss_probability > 0 for camera in s.cameras), "line", BLUE, "2 4", "in view, but missed"),
+        (stage.landmarks, "disc", DARK_BLUE, 1.0, "landmark"),
+        (stage.vehicles > 1, "bead", BLUE, None, "V2X message on its way"),
+        (
+            any(vehicle.goal_radius > 0 for vehicle in s.vehicles),
+            "ring",
+            BLUE,
+            None,
+            "its goal, at the end of its route",
+        ),
+        (s.highway, "block", TRAFFIC, 1.0, "other traffic"),
+    ]
+    svg = '<svg width="22" height="12" viewBox="0 0 22 12" style="vertical-align:middle">{}</svg>'
+    rows = "".join(
+        f'<div style="{_ROW}"><span style="flex:none">{svg.format(_DRAWINGS[drawing].format(colour, value))}</span>'
+        f"<span>{escape(words)}</span></div>"
+        for occurs, drawing, colour, value, words in entries
+        if occurs
+    )
+    note = f'<div style="margin-top:6px;color:#8A3B00"><b>{escape(GAIN)}</b></div>' if not source.honest else ""
+    return rows + note
+
+
+def swatch(colour: str) -> str:
+    """Return a small square in a colour, beside which text stands in ink: many colours are too pale for text."""
+    look = f"width:9px;height:9px;background:{colour};border:1px solid {INK}"
+    return f'<span style="display:inline-block;{look}"></span>'
 
 
 def table_html(stage: Stage, source: Source, frame: Frame) -> str:

@@ -1,4 +1,4 @@
-"""A scene in the browser, frame after frame: lines, names and messages on their way; live and in pages alike."""
+"""A scene in the browser, frame after frame: bodies, lines, names, messages on their way; live and in pages alike."""
 
 from collections import deque
 from typing import Any
@@ -8,57 +8,102 @@ import numpy as np
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.viz.scene import Frame, Source, Stage
-from coopenv.viz.style import GREY, INK
-from coopenv.viz.topview_geometry import Box, crossings
+from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.topview_geometry import Box, crossings, semi_axes
+from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web import ground
-from coopenv.viz.web.actors import Actors, Batch, SentProperties, fine, placed
-from coopenv.viz.web.ground import ROOT, Ground, Look, in_turn, linear, rgb, vehicle_colours
+from coopenv.viz.web.ground import NOTHING, ROOT, Batch, Coloured, Ground, Look, Segments, dashes, fine, placed, rgb
 
-Coloured = tuple[np.ndarray, np.ndarray]
-"""Segments (K, 2, 3), m, and their colours (K, 3) uint8."""
+_SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
+_LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
+_HONEST, _GAIN = 0.2, 0.08  # opacity of an ellipsoid: of a covariance, of a matrix of gains
+_STEPS, _TURN = 32, 2.0**-9  # of an ellipsoid: sizes in a doubling, and steps of its quaternion
+_DOT = 0.008  # of the scene's side, radius of a landmark
+_FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
+
+
+class Actors:
+    """Everything that moves but lines."""
+
+    def __init__(self, scene: Any, stage: Stage, source: Source, floor: Ground, colours: np.ndarray) -> None:
+        """Add the nodes."""
+        self._scene, self._stage, self._floor = scene, stage, floor
+        self._size, self._center = stage.bodies
+        white = np.full((stage.vehicles, 3), 255, np.uint8)
+        self.cars = Batch(scene, f"{ROOT}/cars/true", ground.car(), colours, flat_shading=True)
+        self._arrows = Batch(scene, f"{ROOT}/cars/front", ground.arrow(), white, side="double")
+        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", ground.car(), colours, opacity=0.32, flat_shading=True)
+        self._frames = Batch(scene, f"{ROOT}/estimates/edges", ground.box(), colours, wireframe=True, opacity=0.5)
+        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", ground.sphere(), colours, opacity=_HONEST)
+        self.set_source(source)
+        dark = np.tile(rgb(DARK_BLUE), (stage.landmarks, 1))
+        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", ground.sphere(6), dark)
+        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", ground.pole(), dark)
+        bodies = {i: landmark.body for i, landmark in enumerate(stage.scenario.landmarks) if landmark.body}
+        self._bodies = list(bodies)
+        self._body_center, self._body_size = (
+            np.array([getattr(body, part) for body in bodies.values()], float).reshape(-1, 3)
+            for part in ("center", "size")
+        )
+        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", ground.box(), dark[self._bodies])
+        self._marks = np.zeros((0, 3))
+        self._traffic: Batch | None = None
+
+    def set_source(self, source: Source) -> None:
+        """Set the source: ellipsoids of a gain matrix are paler than those of a covariance."""
+        self._ellipsoids.handle.opacity = _HONEST if source.honest else _GAIN
+
+    def place(self, frame: Frame, look: Look) -> None:
+        """Move everything to where it is in a frame."""
+        R, R_hat, step, side = frame.vehicle_rotation, frame.estimate_rotation, self._floor.step, self._stage.side
+        at = fine(frame.vehicle_position + (R @ self._center[..., None])[..., 0], step)
+        estimated = self._near(frame.estimate_position + (R_hat @ self._center[..., None])[..., 0])
+        true, ghosts = placed(R, at, self._size), placed(R_hat, estimated, _SHELL * self._size)
+        self.cars.put(true)
+        self._arrows.put(true)
+        self._ghosts.put(ghosts, look.estimates)
+        self._frames.put(ghosts, look.estimates)
+        semi, axes = semi_axes(frame.position_covariance)
+        semi *= look.magnification
+        drawn = semi[:, 2] <= _LARGEST * side
+        steps = np.log2(np.maximum(np.where(drawn[:, None], semi, np.nan), step / 4)) * _STEPS
+        semi = 2.0 ** (np.round(steps) / _STEPS)
+        self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi, _TURN), look.ellipsoids)
+        self._place_landmarks(frame)
+        if len(frame.traffic_half):
+            if self._traffic is None:
+                grey = np.tile(rgb(TRAFFIC), (len(frame.traffic_half), 1))
+                self._traffic = Batch(self._scene, f"{ROOT}/traffic", ground.car(), grey, flat_shading=True)
+            size = np.where(frame.traffic_half[:, :1] > 0.0, 2.0 * frame.traffic_half, np.nan)
+            self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
+
+    def _near(self, points: np.ndarray) -> np.ndarray:
+        """Return points (N, 3), those very far away drawn nearer in their direction."""
+        middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
+        away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
+        share = np.minimum(1.0, _FAR * self._stage.side / np.maximum(away, 1e-9))
+        return fine(middle + (points - middle) * share, self._floor.step)
+
+    def _place_landmarks(self, frame: Frame) -> None:
+        L, side, step = self._stage.landmarks, self._stage.side, self._floor.step
+        place = self._stage.targets(frame)[:L]
+        if np.array_equal(place, self._marks, equal_nan=True):
+            return
+        self._marks = place
+        self._dots.put(placed(None, fine(place, step), np.full((L, 3), _DOT * side)))
+        foot = np.column_stack([place[:, :2], np.full(L, self._floor.z)])
+        thick = np.full((L, 2), 0.2 * _DOT * side)
+        self._poles.put(placed(None, fine(foot, step), np.column_stack([thick, np.maximum(place - foot, 0.0)[:, 2]])))
+        R = frame.rotation[self._bodies]
+        at = frame.position[self._bodies] + (R @ self._body_center[..., None])[..., 0]
+        self._boxes.put(placed(R, fine(at, step), self._body_size))
+
+
 _DOTS, _DASHES = 16, 9  # of a line to a target that was missed, and to an estimate
 _TRAIL, _TRAIL_STEP = 36, 0.2  # points, and s between them
-_GROWTH = 32  # segments by which the arrays grow
 
 
-class Segments:
-    """A node of line segments whose number changes.
-
-    Arrays have room for more, so that they seldom change their shape; unused segments lie in a single point.
-    """
-
-    def __init__(self, scene: Any, name: str, thickness: float) -> None:
-        """Begin with none; the thickness is in pixels."""
-        self._scene, self._name, self._thickness = scene, name, thickness
-        self._room = 0
-        self._node: SentProperties | None = None
-        self._colours, self._shade = np.zeros((0, 3), np.uint8), np.zeros((0, 2, 3), np.uint8)
-
-    def show(self, points: np.ndarray, colours: np.ndarray) -> None:
-        """Show segments (K, 2, 3) in colours (K, 3); those with NaN are left out."""
-        good = np.isfinite(points).all(axis=(1, 2))
-        if not good.all():
-            points, colours = points[good], colours[good]
-        if self._node is not None:
-            self._node.set(visible=len(points) > 0)
-        if not len(points):
-            return
-        grown = len(points) > self._room
-        if grown:
-            self._room = -(-len(points) // _GROWTH) * _GROWTH
-        whole = np.empty((self._room, 2, 3), np.float32)
-        whole[: len(points)], whole[len(points) :] = points, points[0, 0]
-        if grown or not np.array_equal(colours, self._colours):
-            self._colours, shade = colours, linear(colours)
-            self._shade = np.empty((self._room, 2, 3), np.uint8)
-            self._shade[: len(points)], self._shade[len(points) :] = shade[:, None], shade[0]
-        if self._node is None or grown:
-            look: dict[str, Any] = {"thickness": self._thickness, "thickness_units": "screen"}
-            self._node = SentProperties(self._scene.add_line_segments(self._name, whole, self._shade, **look))
-        self._node.set(points=whole, colors=self._shade)
-
-
-def joined(*parts: Coloured) -> Coloured:
+def _joined(parts: list[Coloured]) -> Coloured:
     """Return all segments in one pair of arrays."""
     points = np.concatenate([np.asarray(points, float).reshape(-1, 2, 3) for points, _ in parts])
     return points, np.concatenate([np.asarray(colours, np.uint8).reshape(-1, 3) for _, colours in parts])
@@ -67,24 +112,20 @@ def joined(*parts: Coloured) -> Coloured:
 def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> Coloured:
     """Return lines of sight: solid to visible targets, dotted to missed ones, and to hidden ones up to the occluder."""
     eye, target = stage.eyes(frame), stage.targets(frame)
-    chosen = np.ones(stage.vehicles, bool)
-    if look.only is not None:
-        chosen = np.arange(stage.vehicles) == look.only
-
-    def of(kind: Sight) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    chosen = (np.arange(stage.vehicles) == look.only) | (look.only is None)
+    parts = []
+    for kind in (Sight.VISIBLE, Sight.MISSED, Sight.OCCLUDED_BY_BUILDING, Sight.OCCLUDED_BY_BODY):
         observer, seen = np.nonzero((frame.sight == kind) & chosen[:, None])
-        return eye[observer], target[seen], observer
-
-    start, end, observer = of(Sight.VISIBLE)
-    seen = np.stack([start, end], axis=1), colours[observer]
-    start, end, observer = of(Sight.MISSED)
-    missed = _dashed(start, end, colours[observer], _DOTS, 0.35)
-    start, end, _ = of(Sight.OCCLUDED_BY_BUILDING)
-    built = np.stack([start, stopped(start, end, stage.buildings)], axis=1), _one(GREY, len(start))
-    start, end, _ = of(Sight.OCCLUDED_BY_BODY)
-    bodies = stage.solid(frame) if len(start) else []
-    bodily = np.stack([start, stopped(start, end, bodies)], axis=1), _one(INK, len(start))
-    return joined(seen, missed, built, bodily)
+        start, end, shade = eye[observer], target[seen], colours[observer]
+        if kind == Sight.MISSED:
+            parts.append((dashes(start, end, _DOTS, 0.35), np.tile(shade, (_DOTS, 1))))
+            continue
+        if kind == Sight.OCCLUDED_BY_BUILDING:
+            end, shade = stopped(start, end, stage.buildings), np.tile(rgb(GREY), (len(start), 1))
+        elif kind == Sight.OCCLUDED_BY_BODY and len(start):
+            end, shade = stopped(start, end, stage.solid(frame)), np.tile(rgb(INK), (len(start), 1))
+        parts.append((np.stack([start, end], axis=1), shade))
+    return _joined(parts)
 
 
 def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
@@ -96,24 +137,23 @@ def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
     return np.asarray(start + share[:, None] * (end - start))
 
 
-def error_lines(frame: Frame, colours: np.ndarray) -> Coloured:
-    """Return dashed lines from true positions to estimates."""
-    return _dashed(frame.vehicle_position, frame.estimate_position, colours, _DASHES, 0.6)
-
-
 def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Coloured:
     """Return the routes that are drawn, and rings about the goals, at a height."""
-    parts: list[Coloured] = [(np.zeros((0, 2, 3)), np.zeros((0, 3)))]
+    angle = np.linspace(0.0, 2 * np.pi, 33)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(33)], axis=-1)
+    parts = [NOTHING]
     for i, vehicle in enumerate(stage.scenario.vehicles):
-        pale = (0.45 * colours[i] + 0.55 * 255.0)[None]
         points = frame.route[i, : int(frame.route_count[i])].copy()
         points[:, 2:] = z
-        if frame.route_drawn[i] >= 0 and len(points) > 1:
-            parts.append((np.stack([points[:-1], points[1:]], axis=1), np.repeat(pale, len(points) - 1, axis=0)))
-        if vehicle.goal_radius > 0:
-            ring = ground.circle(vehicle.goal_radius) + np.array([*frame.goal[i, :2], z])
-            parts.append((ring, np.repeat(colours[i][None], len(ring), axis=0)))
-    return joined(*parts)
+        ring = vehicle.goal_radius * circle + [*frame.goal[i, :2], z]
+        pale = 0.45 * colours[i] + 0.55 * 255.0
+        for path, colour, drawn in (
+            (points, pale, frame.route_drawn[i] >= 0),
+            (ring, colours[i], vehicle.goal_radius > 0),
+        ):
+            if drawn and len(path) > 1:
+                parts.append((np.stack([path[:-1], path[1:]], axis=1), np.tile(colour, (len(path) - 1, 1))))
+    return _joined(parts)
 
 
 class Trails:
@@ -122,41 +162,24 @@ class Trails:
     def __init__(self) -> None:
         """Start without points."""
         self._points: deque[np.ndarray] = deque(maxlen=_TRAIL)
-        self._times: deque[float] = deque(maxlen=_TRAIL)
-        self._drawn: Coloured = np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
+        self._time = np.inf
+        self._drawn = NOTHING
 
     def lines(self, frame: Frame, time: float, colours: np.ndarray, z: float) -> Coloured:
         """Add a frame and return the trails (paler where they are older), at a height; the same ones till they grow."""
-        if self._times and not 0.0 <= time - self._times[-1] < 10.0 * _TRAIL_STEP:
+        if not 0.0 <= time - self._time < 10.0 * _TRAIL_STEP:
             self._points.clear()
-            self._times.clear()
-        if not self._times or time - self._times[-1] >= _TRAIL_STEP - 1e-9:
+        if not self._points or time - self._time >= _TRAIL_STEP - 1e-9:
             place = frame.vehicle_position.copy()
             place[:, 2] += z - place[:, 2]
             self._points.append(place)
-            self._times.append(time)
-            self._drawn = self._segments(colours)
+            self._time = time
+            points = np.array(self._points)
+            segments = np.stack([points[:-1], points[1:]], axis=2)  # (K, N, 2, 3)
+            age = np.linspace(0.85, 0.35, len(segments))[:, None, None]
+            shade = (1.0 - age) * colours + age * 255.0
+            self._drawn = segments.reshape(-1, 2, 3), shade.reshape(-1, 3).astype(np.uint8)
         return self._drawn
-
-    def _segments(self, colours: np.ndarray) -> Coloured:
-        points = np.array(self._points)
-        if len(points) < 2:
-            return np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
-        segments = np.stack([points[:-1], points[1:]], axis=2)  # (K, N, 2, 3)
-        age = np.linspace(0.85, 0.35, len(segments))[:, None, None]
-        shade = (1.0 - age) * colours + age * 255.0
-        return segments.reshape(-1, 2, 3), shade.reshape(-1, 3).astype(np.uint8)
-
-
-def _dashed(start: np.ndarray, end: np.ndarray, colours: np.ndarray, count: int, share: float) -> Coloured:
-    """Return lines from start to end (K, 3) in so many dashes, which take up a share of them."""
-    at = np.arange(count)[:, None, None] / count
-    dashes = np.stack([start + at * (end - start), start + (at + share / count) * (end - start)], axis=2)
-    return dashes.reshape(-1, 2, 3), np.tile(colours, (count, 1))
-
-
-def _one(colour: str, count: int) -> np.ndarray:
-    return np.tile(np.array(rgb(colour), np.uint8), (count, 1))
 
 
 FLIGHT, PAUSE = 0.5, 1.0
@@ -167,16 +190,15 @@ _SIZE = 0.006  # of the scene's side
 class Pulses:
     """Beads on the links between vehicles."""
 
-    def __init__(self, scene: Any, stage: Stage, colours: np.ndarray) -> None:
+    def __init__(self, scene: Any, stage: Stage, floor: Ground, colours: np.ndarray) -> None:
         """Begin with none."""
         n = stage.vehicles
-        self._stage = stage
-        self._receiver, self._sender = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+        self._stage, self._step = stage, floor.step
+        self._receiver, self._sender = (part.ravel() for part in np.indices((n, n)))
         self._batch = Batch(scene, f"{ROOT}/messages", ground.sphere(5), colours[self._sender])
         self._began = np.full(n * n, -np.inf)
         self._last = np.full(n * n, -1)
         self._time = -np.inf
-        self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
     def place(self, frame: Frame, time: float, shown: bool) -> None:
         """Start the beads of messages that arrived since the last frame, and move the other beads on."""
@@ -195,10 +217,17 @@ class Pulses:
         self._batch.put(placed(None, fine(at, self._step), size), shown)
 
 
+_AT_ONCE = 4  # names and fields of view in a frame while it plays
 _OFTEN = 0.5  # s between two texts of a label
 _CLOSE, _RAISED = 0.09, 0.035  # of the scene's side: vehicles so close have their names so far above each other
 _APART = 0.06  # of the scene's side, distance from which on an estimate has a name of its own
 _MOST_NAMES = 24  # landmarks; more would hide one another
+
+
+def in_turn(turn: int | None, count: int) -> slice:
+    """Return which of so many names, or fields of view, are sent in a turn: half, at most four; None: all of them."""
+    parts = max(2, -(-count // _AT_ONCE))
+    return slice(None) if turn is None else slice(turn % parts, None, parts)
 
 
 class Labels:
@@ -207,50 +236,39 @@ class Labels:
     def __init__(self, scene: Any, stage: Stage) -> None:
         """Add them."""
         self._stage, self._said = stage, -np.inf
-        look: dict[str, Any] = {"anchor": "bottom-center", "depth_test": False}
-        marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
-        self._cars = [SentProperties(scene.add_label(f"{ROOT}/names/{mark}", mark, **look)) for mark in marks]
-        self._marks = marks
-        self._marked, self._marks_at = False, np.zeros((0, 3))
-        above = stage.bodies[0][:, 2] + 0.012 * stage.side
-        self._above = np.column_stack([np.zeros((len(above), 2)), above])
-        small = {**look, "font_screen_scale": 0.85}
-        estimated = f"{ROOT}/names/estimates"
-        self._estimates = [
-            SentProperties(scene.add_label(f"{estimated}/{mark}", f"{mark} estimated", **small)) for mark in marks
-        ]
+        self._marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
+        self._above = stage.bodies[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.012 * stage.side]
+
+        def label(name: str, text: str, **look: Any) -> Any:
+            return scene.add_label(f"{ROOT}/names/{name}", text, anchor="bottom-center", depth_test=False, **look)
+
+        small = {"font_screen_scale": 0.85}
+        self._cars = [label(mark, mark) for mark in self._marks]
+        self._estimates = [label(f"estimates/{mark}", f"{mark} estimated", **small) for mark in self._marks]
         self._landmarks = {
-            i: SentProperties(scene.add_label(f"{ROOT}/names/landmarks/{i}", stage.short_name(i), **small))
+            i: label(f"landmarks/{i}", stage.short_name(i), **small)
             for i, landmark in enumerate(stage.scenario.landmarks)
             if landmark.group is None and stage.landmarks <= _MOST_NAMES
         }
 
     def place(self, frame: Frame, time: float, shown: bool, turn: int | None = None) -> None:
         """Move the names; with a `turn` those of some vehicles, as in `Picture.show`."""
-        again = not 0.0 <= time - self._said < _OFTEN - 1e-9
-        self._said = time if again else self._said
-        if again and shown:
-            for i, label in enumerate(self._cars):
-                label.set(text=self._text(frame, i))
-        mine = in_turn(turn, self._stage.vehicles)
-        places = frame.vehicle_position + self._above
-        places[:, 2] += _RAISED * self._stage.side * levels(places[:, :2], _CLOSE * self._stage.side)
-        for label, place in zip(self._cars[mine], places[mine], strict=True):
-            _put(label, place, shown)
-        self._place_estimates(frame, shown, mine)
-        places = self._stage.targets(frame)[: self._stage.landmarks]
-        if shown != self._marked or not np.array_equal(places, self._marks_at, equal_nan=True):
-            self._marked, self._marks_at = shown, places
-            for i, label in self._landmarks.items():
-                _put(label, places[i] + [0.0, 0.0, 0.015 * self._stage.side], shown)
-
-    def _place_estimates(self, frame: Frame, shown: bool, mine: slice) -> None:
-        """Name the estimates that are not where their vehicles are."""
-        places = (frame.estimate_position + self._above)[mine]
-        inside = np.all((places[:, :2] > self._stage.low) & (places[:, :2] < self._stage.high), axis=-1)
-        named = inside & (frame.position_error[mine] > _APART * self._stage.side)
-        for label, place, there in zip(self._estimates[mine], places, named.tolist(), strict=True):
-            _put(label, place, shown and there)
+        stage, side = self._stage, self._stage.side
+        if not 0.0 <= time - self._said < _OFTEN - 1e-9:
+            self._said = time
+            for i, label in enumerate(self._cars if shown else ()):
+                label.text = self._text(frame, i)
+        mine = in_turn(turn, stage.vehicles)
+        places, estimates = frame.vehicle_position + self._above, frame.estimate_position + self._above
+        places[:, 2] += _RAISED * side * levels(places[:, :2], _CLOSE * side)
+        inside = np.all((estimates[:, :2] > stage.low) & (estimates[:, :2] < stage.high), axis=-1)
+        named = inside & (frame.position_error > _APART * side)  # those that are not where their vehicles are
+        for i in range(stage.vehicles)[mine]:
+            _put(self._cars[i], places[i], shown)
+            _put(self._estimates[i], estimates[i], shown and bool(named[i]))
+        targets = stage.targets(frame) + np.array([0.0, 0.0, 0.015 * side])
+        for i, label in self._landmarks.items():
+            _put(label, targets[i], shown)
 
     def _text(self, frame: Frame, vehicle: int) -> str:
         mark, ended = self._marks[vehicle], int(frame.ended[vehicle])
@@ -274,12 +292,11 @@ def levels(points: np.ndarray, close: float) -> np.ndarray:
     return level
 
 
-def _put(label: SentProperties, place: np.ndarray, shown: bool) -> None:
+def _put(label: Any, place: np.ndarray, shown: bool) -> None:
     """Put a label to a place (3,), NaN: nowhere."""
-    shown = shown and not np.isnan(place[0])
-    label.set(visible=shown)
-    if shown:
-        label.set(position=tuple(place.round(3).tolist()))
+    label.visible = shown and not np.isnan(place[0])
+    if label.visible:
+        label.position = tuple(place.round(3).tolist())
 
 
 FIELD_OF_VIEW = 0.72
@@ -293,21 +310,19 @@ class Picture:
     def __init__(self, scene: Any, stage: Stage, source: Source, look: Look) -> None:
         """Draw the static part, and add the moving parts."""
         self.stage, self.look = stage, look
-        self._scene, self._colours = scene, vehicle_colours(stage.vehicles)
+        self._scene = scene
+        self._colours = np.array([rgb(vehicle_colour(i)) for i in range(stage.vehicles)])
         self.ground = Ground(scene, stage)
         self.actors = Actors(scene, stage, source, self.ground, self._colours)
         self._labels = Labels(scene, stage)
-        self._pulses = Pulses(scene, stage, self._colours)
+        self._pulses = Pulses(scene, stage, self.ground, self._colours)
         self._trails = Trails()
-        self._sight = Segments(scene, f"{ROOT}/sight", 2.0)
-        self._errors = Segments(scene, f"{ROOT}/errors", 1.5)
-        self._ways = Segments(scene, f"{ROOT}/ways", 2.0)
-        self._trail = Segments(scene, f"{ROOT}/trails", 3.0)
-        self._views: list[SentProperties] = []
-        self._drawn_trail: Coloured | None = None
-        self._trails_shown = True
+        self._lines = {
+            name: Segments(scene, f"{ROOT}/{name}", thickness, self.ground.step)
+            for name, thickness in (("sight", 2.0), ("errors", 1.5), ("ways", 2.0), ("trails", 3.0))
+        }
+        self._views: list[Any] = []
         self._drawn_ways: tuple[bytes, ...] = ()
-        self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
     def show(self, frame: Frame, turn: int | None = None) -> None:
         """Show a frame.
@@ -317,51 +332,44 @@ class Picture:
             turn: number of the frame where another frame follows at once: then some names and fields of view wait
                 for that frame, see `in_turn`.
         """
-        time, look, nothing = float(frame.tick) / self.stage.scenario.rates.camera, self.look, np.zeros((0, 2, 3))
-        none = nothing, np.zeros((0, 3), np.uint8)
+        time, look, side = float(frame.tick) / self.stage.scenario.rates.camera, self.look, self.stage.side
         self.actors.place(frame, look)
         self._labels.place(frame, time, look.names, turn)
         self._pulses.place(frame, time, look.messages)
-        trail = self._trails.lines(frame, time, self._colours, self.ground.z + 1e-3 * self.stage.side)
-        if trail is not self._drawn_trail or look.trails != self._trails_shown:
-            self._drawn_trail, self._trails_shown = trail, look.trails
-            self._show(self._trail, trail if look.trails else none)
-        sight = sight_lines(self.stage, frame, self._colours, look) if look.sight else none
-        self._show(self._sight, sight)
-        self._show(self._errors, error_lines(frame, self._colours) if look.estimates else none)
+        trail = self._trails.lines(frame, time, self._colours, self.ground.z + 1e-3 * side)
+        self._lines["trails"].show(trail if look.trails else NOTHING)
+        sight = sight_lines(self.stage, frame, self._colours, look) if look.sight else NOTHING
+        self._lines["sight"].show(sight)
+        errors = dashes(frame.vehicle_position, frame.estimate_position, _DASHES, 0.6)
+        self._lines["errors"].show((errors, np.tile(self._colours, (_DASHES, 1))) if look.estimates else NOTHING)
         ways = (frame.goal.tobytes(), frame.route_count.tobytes(), frame.route_drawn.tobytes(), frame.route.tobytes())
         if ways != self._drawn_ways:
             self._drawn_ways = ways
-            self._show(self._ways, way_lines(self.stage, frame, self._colours, self.ground.z))
+            self._lines["ways"].show(way_lines(self.stage, frame, self._colours, self.ground.z))
         self._show_views(frame, turn)
-
-    def _show(self, node: Segments, what: Coloured) -> None:
-        node.show(fine(what[0], self._step), what[1])
 
     def _show_views(self, frame: Frame, turn: int | None) -> None:
         mine = in_turn(turn if self._views else None, self.stage.vehicles)
         views = self.stage.fields_of_view(frame, _VIEW_RAYS, mine) if self.look.views else None
         if views is None:
             for view in self._views:
-                view.set(visible=False)
+                view.visible = False
             return
         views[..., 2] = (self.ground.z + 2e-4 * self.stage.side * np.arange(1, self.stage.vehicles + 1))[mine, None]
-        corners = fine(views, self._step)
+        corners = fine(views, self.ground.step)
         if not self._views:
-            self._add_views(corners)
+            n = np.arange(1, corners.shape[1] - 1)
+            faces = np.stack([np.zeros_like(n), n + 1, n], axis=-1)
+            flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False, "side": "double", "opacity": 0.16}
+            self._views = [
+                self._scene.add_mesh_simple(f"{ROOT}/views/{i}", corner, faces, color=colour, **flat)
+                for i, (corner, colour) in enumerate(zip(corners, self._colours, strict=True))
+            ]
         there = np.isfinite(corners).all(axis=(1, 2)).tolist()
-        for i, view in enumerate(self._views[mine]):
-            view.set(visible=there[i])
-            if there[i]:
-                view.set(vertices=corners[i])
-
-    def _add_views(self, corners: np.ndarray) -> None:
-        n = np.arange(1, corners.shape[1] - 1)
-        faces = np.stack([np.zeros_like(n), n + 1, n], axis=-1)
-        flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False, "side": "double", "opacity": 0.16}
-        for i, colour in enumerate(self._colours.tolist()):
-            mesh = self._scene.add_mesh_simple(f"{ROOT}/views/{i}", corners[i], faces, color=tuple(colour), **flat)
-            self._views.append(SentProperties(mesh))
+        for view, corner, shown in zip(self._views[mine], corners, there, strict=True):
+            view.visible = shown
+            if shown:
+                view.vertices = corner
 
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:
