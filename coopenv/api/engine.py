@@ -29,7 +29,7 @@ from coopenv.observers.interference import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
-from coopenv.viz.scene.stage import Frame
+from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory

@@ -23,7 +23,7 @@ from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_me
 from coopenv.runs.scenes import VIDEO_FILES, Keeper, frame_stride, source_of, video_path, write_film, write_page
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz import FIGURE_NAMES, FORMATS
-from coopenv.viz.scene.record import SCENE_FILE
+from coopenv.viz.scene import SCENE_FILE
 
 METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "replay.html"
 

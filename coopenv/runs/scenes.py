@@ -28,8 +28,7 @@ from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.rollouts import play
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import SceneRecord, SceneWriter, Source
-from coopenv.viz.scene.record import SCENE_FILE
+from coopenv.viz.scene import SCENE_FILE, Frame, SceneRecord, Source
 
 BASELINE = "route_follower"
 MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
@@ -53,26 +52,22 @@ class Keeper:
 
     def __init__(self, engine: Engine, source: Source) -> None:
         """Begin with none."""
-        scenario = engine.backend.scenario
-        self._writer, self._stride = SceneWriter(scenario, source), frame_stride(scenario)
-        self.engine = engine
-        self._last = -1
+        self.engine, self._source = engine, source
+        self._stride = frame_stride(engine.backend.scenario)
+        self._frames: list[Frame] = []
 
     def tick(self, tick: int) -> bool:
         """Keep what is there at a tick if it is one that is drawn; return whether it is."""
         drawn = tick % self._stride == 0
         if drawn:
-            self._last = tick
-            self._writer.add(self.engine)
+            self._frames.append(Frame.of(self.engine))
         return drawn
 
     def record(self) -> SceneRecord:
         """Return what has been kept, and what is there now."""
-        now = int(self.engine.view("tick")[0])
-        if now > self._last:
-            self._writer.add(self.engine)
-            self._last = now
-        return self._writer.record()
+        if not self._frames or self.engine.view("tick")[0] > self._frames[-1].tick:
+            self._frames.append(Frame.of(self.engine))
+        return SceneRecord.of_frames(self.engine.backend.scenario, self._source, self._frames)
 
 
 def scene_of(

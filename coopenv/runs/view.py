@@ -12,8 +12,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, error_text
 from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
-from coopenv.viz.scene import Frame, Stage
-from coopenv.viz.scene.stage import entry
+from coopenv.viz.scene import Frame
+from coopenv.viz.stage import Stage, entry
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim, guarded_server
 from coopenv.viz.web.panel import NO_FAULT, History, Panel

@@ -9,9 +9,9 @@ from coopenv.estimation.lens import distort
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario.base import rotation_of
 from coopenv.scenario.sensing import Camera
-from coopenv.viz.scene import Frame, Stage
+from coopenv.viz.scene import Frame
+from coopenv.viz.stage import Box, Stage
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
-from coopenv.viz.topview_geometry import Box
 from coopenv.viz.topview_ground import GROUND, ROOF, TRAFFIC, WALL
 
 SKY = "#E6EEF5"
@@ -21,7 +21,6 @@ _SCALE = 2  # of the drawing, which is made smaller at the end
 _NEAR = 0.05  # m before the camera, where boxes are cut
 _AHEAD = 1e-3  # of the distance: depth from which on a point is ahead of the camera
 _WIDEST = 2.0  # radius of the image plane at distance 1 from which on the polynomial of the lens is not valid
-_EDGES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
 def camera_image(stage: Stage, frame: Frame, vehicle: int) -> np.ndarray:
@@ -61,7 +60,7 @@ class Lens:
         return float(np.linalg.norm(point - self.eye))
 
     def in_camera(self, points: np.ndarray) -> np.ndarray:
-        """Return points (K, 3) of the map in the camera's frame; z ahead, but of a panorama x ahead and z up."""
+        """Return points (..., 3) of the map in the camera's frame; z ahead, but of a panorama x ahead and z up."""
         return np.asarray((points - self.eye) @ self._to_map)
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
@@ -110,10 +109,7 @@ def _draw_ground(draw: ImageDraw.ImageDraw, lens: Lens) -> None:
 
 
 def _draw_box(draw: ImageDraw.ImageDraw, lens: Lens, box: Box, colour: str, edge: str) -> None:
-    signs = np.array([(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)]) - 0.5
-    corners = lens.in_camera(box.center + (signs * np.asarray(box.size, float)) @ box.rotation.T)
-    faces = [corners[list(face)] for face in _EDGES]
-    for face in sorted(faces, key=lambda each: -float(np.linalg.norm(each.mean(axis=0)))):
+    for face in sorted(lens.in_camera(box.faces), key=lambda each: -float(np.linalg.norm(each.mean(axis=0)))):
         whole = face if lens.around else _before(face)
         if len(whole) < 3:
             continue

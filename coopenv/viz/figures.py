@@ -14,6 +14,7 @@ from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import fontManager
@@ -34,15 +35,20 @@ from coopenv.viz.error_figures import consistency_figure, error_figure, observab
 from coopenv.viz.style import save, sign
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 
-
-def _hatched(colour: str, hatch: str, label: str) -> dict[str, Any]:
-    return {"facecolor": "white", "edgecolor": colour, "hatch": hatch, "label": label}
-
-
 _LOOKS: dict[Sight, dict[str, Any]] = {
     Sight.VISIBLE: {"facecolor": house.BLUE, "edgecolor": "none", "label": "visible"},
-    Sight.OCCLUDED_BY_BODY: _hatched(house.VERMILION, "//////", "occluded by a moving body"),
-    Sight.OCCLUDED_BY_BUILDING: _hatched(house.ORANGE, "......", "occluded by a building"),
+    Sight.OCCLUDED_BY_BODY: {
+        "facecolor": "white",
+        "edgecolor": house.VERMILION,
+        "hatch": "//////",
+        "label": "occluded by a moving body",
+    },
+    Sight.OCCLUDED_BY_BUILDING: {
+        "facecolor": "white",
+        "edgecolor": house.ORANGE,
+        "hatch": "......",
+        "label": "occluded by a building",
+    },
     Sight.OUT_OF_VIEW: {"facecolor": house.GREY, "edgecolor": "none", "label": "out of view"},
 }
 _WORDS = {
@@ -226,7 +232,7 @@ def style(name: str, height: float = 0.68) -> dict[str, Any]:
         "axes.labelsize": one.size,
         **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), small),
         **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), house.INK),
-        "axes.prop_cycle": _cycle(),
+        "axes.prop_cycle": cycler(color=house.VEHICLE_COLOURS),
         "axes.linewidth": 0.6,
         "axes.grid": True,
         "axes.axisbelow": True,
@@ -240,12 +246,6 @@ def style(name: str, height: float = 0.68) -> dict[str, Any]:
         "pdf.fonttype": 42,
         "ps.fonttype": 42,
     }
-
-
-def _cycle() -> Any:
-    from cycler import cycler
-
-    return cycler(color=house.VEHICLE_COLOURS)
 
 
 def restyle(figure: Figure, name: str) -> Figure:
@@ -281,14 +281,10 @@ def save_figures(
     directory: str | Path,
     observability: Observability | None = None,
     *,
-    scenario: Scenario | None = None,
-    ends: Sequence[float] | None = None,
-    steady_from: float | None = None,
     file_format: str = "png",
     note: str = "",
     about: Mapping[str, object] | None = None,
-    width: str | float | None = None,
-    gain: bool = False,
+    **options: Any,
 ) -> list[Path]:
     """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be, and return their paths.
 
@@ -296,77 +292,65 @@ def save_figures(
         trajectory: the record of a run.
         directory: where the files go; files of the same names are replaced.
         observability: with the default window and threshold unless given.
-        scenario: of the run, for the roads and buildings under its paths.
-        ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
-        steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
         file_format: one of `FORMATS`.
         note: in small print below each figure: its subject.
         about: metadata of the files: environment, observer, seed.
-        width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figures then have, or inches (None: a page's).
-        gain: whether P is a gain matrix and no covariance.
+        options: further arguments of `draw_figure`.
 
     Raises:
         OutputError: the directory cannot be made or written to.
         CoopenvError: no such format or column.
     """
     directory = Path(directory)
-    inches = inches_of(width)
-    drawings = _drawings(trajectory, observability, scenario, ends, steady_from, gain, inches)
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
     paths = []
     for name in FIGURE_NAMES:
-        figure = drawings[name]()
-        sign(figure, note)
-        if isinstance(width, str):
-            restyle(figure, width)
-        paths.append(
-            save(figure, directory / f"{name}.{file_format}", about=about or ({"About": note} if note else {}))
-        )
+        figure = draw_figure(name, trajectory, observability, note=note, **options)
+        about = about or ({"About": note} if note else {})
+        paths.append(save(figure, directory / f"{name}.{file_format}", about=about))
     return paths
 
 
 def draw_figure(
     name: str,
     trajectory: Trajectory,
+    observability: Observability | None = None,
     *,
     scenario: Scenario | None = None,
     ends: Sequence[float] | None = None,
     steady_from: float | None = None,
     width: str | float | None = None,
     gain: bool = False,
+    note: str = "",
 ) -> Figure:
-    """Return one figure of a run; arguments as for `save_figures`.
+    """Return one figure of a run.
+
+    Args:
+        name: one of `FIGURE_NAMES`.
+        trajectory: the record of a run.
+        observability: with the default window and threshold unless given.
+        scenario: of the run, for the roads and buildings under its paths.
+        ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
+        steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
+        width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figure then has, or inches (None: a page's).
+        gain: whether P is a gain matrix and no covariance.
+        note: in small print below the figure: its subject.
 
     Raises:
         CoopenvError: no figure or column of that name.
     """
-    drawings = _drawings(trajectory, None, scenario, ends, steady_from, gain, inches_of(width))
+    inches = inches_of(width)
+    drawings: dict[str, Callable[[], Figure]] = {
+        "errors": lambda: error_figure(trajectory, ends, inches),
+        "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario, inches),
+        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends, scenario, inches),
+        "topology": lambda: topology_figure(trajectory, ends, inches),
+        "consistency": lambda: consistency_figure(trajectory, ends, steady_from, inches, gain=gain),
+        "observability": lambda: observability_figure(observability or analyse_observability(trajectory), ends, inches),
+    }
     if name not in drawings:
         raise CoopenvError(f"unknown figure '{name}'{suggest(name, drawings)}; known: {', '.join(drawings)}")
     figure = drawings[name]()
+    sign(figure, note)
     return restyle(figure, width) if isinstance(width, str) else figure
-
-
-def _drawings(
-    trajectory: Trajectory,
-    observability: Observability | None,
-    scenario: Scenario | None,
-    ends: Sequence[float] | None,
-    steady_from: float | None,
-    gain: bool,
-    width: float | None,
-) -> dict[str, Callable[[], Figure]]:
-    """Return how each figure is drawn, by name."""
-
-    def seen() -> Observability:
-        return analyse_observability(trajectory) if observability is None else observability
-
-    return {
-        "errors": lambda: error_figure(trajectory, ends, width),
-        "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario, width),
-        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends, scenario, width),
-        "topology": lambda: topology_figure(trajectory, ends, width),
-        "consistency": lambda: consistency_figure(trajectory, ends, steady_from, width, gain=gain),
-        "observability": lambda: observability_figure(seen(), ends, width),
-    }

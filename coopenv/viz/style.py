@@ -1,4 +1,4 @@
-"""What the figures share: a palette safe for colour-blind readers, the paper's names, time-axis helpers."""
+"""What the figures share: a palette safe for colour-blind readers, the paper's names, time axes, places of names."""
 
 import re
 import warnings
@@ -12,6 +12,7 @@ from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
@@ -284,3 +285,54 @@ def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:
     ax.tick_params(labelbottom=labelled)
     if labelled:
         ax.set_xlabel("time [s]", fontsize=NORMAL, color=INK)
+
+
+_GAP = 5.0  # pt between a point and its name
+_MARK = 4.5  # pt, half the side of a mark
+_WIDTH, _HEIGHT = 0.62, 0.95  # of a character, in font sizes
+_DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
+_COST_OF_NAME, _COST_OF_MARK, _COST_OF_LINE = 200.0, 100.0, 1.0
+
+
+def place_names(
+    names: Sequence[str], anchors: np.ndarray, marks: np.ndarray, lines: np.ndarray, size: float
+) -> np.ndarray:
+    """Return the offsets (M, 2), in pt, of names' lower left corners from their points.
+
+    Each name in turn takes the side of its point that covers the least: first other names, then marks, then lines.
+    Points of names (M, 2), of all marks (P, 2) and along lines (Q, 2) are in pixels; the font's size is in pt.
+    """
+    point, sides = DPI / 72.0, np.array(_DIRECTIONS)
+    gaps = np.where(sides.all(axis=1, keepdims=True), _GAP, 1.4 * _GAP) * sides
+    anchors, marks, lines = (np.asarray(a, float).reshape(-1, 2) / point for a in (anchors, marks, lines))
+    taken: list[np.ndarray] = []
+    offsets = []
+    for name, anchor in zip(names, anchors, strict=True):
+        extent = np.array([_WIDTH * len(re.sub(r"[${}_\\]", "", name)), _HEIGHT]) * size
+        corners = gaps + np.where(sides > 0, 0.0, np.where(sides < 0, -extent, -extent / 2))
+        low, high = (anchor + corners)[:, None], (anchor + corners + extent)[:, None]
+        other = np.array(taken).reshape(-1, 2, 2)
+        costs = _COST_OF_NAME * np.all((low < other[:, 1]) & (high > other[:, 0]), axis=-1).sum(axis=1)
+        costs += _COST_OF_MARK * np.all((marks > low - _MARK) & (marks < high + _MARK), axis=-1).sum(axis=1)
+        costs += _COST_OF_LINE * np.all((lines > low) & (lines < high), axis=-1).any(axis=1)
+        best = corners[int(np.argmin(costs))]
+        taken.append(np.stack([anchor + best, anchor + best + extent]))
+        offsets.append(best)
+    return np.array(offsets).reshape(-1, 2)
+
+
+Colour = str | tuple[float, float, float]
+LEAST = 4.5
+"""Of text, as WCAG 2 asks for at level AA."""
+
+
+def linear_light(part: np.ndarray) -> np.ndarray:
+    """Return the linear intensities of sRGB components, both 0 to 1."""
+    return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+
+
+def contrast(colour: Colour, background: Colour = "white") -> float:
+    """Return the contrast of two colours, 1 (none) to 21 (black on white)."""
+    luminance = linear_light(np.array([to_rgb(colour), to_rgb(background)])) @ (0.2126, 0.7152, 0.0722)
+    low, high = np.sort(luminance).tolist()
+    return float((high + 0.05) / (low + 0.05))

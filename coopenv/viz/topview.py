@@ -5,15 +5,17 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
+from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body
-from coopenv.viz import topview_geometry as geometry
+from coopenv.viz import stage as geometry
 from coopenv.viz import topview_ground as ground
-from coopenv.viz.scene.stage import Frame, FrameSource, Stage
+from coopenv.viz.scene import Frame, FrameSource
+from coopenv.viz.stage import Stage
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_ground import Goals, Layers
 
@@ -85,7 +87,6 @@ _POINTER = 13  # px
 _LABEL = 3  # px between a vehicle and its name
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
-_BOX = ("rotation", "position", "half")
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 
 
@@ -107,11 +108,9 @@ class TopView:
         self._error_words = "mean error" if len(scenario.vehicles) > 1 else "error"
         self._stage, self._landmarks = Stage(scenario), len(scenario.landmarks)
         self._gain = not states_covariance(scenario.observer.name)
-        self._figure, self._axes = ground.new_ground(scenario)
+        self._figure, self._axes = ground.new_ground(self._stage)
         self._layers = Layers(self._figure, self._axes)
-        (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
-        self._low, self._high = np.array([x0, y0]), np.array([x1, y1])
-        self._side = x1 - x0
+        self._low, self._high, self._side = self._stage.low, self._stage.high, self._stage.side
         self._pixel = self._side / self._axes.get_window_extent().width  # m
         self._prepare_shapes()
         self._prepare_artists()
@@ -128,7 +127,9 @@ class TopView:
         self._goals.place(frame)
         self._place_bodies(frame)
         there = frame.traffic_half[:, 0] > 0.0
-        self._traffic.set_verts(geometry.box_outlines(*(getattr(frame, f"traffic_{part}")[there] for part in _BOX)))
+        corners = frame.traffic_half[there, None, :2] * geometry.CORNERS
+        outline = geometry.outlines(frame.traffic_rotation[there], frame.traffic_position[there, :2], corners)
+        self._traffic.set_verts(outline)
         self._place_sight(frame)
         self._place_marks(frame)
         self._write(frame, sigma)
@@ -149,13 +150,14 @@ class TopView:
         bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
         boxes = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
         noses = np.array([geometry.nose_shape(box) for box in boxes])
-        self._box, self._nose = (geometry.turned(part, geometry.ways(s)) for part in (boxes, noses))
+        turn, still = Rotation.from_euler("z", geometry.ways(s)[:, None]).as_matrix(), np.zeros((len(boxes), 2))
+        self._box, self._nose = geometry.outlines(turn, still, boxes), geometry.outlines(turn, still, noses)
         self._others = [i for i, m in enumerate(s.landmarks) if m.body]
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
         flank = np.stack([boxes[:, :, 0].mean(axis=1), boxes[:, 2, 1]], axis=-1)
         aside = np.tile([0.0, 1.0], (len(flank), 1))
-        self._flank = geometry.turned(np.stack([flank, aside], axis=1), geometry.ways(s))
+        self._flank = geometry.outlines(turn, still, np.stack([flank, aside], axis=1))
 
     def _prepare_artists(self) -> None:
         layers = self._layers
@@ -212,7 +214,7 @@ class TopView:
         self._rows = [self._layers.keep(row) for row in rows]
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
-        ground.draw_legend(self._figure, self.scenario, shown + 1)
+        ground.draw_legend(self._figure, self._stage, shown + 1)
 
     def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""

@@ -18,11 +18,9 @@ from matplotlib.text import Annotation, Text
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
-from coopenv.scenario.bodies import Obstacle
-from coopenv.viz.drawing import place_names
-from coopenv.viz.scene.stage import Frame, sees_a_part
-from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
-from coopenv.viz.topview_geometry import limits, road_corners, ways
+from coopenv.viz.scene import Frame
+from coopenv.viz.stage import Stage, road_corners, ways
+from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, place_names, vehicle_colour
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
 LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
@@ -58,7 +56,7 @@ def pixels(x: float, y: float) -> tuple[float, float]:
     return x / WIDTH, y / HEIGHT
 
 
-def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
+def new_ground(stage: Stage) -> tuple[Figure, Axes]:
     """Return a figure with everything that does not change during an episode."""
     figure = new_figure((WIDTH + 0.1) / DPI, (HEIGHT + 0.1) / DPI)
     ax = figure.add_axes((*pixels(LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
@@ -71,12 +69,11 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.yaxis.set_label_coords(-_WORDS / _SIDE, 0.5)
     for spine in ax.spines.values():
         spine.set(linewidth=0.6, color=GREY)
-    low, high = limits(scenario)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    ax.set(xlim=(stage.low[0], stage.high[0]), ylim=(stage.low[1], stage.high[1]))
     ax.set_aspect("equal")
     ax.set_autoscale_on(False)
-    figure.text(*pixels(LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
-    draw_site(ax, scenario)
+    figure.text(*pixels(LEFT, HEIGHT - 21), stage.scenario.title, fontsize=NORMAL + 1.5, color=INK)
+    draw_site(ax, stage)
     return figure, ax
 
 
@@ -86,25 +83,16 @@ def shrink(text: Text, width: float) -> None:
     text.set_fontsize(float(text.get_fontsize()) * min(1.0, width / wide))
 
 
-def draw_site(ax: Axes, scenario: Scenario) -> None:
+def draw_site(ax: Axes, stage: Stage) -> None:
     """Draw roads and buildings in plan."""
-    origin = np.array(scenario.map.origin)[:2]
-    for road in scenario.roads:
+    origin = stage.origin[:2]
+    for road in stage.scenario.roads:
         ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
-    for road in (road for road in scenario.roads if road.marked):
-        line = np.array([road.start, road.end]) - origin
-        ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
-    for obstacle in scenario.obstacles:
-        corners = footprint(scenario, obstacle)
-        ax.add_patch(Polygon(corners, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
-
-
-def footprint(scenario: Scenario, obstacle: Obstacle) -> np.ndarray:
-    """Return the corners (4, 2) of a building in plan, map frame, m."""
-    half = np.array(obstacle.size)[:2] / 2
-    c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
-    corners = (half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
-    return np.asarray(corners + np.array(obstacle.center)[:2] - np.array(scenario.map.origin)[:2])
+        if road.marked:
+            line = np.array([road.start, road.end]) - origin
+            ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
+    for box in stage.buildings:
+        ax.add_patch(Polygon(box.footprint, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
 
 
 def name_landmarks(ax: Axes, scenario: Scenario) -> list[Annotation]:
@@ -124,19 +112,21 @@ def label_landmark(ax: Axes, name: str, place: np.ndarray, offset: tuple[float, 
     return ax.annotate(name, (float(place[0]), float(place[1])), offset, **look)
 
 
-def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
-    """Explain the marks that can occur in this scenario, under a table of `rows` rows."""
+def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
+    """Explain the marks that can occur in a scenario, under a table of `rows` rows."""
+    scenario, largest = stage.scenario, LARGEST_ELLIPSE * stage.side
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
     moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
     honest = states_covariance(scenario.observer.name)
+    way = ", and its way" if np.any(ways(scenario)) else ""
     marks: list[tuple[object, Artist]] = [
-        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label=_vehicle_words(scenario))),
+        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true" + way)),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
         (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DASH_DOTTED, label="error of the estimate")),
-        (honest, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=_ellipse_words(scenario))),
+        (honest, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=f"3σ, where below {largest:.2g} m")),
         (not honest, _mark("$-$", INK, INK, 5, "no 3σ: P is a gain matrix")),
-        (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
+        (stage.sees_a_part, Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
         (True, _sight(Sight.VISIBLE, "sees (its colour)")),
         (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),
         (sensed, _sight(Sight.OCCLUDED_BY_BODY, "hidden by a body")),
@@ -153,15 +143,6 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
     gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
     legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
-
-
-def _ellipse_words(scenario: Scenario) -> str:
-    low, high = limits(scenario)
-    return f"3σ, where below {LARGEST_ELLIPSE * (high - low)[0]:.2g} m"
-
-
-def _vehicle_words(scenario: Scenario) -> str:
-    return "vehicle, true, and its way" if np.any(ways(scenario)) else "vehicle, true"
 
 
 def draw_swatches(figure: Figure, places: Sequence[tuple[float, float]]) -> None:

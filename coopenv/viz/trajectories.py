@@ -1,22 +1,22 @@
 """The paths of vehicles and landmarks, in plan and in space: truth dotted, estimate solid."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from coopenv.estimation.metrics import SETTLED, live_ticks, settling_times
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz import style
-from coopenv.viz.drawing import Drawing, marker_look
+from coopenv.viz.stage import Stage
 from coopenv.viz.style import DARK_BLUE, GREY, INK, NORMAL, NOTE, vehicle_colour, vehicle_label
-from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site, footprint
+from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site
 
 _DOTTED = (0, (1, 1.6))
 _DASHED = (0, (5, 1.5, 1, 1.5))
@@ -33,6 +33,95 @@ _FAINT: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.3}
 _ESTIMATE: dict[str, Any] = {"linewidth": 1.6, "alpha": 0.85}
 _TRUTH: dict[str, Any] = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
 _STEM: dict[str, Any] = {"color": NOTE, "linewidth": 0.7}
+
+
+def clipped(path: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the parts (M, D) of a line (K, D) within a box, apart by rows of NaN, each cut where it meets a side."""
+    path = np.asarray(path, float)
+    if len(path) == 1:
+        return path if np.all((path >= low) & (path <= high)) else np.empty((0, path.shape[1]))
+    start = path[:-1]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        step = np.diff(path, axis=0)
+        to_low, to_high = (low - start) / step, (high - start) / step
+        still = step == 0
+        within = (start >= low) & (start <= high)
+        enter = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(to_low, to_high)).max(axis=1)
+        leave = np.where(still, np.inf, np.maximum(to_low, to_high)).min(axis=1)
+        enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
+        drawn = enter <= leave  # False for NaN
+    points: list[np.ndarray] = []
+    gap = np.full(path.shape[1], np.nan)
+    connected = False
+    for i in np.flatnonzero(drawn):
+        connected = connected and bool(drawn[i - 1]) and enter[i] == 0.0
+        if not connected:
+            points += [gap] if points else []
+            points.append(start[i] + enter[i] * step[i] if enter[i] > 0 else start[i])
+        points.append(path[i + 1] if leave[i] == 1.0 else start[i] + leave[i] * step[i])
+        connected = bool(leave[i] == 1.0)
+    return np.array(points).reshape(-1, path.shape[1])
+
+
+class Drawing:
+    """Axes with lines, marks, and names that are placed at the end."""
+
+    def __init__(self, ax: Any, low: np.ndarray, high: np.ndarray, dimensions: int) -> None:
+        self.ax, self.low, self.high, self.dimensions = ax, low, high, dimensions
+        self.outside = False  # an estimate starts outside the box
+        self._marks: list[np.ndarray] = []
+        self._lines: list[np.ndarray] = []
+        self._names: list[tuple[str, np.ndarray, str]] = []
+
+    def line(self, path: np.ndarray, **look: Any) -> None:
+        """Draw the part of a path (K, 3) that lies in the box."""
+        used = slice(self.dimensions)
+        shown = clipped(path[:, used], self.low[used], self.high[used])
+        self.ax.plot(*shown.T, **look)
+        self._lines.append(shown)
+
+    def mark(self, point: np.ndarray, marker: str, edge: str, face: str | None = None) -> None:
+        """Mark a point (3,); the face has the colour of the edge unless another one is given."""
+        point = point[: self.dimensions]
+        self.ax.plot(*point[:, None], clip_on=False, zorder=4, **marker_look(marker, edge, face or edge))
+        self._marks.append(point)
+
+    def stem(self, point: np.ndarray, **look: Any) -> None:
+        """Connect a point (3,) with the floor of the box, in space."""
+        if self.dimensions == 3:
+            foot = np.array([*point[:2], self.low[2]])
+            self.line(np.stack([foot, point]), **look)
+
+    def name(self, point: np.ndarray, text: str, colour: str) -> None:
+        """Name a point (3,)."""
+        self._names.append((text, point[: self.dimensions], colour))
+
+    def write_names(self) -> None:
+        """Write the names; the limits of the axes must be final."""
+        self.ax.apply_aspect()
+        if not self._names:
+            return
+        texts, points, colours = zip(*self._names, strict=True)
+        anchors = self._plane(np.array(points))
+        marks, lines = self._plane(np.array(self._marks)), self._plane(np.concatenate(self._lines or [points]))
+        pixels = self.ax.transData.transform
+        offsets = style.place_names(texts, pixels(anchors), pixels(marks), pixels(lines), NORMAL + 1)
+        look: dict[str, Any] = {"fontsize": NORMAL + 1, "path_effects": style.HALO, "zorder": 5}
+        for text, anchor, offset, colour in zip(texts, anchors, offsets, colours, strict=True):
+            self.ax.annotate(text, anchor, offset, textcoords="offset points", color=colour, **look)
+
+    def _plane(self, points: np.ndarray) -> np.ndarray:
+        """Return points (K, D) in the coordinates of the plane that is drawn."""
+        if self.dimensions == 2:
+            return points
+        x, y, _ = proj3d.proj_transform(*points.T, self.ax.get_proj())
+        return np.stack([x, y], axis=-1)
+
+
+def marker_look(marker: str, edge: str, face: str) -> dict[str, Any]:
+    """Return how a mark of a point looks."""
+    look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
+    return {"linestyle": "none", "markersize": 6.0, "markeredgewidth": 1.0, **look}
 
 
 def trajectory_figure_2d(
@@ -59,7 +148,7 @@ def trajectory_figure_2d(
     ax = figure.add_subplot()
     style.tidy(ax, x_label="x [m]", y_label="y [m]")
     if scenario is not None:
-        draw_site(ax, scenario)
+        draw_site(ax, Stage(scenario))
     drawing = Drawing(ax, low, high, dimensions=2)
     elsewhere = _elsewhere(trajectory, scenario)
     step = _draw_paths(drawing, trajectory, ends, elsewhere)
@@ -114,14 +203,9 @@ def trajectory_figure_3d(
 
 def _draw_buildings(ax: Any, scenario: Scenario, low: np.ndarray, high: np.ndarray) -> None:
     """Draw the buildings, as far as they are in the box."""
-    for obstacle in scenario.obstacles:
-        corners = np.clip(footprint(scenario, obstacle), low[:2], high[:2])
-        height = np.array(obstacle.center)[2] - scenario.map.origin[2]
-        ends = np.clip(height + np.array([-0.5, 0.5]) * obstacle.size[2], low[2], high[2])
-        rings = [np.column_stack([corners, np.full(len(corners), z)]) for z in ends]
-        around = [*pairwise(zip(*rings, strict=True)), ((rings[0][-1], rings[1][-1]), (rings[0][0], rings[1][0]))]
-        sides = [np.array([a, b, d, c]) for (a, b), (c, d) in around]
-        faces = Poly3DCollection([*sides, rings[1]], facecolor=ROOF, edgecolor=WALL, linewidth=0.6, alpha=0.35)
+    for box in Stage(scenario).buildings:
+        *sides, _, top = np.clip(box.faces, low, high)
+        faces = Poly3DCollection([*sides, top], facecolor=ROOF, edgecolor=WALL, linewidth=0.6, alpha=0.35)
         ax.add_collection3d(faces)
 
 

@@ -131,8 +131,8 @@ def test_switches_change_what_is_shown(viewer: Viewer) -> None:
     wish(viewer, ("magnification", 10.0), ("show names", False), ("show views", False))
     large = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
     np.testing.assert_allclose(large[small > 0.05] / small[small > 0.05], 10.0, rtol=0.05)
-    assert not any(label.handle.visible for label in viewer._picture._labels._cars)
-    assert not any(view.handle.visible for view in viewer._picture._views)
+    assert not any(label.visible for label in viewer._picture._labels._cars)
+    assert not any(view.visible for view in viewer._picture._views)
 
 
 def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,8 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.policies import decide, load_policy
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.camera_image import Lens
-from coopenv.viz.scene import Frame, SceneRecord, Source, Stage
-from coopenv.viz.scene.stage import entry
+from coopenv.viz.scene import Frame, SceneRecord, Source
+from coopenv.viz.stage import Stage, entry
 from coopenv.viz.topview import TopView
 from coopenv.viz.web.picture import stopped
 

@@ -24,11 +24,10 @@ from coopenv.estimation.poses import error_coordinates, position_covariance
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.camera_image import Lens, camera_image
-from coopenv.viz.scene import Frame, Stage
-from coopenv.viz.style import ORANGE, vehicle_colour
-from coopenv.viz.topview import TopView
-from coopenv.viz.topview_geometry import (
+from coopenv.viz.scene import Frame
+from coopenv.viz.stage import (
     Box,
+    Stage,
     camera_fan,
     ellipses,
     free_lengths,
@@ -36,6 +35,8 @@ from coopenv.viz.topview_geometry import (
     pointers,
     ways,
 )
+from coopenv.viz.style import ORANGE, vehicle_colour
+from coopenv.viz.topview import TopView
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH, touching
 from tests.helpers.builders import scenario
 from tests.helpers.four_way import FOUR_WAY

@@ -14,8 +14,7 @@ from mpl_toolkits.mplot3d import proj3d
 import coopenv
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
-from coopenv.viz.drawing import clipped, place_names
-from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
+from coopenv.viz.trajectories import clipped, trajectory_figure_2d, trajectory_figure_3d
 from tests.helpers.drawn import texts, xdata, ydata
 from tests.helpers.four_way import FOUR_WAY
 
@@ -119,13 +118,13 @@ def test_names_keep_off_marks_and_each_other() -> None:
     point = style.DPI / 72.0
     anchors = np.array([(100.0, 100.0), (104.0, 100.0)])
     marks = np.vstack([anchors, [(115.0, 110.0)]])
-    offsets = place_names(["SL1", "$f_{2}$"], anchors, marks, np.empty((0, 2)), 10.0)
+    offsets = style.place_names(["SL1", "$f_{2}$"], anchors, marks, np.empty((0, 2)), 10.0)
     low = anchors / point + offsets
     extent = np.array([(0.62 * 3, 0.95), (0.62 * 2, 0.95)]) * 10.0
     for corner, size in zip(low, extent, strict=True):
         assert not np.any(np.all((marks / point > corner) & (marks / point < corner + size), axis=-1))
     assert np.any((low[0] >= low[1] + extent[1]) | (low[1] >= low[0] + extent[0]))
-    assert place_names(["A"], anchors[:1], anchors[:1], np.empty((0, 2)), 10.0).tolist() == [[5.0, 5.0]]
+    assert style.place_names(["A"], anchors[:1], anchors[:1], np.empty((0, 2)), 10.0).tolist() == [[5.0, 5.0]]
 
 
 @pytest.mark.parametrize("draw", [trajectory_figure_2d, trajectory_figure_3d])

@@ -16,7 +16,8 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
-from coopenv.viz.scene import SceneRecord, Source, Stage
+from coopenv.viz.scene import SceneRecord, Source
+from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import linear, placed, spacing_of
 from coopenv.viz.web.page import has_viser, viser_module, write_replay
 from coopenv.viz.web.panel import GAIN

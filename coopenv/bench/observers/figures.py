@@ -29,7 +29,6 @@ from coopenv.bench.observers.tables import BOUNDS, Leaderboard
 from coopenv.estimation.metrics import mean_bounds, wilson_interval
 from coopenv.estimation.poses import Array
 from coopenv.viz import style
-from coopenv.viz.drawing import contrast, place_names
 from coopenv.viz.style import (
     BLUE,
     GREY,
@@ -39,6 +38,8 @@ from coopenv.viz.style import (
     SMALL,
     VEHICLE_COLOURS,
     VERMILION,
+    contrast,
+    place_names,
     vehicle_colour,
     vehicle_label,
 )

@@ -6,8 +6,7 @@ estimate alone.
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from io import BytesIO
 from typing import Any
 
@@ -19,17 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap.format import LogClock, View, codec, ros_definition
 from coopenv.base.format import jsonable
-from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array, covariance_in_map
 from coopenv.observers import Run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.camera_image import pixels
-from coopenv.viz.scene import Frame, Stage
-from coopenv.viz.scene.record import frames_of
+from coopenv.viz.scene import semi_axes
+from coopenv.viz.stage import Stage, road_corners, ways
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour
-from coopenv.viz.topview_geometry import road_corners, semi_axes, ways
 from coopenv.viz.topview_ground import ASPHALT, ROOF
 
 Messages = Iterator[tuple[int, bytes]]
@@ -62,54 +59,50 @@ _ERROR_SCHEMA = json.dumps(
 ).encode()
 
 
-@dataclass(frozen=True)
 class RunView:
-    """A recording, a run of an observer on it, and their frames."""
+    """A recording and a run of an observer on it, at the K ticks that are shown, at most 20 a second.
 
-    recording: Recording
-    run: Run
-    clock: LogClock
-    gain: bool
-    """Whether the observer's P is a gain matrix, and no covariance."""
+    A vehicle whose truth is never known has the pose of its estimate.
+    """
 
-    @cached_property
-    def frames(self) -> list[Frame]:
-        """Frames of the drive, at most 20 a second."""
-        stride = max(1, round(1.0 / (_RATE * self.recording.dt)))
-        return frames_of(self.recording, self.run, np.arange(0, self.recording.ticks, stride))
-
-    @cached_property
-    def names(self) -> list[str]:
-        """Names of the vehicles."""
-        return [setup.name for setup in self.recording.setups]
-
-    @cached_property
-    def bodies(self) -> list[tuple[str, int]]:
+    def __init__(self, recording: Recording, run: Run, clock: LogClock, gain: bool) -> None:
+        """Take what is shown; with `gain` the observer's P is a gain matrix, and no covariance."""
+        r, self.recording, self.run, self.clock, self.gain = recording, recording, run, clock, gain
+        self.ticks = ticks = np.arange(0, r.ticks, max(1, round(1.0 / (_RATE * r.dt))))
+        self.names = [setup.name for setup in r.setups]
+        known = np.atleast_1d(r.truth.known.any(axis=0))
+        self.bodies = [(name if known[i] else f"{name}/estimate", i) for i, name in enumerate(self.names)]
         """Frame and index of the true body of each vehicle with a known truth, else of its estimate."""
-        known = np.atleast_1d(self.recording.truth.known.any(axis=0))
-        return [(name if known[i] else f"{name}/estimate", i) for i, name in enumerate(self.names)]
-
-    @cached_property
-    def extent(self) -> float:
-        """Size of the scene, m."""
-        r = self.recording
+        self.estimate_rotation, self.estimate_position = run.rotation[ticks], run.position[ticks]
+        self.rotation = np.where(known[:, None, None], r.truth.rotation[ticks], self.estimate_rotation)
+        self.position = np.where(known[:, None], r.truth.position[ticks], self.estimate_position)
+        pose = run.coordinates, self.estimate_rotation, self.estimate_position
+        self.covariance = covariance_in_map(*pose, run.covariance[ticks])
+        """(K, N, 6, 6) of position and rotation in the map."""
+        self.semi, self.axes = (
+            part.reshape(*self.covariance.shape[:2], *part.shape[1:])
+            for part in semi_axes(self.covariance[..., :3, :3].reshape(-1, 3, 3))
+        )
+        """(K, N, 3) and (K, N, 3, 3) of ellipsoids of 3 sigma."""
+        self.landmarks, self.visible = r.landmarks[ticks], r.visible[ticks]
+        self.bearings = r.bearings[ticks]
+        self.pan = np.zeros(self.position.shape[:2]) if r.pan is None else r.pan[ticks]
+        self.moving_landmarks = np.flatnonzero((r.landmarks != r.landmarks[:1]).any(axis=(0, 2))).tolist()
         points = np.concatenate([r.landmarks[0], r.truth.position[0], r.start_position])
         points = points[np.isfinite(points).all(axis=1)]
-        return max(1.0, float(np.ptp(points, axis=0).max()))
+        self.extent = max(1.0, float(np.ptp(points, axis=0).max()))
+        """Size of the scene, m."""
+        s, none = r.scenario, [None] * len(self.names)
+        found = none if s is None or s.topology.mode != "sensed" else s.cameras
+        self.cameras = [camera if camera is not None and camera.model == "pinhole" else None for camera in found]
+        """None where a vehicle has no image."""
+        self.stamps = [self.stamp(tick) for tick in ticks]
 
-    @cached_property
-    def moving_landmarks(self) -> list[int]:
-        """Indices of the landmarks that move."""
-        landmarks = self.recording.landmarks
-        return [int(i) for i in np.flatnonzero((landmarks != landmarks[:1]).any(axis=(0, 2)))]
-
-    @cached_property
-    def cameras(self) -> list[Camera | None]:
-        """Camera of each vehicle; None where it has no image."""
-        scenario = self.recording.scenario
-        if scenario is None or scenario.topology.mode != "sensed":
-            return [None] * len(self.names)
-        return [camera if camera.model == "pinhole" else None for camera in scenario.cameras]
+    def each(self, message: Callable[[Any, int], Any], count: int | None = None) -> Messages:
+        """Yield a message, or bytes, of each tick, or of the first ones."""
+        for n, tick in enumerate(self.ticks[:count].tolist()):
+            found = message(self, n)
+            yield tick, found if isinstance(found, bytes) else found.encode()
 
     def stamp(self, tick: Any) -> Any:
         """Return the time of a tick as a `foxglove.Timestamp`."""
@@ -124,14 +117,13 @@ def topics(view: RunView) -> list[View]:
         schema = kind.get_schema()
         return View(topic, schema.name, schema.encoding, schema.data, "protobuf", messages)
 
-    def scene(topic: str, update: Callable[[RunView, Frame], Any], frames: list[Frame] | None = None) -> View:
-        shown = view.frames if frames is None else frames
-        return published(topic, fox.SceneUpdate, ((int(f.tick), update(view, f).encode()) for f in shown))
+    def scene(topic: str, update: Callable[[RunView, int], Any], count: int | None = None) -> View:
+        return published(topic, fox.SceneUpdate, view.each(update, count))
 
     found = [
-        scene("/scene/world", _world, view.frames[:1]),
-        scene("/scene/vehicles", _vehicles, view.frames[:1]),
-        published("/tf", fox.FrameTransforms, _transforms(view)),
+        scene("/scene/world", _world, 1),
+        scene("/scene/vehicles", _vehicles, 1),
+        published("/tf", fox.FrameTransforms, view.each(_transforms)),
         scene("/scene/sight", _sight),
     ]
     if view.moving_landmarks:
@@ -141,21 +133,24 @@ def topics(view: RunView) -> list[View]:
     for i, name in enumerate(view.names):
         found += [
             View(f"/{name}/estimate", _POSE, "ros2msg", ros_definition(_POSE), "cdr", _poses(view, i)),
-            View(f"/{name}/error", _ERROR, "jsonschema", _ERROR_SCHEMA, "json", _errors(view, i)),
+            View(f"/{name}/error", _ERROR, "jsonschema", _ERROR_SCHEMA, "json", view.each(partial(_errors, vehicle=i))),
         ]
         camera = view.cameras[i]
         if camera is not None:
             found += [
-                published(f"/{name}/camera/calibration", fox.CameraCalibration, _calibration(view, i, camera)),
-                published(f"/{name}/camera/image", fox.CompressedImage, _image(view, i, camera)),
-                published(f"/{name}/camera/annotations", fox.ImageAnnotations, _annotations(view, i, camera)),
+                published(f"/{name}/camera/{topic}", kind, view.each(partial(message, vehicle=i, camera=camera), count))
+                for topic, kind, message, count in (
+                    ("calibration", fox.CameraCalibration, _calibration, 1),
+                    ("image", fox.CompressedImage, _image, 1),
+                    ("annotations", fox.ImageAnnotations, _annotations, None),
+                )
             ]
     return found
 
 
-def _world(view: RunView, frame: Frame) -> Any:
+def _world(view: RunView, n: int) -> Any:
     """Return what never moves."""
-    stamp, scenario = view.stamp(frame.tick), view.recording.scenario
+    stamp, scenario = view.stamps[n], view.recording.scenario
     entities = []
     if scenario is not None:
         stage = Stage(scenario)
@@ -168,25 +163,25 @@ def _world(view: RunView, frame: Frame) -> Any:
             place = _pose(building.center, building.rotation)
             box = fox.CubePrimitive(pose=place, size=_vector(building.size), color=_colour(ROOF, 0.6))
             entities.append(_entity(f"building {building.name}", stamp, cubes=[box]))
-    still = set(range(frame.landmarks)) - set(view.moving_landmarks)
-    return fox.SceneUpdate(entities=entities + [_landmark(view, frame, i) for i in sorted(still)])
+    still = set(range(view.landmarks.shape[1])) - set(view.moving_landmarks)
+    return fox.SceneUpdate(entities=entities + [_landmark(view, n, i) for i in sorted(still)])
 
 
-def _moving(view: RunView, frame: Frame) -> Any:
+def _moving(view: RunView, n: int) -> Any:
     """Return the landmarks that move."""
-    return fox.SceneUpdate(entities=[_landmark(view, frame, i) for i in view.moving_landmarks])
+    return fox.SceneUpdate(entities=[_landmark(view, n, i) for i in view.moving_landmarks])
 
 
-def _landmark(view: RunView, frame: Frame, i: int) -> Any:
-    place, name = frame.position[i], view.recording.setups[0].target_names[i]
+def _landmark(view: RunView, n: int, i: int) -> Any:
+    place, name = view.landmarks[n, i], view.recording.setups[0].target_names[i]
     ball = fox.SpherePrimitive(pose=_pose(place), size=_vector([_BALL * view.extent] * 3), color=_colour(DARK_BLUE))
     above = _text(name, np.add(place, (0.0, 0.0, 0.8 * _LETTERS * view.extent)), view.extent)
-    return _entity(f"landmark {name}", view.stamp(frame.tick), spheres=[ball], texts=[above])
+    return _entity(f"landmark {name}", view.stamps[n], spheres=[ball], texts=[above])
 
 
-def _vehicles(view: RunView, frame: Frame) -> Any:
+def _vehicles(view: RunView, n: int) -> Any:
     """Return the vehicles: the true ones opaque and with names, the estimated ones translucent."""
-    stamp, scenario = view.stamp(frame.tick), view.recording.scenario
+    stamp, scenario = view.stamps[n], view.recording.scenario
     angles = np.zeros(len(view.names)) if scenario is None else ways(scenario)
     entities = []
     for shown, i in view.bodies:
@@ -207,41 +202,35 @@ def _vehicles(view: RunView, frame: Frame) -> Any:
     return fox.SceneUpdate(entities=entities)
 
 
-def _transforms(view: RunView) -> Messages:
-    """Yield the frames of bodies, true and estimated, and of cameras."""
-    for frame in view.frames:
-        found = []
-        stamp, true = view.stamp(frame.tick), (frame.vehicle_rotation, frame.vehicle_position)
-        for parent, i in view.bodies:
-            name, camera = view.names[i], view.cameras[i]
-            if parent == name:
-                found += _transform(stamp, _MAP, name, true[0][i], true[1][i])
-            found += _transform(stamp, _MAP, f"{name}/estimate", frame.estimate_rotation[i], frame.estimate_position[i])
-            if camera is not None and (frame.tick == 0 or view.recording.pan is not None):
-                mounted = camera.to_body(float(frame.pan[i]))
-                found += _transform(stamp, parent, f"{name}/camera", mounted, np.array(camera.position))
-        yield int(frame.tick), fox.FrameTransforms(transforms=found).encode()
+def _transforms(view: RunView, n: int) -> Any:
+    """Return the frames of bodies, true and estimated, and of cameras."""
+    found = []
+    for parent, i in view.bodies:
+        name, camera = view.names[i], view.cameras[i]
+        poses = {f"{name}/estimate": (_MAP, view.estimate_rotation[n, i], view.estimate_position[n, i])}
+        if parent == name:
+            poses = {name: (_MAP, view.rotation[n, i], view.position[n, i]), **poses}
+        if camera is not None and (n == 0 or view.recording.pan is not None):
+            mounted = camera.to_body(float(view.pan[n, i]))
+            poses[f"{name}/camera"] = parent, mounted, np.array(camera.position)
+        for child, (frame, R, p) in poses.items():
+            if np.isfinite(R).all() and np.isfinite(p).all():
+                place: dict[str, Any] = {"translation": _vector(p), "rotation": _quaternion(R)}
+                place |= {"parent_frame_id": frame, "child_frame_id": child}
+                found.append(fox.FrameTransform(timestamp=view.stamps[n], **place))
+    return fox.FrameTransforms(transforms=found)
 
 
-def _transform(stamp: Any, parent: str, child: str, rotation: Array, place: Array) -> list[Any]:
-    if not (np.isfinite(rotation).all() and np.isfinite(place).all()):
-        return []
-    turned, moved = _quaternion(rotation), _vector(place)
-    names = {"parent_frame_id": parent, "child_frame_id": child}
-    return [fox.FrameTransform(timestamp=stamp, translation=moved, rotation=turned, **names)]
-
-
-def _sight(view: RunView, frame: Frame) -> Any:
+def _sight(view: RunView, n: int) -> Any:
     """Return lines from every camera to the targets that it measures, in the colour of the vehicle."""
-    r, stamp = view.recording, view.stamp(frame.tick)
-    R, p = frame.vehicle_rotation, frame.vehicle_position
-    lever, marker = (np.array([getattr(s, part) for s in r.setups]) for part in ("lever_arm", "marker"))
+    stamp, R, p = view.stamps[n], view.rotation[n], view.position[n]
+    lever, marker = (np.array([getattr(s, part) for s in view.recording.setups]) for part in ("lever_arm", "marker"))
     eye = p + (R @ lever[..., None])[..., 0]
-    target = np.concatenate([frame.position[: frame.landmarks], p + (R @ marker[..., None])[..., 0]])
+    target = np.concatenate([view.landmarks[n], p + (R @ marker[..., None])[..., 0]])
     entities = []
     for i, name in enumerate(view.names):
-        seen = np.flatnonzero((frame.sight[i] == Sight.VISIBLE) & np.isfinite(eye[i]).all())
-        along = eye[i] + _UNSEEN * (r.bearings[int(frame.tick), i] @ R[i].T)
+        seen = np.flatnonzero(view.visible[n, i] & np.isfinite(eye[i]).all())
+        along = eye[i] + _UNSEEN * (view.bearings[n, i] @ R[i].T)
         ends = [p for j in seen for p in (eye[i], target[j] if np.isfinite(target[j]).all() else along[j])]
         lines = fox.LinePrimitive(
             type=fox.LinePrimitiveLineType.LineList,
@@ -255,15 +244,14 @@ def _sight(view: RunView, frame: Frame) -> Any:
     return fox.SceneUpdate(entities=entities)
 
 
-def _uncertainty(view: RunView, frame: Frame) -> Any:
+def _uncertainty(view: RunView, n: int) -> Any:
     """Return ellipsoids of 3 sigma about the estimated places."""
-    entities, gone, stamp = [], [], view.stamp(frame.tick)
-    half, axes = semi_axes(frame.position_covariance)
-    largest = np.where(np.isfinite(frame.estimate_position).all(axis=-1), half[:, -1], np.nan)
+    entities, gone, stamp, place = [], [], view.stamps[n], view.estimate_position[n]
+    largest = np.where(np.isfinite(place).all(axis=-1), view.semi[n, :, -1], np.nan)
     for i, name in enumerate(view.names):
         if largest[i] < _LARGEST * view.extent:
-            place = _pose(frame.estimate_position[i], axes[i])
-            ball = fox.SpherePrimitive(pose=place, size=_vector(2.0 * half[i]), color=_of(i, 0.25))
+            size = _vector(2.0 * view.semi[n, i])
+            ball = fox.SpherePrimitive(pose=_pose(place[i], view.axes[n, i]), size=size, color=_of(i, 0.25))
             entities.append(_entity(f"3 sigma of {name}", stamp, spheres=[ball]))
         else:
             gone.append(fox.SceneEntityDeletion(timestamp=stamp, id=f"3 sigma of {name}"))
@@ -272,14 +260,14 @@ def _uncertainty(view: RunView, frame: Frame) -> Any:
 
 def _poses(view: RunView, vehicle: int) -> Messages:
     """Yield a vehicle's estimate; a covariance of zeros, as ROS has it, where the observer states none."""
-    store, run = codec(), view.run
+    store = codec()
     types = {name.rpartition("/")[2]: kind for name, kind in store.types.items() if "geometry_msgs" in name}
     time, header = (store.types[name] for name in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
-    for frame in view.frames:
-        k, R, p = int(frame.tick), frame.estimate_rotation[vehicle], frame.estimate_position[vehicle]
+    for n, k in enumerate(view.ticks.tolist()):
+        R, p = view.estimate_rotation[n, vehicle], view.estimate_position[n, vehicle]
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             continue
-        covariance = covariance_in_map(run.coordinates, R, p, run.covariance[k, vehicle])
+        covariance = view.covariance[n, vehicle]
         stated = not view.gain and bool(np.isfinite(covariance).all())
         P = np.array(_short(covariance)).ravel() if stated else np.zeros(36)
         q = _short(Rotation.from_matrix(R).as_quat())
@@ -289,61 +277,55 @@ def _poses(view: RunView, vehicle: int) -> Messages:
         yield k, bytes(store.serialize_cdr(message, _POSE))
 
 
-def _errors(view: RunView, vehicle: int) -> Messages:
-    """Yield a vehicle's errors as JSON; null where they are not known."""
-    for frame in view.frames:
-        sigma = np.nan if view.gain else semi_axes(frame.position_covariance[[vehicle]])[0][0, -1]
-        nees = frame.nees[vehicle] if np.isfinite(sigma) else np.nan
-        values = frame.position_error[vehicle], frame.orientation_error[vehicle], sigma, nees
-        row = {name: float(f"{value:.6g}") for name, value in zip(_NUMBERS, values, strict=True)}
-        yield int(frame.tick), json.dumps(jsonable(row), separators=(",", ":")).encode()
+def _errors(view: RunView, n: int, vehicle: int) -> bytes:
+    """Return a vehicle's errors as JSON; null where they are not known."""
+    run, here = view.run, (view.ticks[n], vehicle)
+    sigma = np.nan if view.gain else view.semi[n, vehicle, -1]
+    nees = run.nees[here] if np.isfinite(sigma) else np.nan
+    values = run.position_error[here], run.orientation_error[here], sigma, nees
+    row = {name: float(f"{value:.6g}") for name, value in zip(_NUMBERS, values, strict=True)}
+    return json.dumps(jsonable(row), separators=(",", ":")).encode()
 
 
-def _calibration(view: RunView, vehicle: int, camera: Camera) -> Messages:
-    """Yield a camera's calibration, once."""
+def _calibration(view: RunView, n: int, vehicle: int, camera: Camera) -> Any:
+    """Return a camera's calibration."""
     (fx, fy), (cx, cy) = camera.focal_length, camera.principal_point
     width, height = camera.image_size
-    yield (
-        0,
-        fox.CameraCalibration(
-            timestamp=view.stamp(0),
-            frame_id=f"{view.names[vehicle]}/camera",
-            width=int(width),
-            height=int(height),
-            distortion_model="plumb_bob",
-            D=list(camera.distortion),
-            K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-            P=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-        ).encode(),
+    return fox.CameraCalibration(
+        timestamp=view.stamps[n],
+        frame_id=f"{view.names[vehicle]}/camera",
+        width=int(width),
+        height=int(height),
+        distortion_model="plumb_bob",
+        D=list(camera.distortion),
+        K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
     )
 
 
-def _image(view: RunView, vehicle: int, camera: Camera) -> Messages:
-    """Yield an empty image, once: a canvas for the annotations, as simulated cameras have no pixels."""
+def _image(view: RunView, n: int, vehicle: int, camera: Camera) -> Any:
+    """Return an empty image: a canvas for the annotations, as simulated cameras have no pixels."""
     file = BytesIO()
     Image.new("RGB", (int(camera.image_size[0]), int(camera.image_size[1])), _CANVAS).save(file, "png")
     frame = f"{view.names[vehicle]}/camera"
-    yield 0, fox.CompressedImage(timestamp=view.stamp(0), frame_id=frame, data=file.getvalue(), format="png").encode()
+    return fox.CompressedImage(timestamp=view.stamps[n], frame_id=frame, data=file.getvalue(), format="png")
 
 
-def _annotations(view: RunView, vehicle: int, camera: Camera) -> Messages:
-    """Yield circles where the measured bearings hit the image, with the names of the targets."""
-    r = view.recording
-    names, L = r.setups[vehicle].target_names, r.landmarks.shape[1]
-    for frame in view.frames:
-        stamp, targets = view.stamp(frame.tick), np.flatnonzero(frame.sight[vehicle] == Sight.VISIBLE)
-        rays = r.bearings[int(frame.tick), vehicle, targets] @ camera.to_body(float(frame.pan[vehicle]))
-        places = pixels(rays, camera)
-        circles, words = [], []
-        ahead = np.isfinite(places).all(axis=1)
-        for target, (x, y) in zip(targets[ahead].tolist(), places[ahead].tolist(), strict=True):
-            look = _colour(DARK_BLUE) if target < L else _of(target - L)
-            ring = {"diameter": _RING, "thickness": 2.0, "outline_color": look}
-            circles.append(fox.CircleAnnotation(timestamp=stamp, position=fox.Point2(x=x, y=y), **ring))
-            text = {"text": names[target], "font_size": _WORDS, "text_color": look}
-            words.append(fox.TextAnnotation(timestamp=stamp, position=fox.Point2(x=x + _RING, y=y), **text))
-        yield int(frame.tick), fox.ImageAnnotations(circles=circles, texts=words).encode()
+def _annotations(view: RunView, n: int, vehicle: int, camera: Camera) -> Any:
+    """Return circles where the measured bearings hit the image, with the names of the targets."""
+    names, L, stamp = view.recording.setups[vehicle].target_names, view.landmarks.shape[1], view.stamps[n]
+    targets = np.flatnonzero(view.visible[n, vehicle])
+    places = pixels(view.bearings[n, vehicle, targets] @ camera.to_body(float(view.pan[n, vehicle])), camera)
+    circles, words = [], []
+    ahead = np.isfinite(places).all(axis=1)
+    for target, (x, y) in zip(targets[ahead].tolist(), places[ahead].tolist(), strict=True):
+        look = _colour(DARK_BLUE) if target < L else _of(target - L)
+        ring = {"diameter": _RING, "thickness": 2.0, "outline_color": look}
+        circles.append(fox.CircleAnnotation(timestamp=stamp, position=fox.Point2(x=x, y=y), **ring))
+        text = {"text": names[target], "font_size": _WORDS, "text_color": look}
+        words.append(fox.TextAnnotation(timestamp=stamp, position=fox.Point2(x=x + _RING, y=y), **text))
+    return fox.ImageAnnotations(circles=circles, texts=words)
 
 
 def _entity(name: str, stamp: Any, frame: str = _MAP, **parts: Any) -> Any:

@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
-from coopenv.viz.drawing import linear_light
-from coopenv.viz.scene import Stage
-from coopenv.viz.topview_geometry import road_corners
+from coopenv.viz.stage import CORNERS, Stage, road_corners
+from coopenv.viz.style import linear_light
 from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
 
 
@@ -263,7 +262,7 @@ class Ground:
     def _add_floor(self) -> None:
         side, spacing = self._stage.side, spacing_of(self._stage.side)
         middle = (self._stage.low + self._stage.high) / 2
-        corners = middle + 0.75 * side * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        corners = middle + 0.75 * side * CORNERS
         floor = _quad(corners, self.z - 0.004 * side)
         self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **_FLAT)
         count = int(np.ceil(0.7 * side / spacing))

@@ -18,7 +18,8 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
-from coopenv.viz.scene import SceneRecord, Stage
+from coopenv.viz.scene import SceneRecord
+from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.panel import legend_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification

@@ -14,9 +14,9 @@ from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
-from coopenv.viz.scene import Frame, Source, Stage
+from coopenv.viz.scene import Frame, Source, semi_axes
+from coopenv.viz.stage import Stage
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, vehicle_colour
-from coopenv.viz.topview_geometry import semi_axes
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import Look
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
-from coopenv.viz.scene import Frame, Source, Stage
+from coopenv.viz.scene import Frame, Source, semi_axes
+from coopenv.viz.stage import Box, Stage, crossings
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
-from coopenv.viz.topview_geometry import Box, crossings, semi_axes
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web import ground
 from coopenv.viz.web.ground import NOTHING, ROOT, Batch, Coloured, Ground, Look, Segments, dashes, fine, placed, rgb

@@ -24,8 +24,8 @@ from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.rows import Row
 from coopenv.observers import Estimate, Setup, Tick, registry
 from coopenv.observers.single_frame import DeadReckoning
-from coopenv.viz.drawing import LEAST, contrast
 from coopenv.viz.figures import COLUMNS
+from coopenv.viz.style import LEAST, contrast
 
 
 class Mine(DeadReckoning):

@@ -1,0 +1,267 @@
+"""The moving parts of a picture of a world as plain data, a frame per drawn tick, and the file that keeps an episode.
+
+The top view, the page in the browser and films are made of frames and of a `Stage`, whether a world runs, has been
+recorded or is the one of real cars. `scene.npz` holds the frames of an episode, from which pages and films are made
+again.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.files import replacing_file
+from coopenv.base.format import jsonable
+from coopenv.base.sections import Section, read_npz, validated
+from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.poses import position_covariance
+from coopenv.observers.registry import states_covariance
+from coopenv.scenario import Scenario
+from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.own_terms import without_own_terms
+
+SIGMAS = 3.0
+_ROUNDING = 1e-12  # of the largest eigenvalue: so far below zero is zero
+
+
+def semi_axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 3-sigma semi-axes of covariances (N, D, D): lengths (N, D), ascending, and axes (N, D, D).
+
+    Axes are rotation matrices. Lengths are NaN where a matrix is not finite, or has a negative eigenvalue.
+    """
+    finite = np.isfinite(covariance).all(axis=(-1, -2))
+    variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
+    valid = finite & (variance[:, 0] >= -_ROUNDING * variance[:, -1])
+    return np.where(valid[:, None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan), axes
+
+
+class FrameSource(Protocol):
+    """Source of frames: an engine, or a stand-in for one."""
+
+    def view(self, name: str) -> np.ndarray:
+        """Return a field of its results or its state, (W, ...)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A agents (landmarks first, then N vehicles), R reward terms, P points of a route, Z bodies of other traffic.
+
+    Positions are in the map frame, m; rotations map body to map. Arrays are copies. Numbers are NaN of agents that are
+    not there, and of unknown true poses.
+    """
+
+    tick: np.ndarray  # () camera ticks since the start
+    rotation: np.ndarray  # (A, 3, 3) true
+    position: np.ndarray  # (A, 3) true
+    estimate_rotation: np.ndarray  # (N, 3, 3)
+    estimate_position: np.ndarray  # (N, 3)
+    position_covariance: np.ndarray  # (N, 3, 3) m^2, of the estimate, from the observer's P to first order
+    position_error: np.ndarray  # (N,) m
+    orientation_error: np.ndarray  # (N,) deg
+    nees: np.ndarray  # (N,) normalised error squared of the pose; 6 on average where P is consistent
+    sight: np.ndarray  # (N, A) values of `Sight`
+    pan: np.ndarray  # (N,) rad, by which the camera is turned to the left
+    ended: np.ndarray  # (N,) values of `Outcome`, or conditions of the scenario's own
+    inbox_tick: np.ndarray  # (N receiver, N sender) tick of sending of the last message that arrived; -1: none
+    terms: np.ndarray  # (N, R) terms of the reward, of this tick
+    goal: np.ndarray  # (N, 3)
+    route: np.ndarray  # (N, P, 3) x, y, and arc length
+    route_count: np.ndarray  # (N,) points of the route; 0: none
+    route_drawn: np.ndarray  # (N,) number of the scenario's route that it is drawn from; -1: of none
+    traffic_rotation: np.ndarray  # (Z, 3, 3)
+    traffic_position: np.ndarray  # (Z, 3)
+    traffic_half: np.ndarray  # (Z, 3) half of the edges; zero: not there
+
+    @classmethod
+    def of(cls, shown: FrameSource, world: int = 0) -> Self:
+        """Return the present frame of a world of an engine."""
+        kept: dict[str, Any] = {
+            name: np.array(shown.view(name)[world], np.int64 if name in _WHOLE else np.float64)
+            for name in FIELDS.keys() - {"position_covariance"}
+        }
+        R_hat, p_hat = kept["estimate_rotation"], kept["estimate_position"]
+        covariance = np.array(shown.view("covariance")[world], float)
+        estimate = (R_hat @ p_hat[..., None])[..., 0]
+        absent = np.asarray(shown.view("present")[world]) == 0
+        kept["position"][absent] = np.nan
+        estimate[absent[len(absent) - len(estimate) :]] = np.nan
+        spread = position_covariance(R_hat, p_hat, covariance)
+        return cls(**{**kept, "estimate_position": estimate, "position_covariance": spread})
+
+    @property
+    def landmarks(self) -> int:
+        """How many agents are landmarks."""
+        return len(self.position) - len(self.estimate_position)
+
+    @property
+    def vehicle_rotation(self) -> np.ndarray:
+        """(N, 3, 3) true, body to map."""
+        return self.rotation[self.landmarks :]
+
+    @property
+    def vehicle_position(self) -> np.ndarray:
+        """(N, 3) true, map, m."""
+        return self.position[self.landmarks :]
+
+    @property
+    def sees(self) -> np.ndarray:
+        """(N,) how many targets each camera measures."""
+        return np.asarray(np.sum(self.sight == Sight.VISIBLE, axis=-1))
+
+    @property
+    def could_see(self) -> np.ndarray:
+        """(N,) how many targets there are for each camera."""
+        return np.asarray(np.sum(self.sight != Sight.NOT_A_NEIGHBOUR, axis=-1))
+
+    @property
+    def under_way(self) -> np.ndarray:
+        """(N,) bool: has not ended."""
+        return np.asarray(self.ended == Outcome.UNDER_WAY)
+
+    @property
+    def three_sigma(self) -> np.ndarray:
+        """(N,) m: three standard deviations of the estimated position in plan, along the axis where it is worst."""
+        return semi_axes(self.position_covariance[:, :2, :2])[0][:, -1]
+
+
+FIELDS = {
+    "tick": "i F",
+    "rotation": "f K A 3 3",
+    "position": "f K A 3",
+    **dict.fromkeys(("estimate_rotation", "position_covariance"), "f K N 3 3"),
+    **dict.fromkeys(("estimate_position", "goal"), "f K N 3"),
+    **dict.fromkeys(("position_error", "orientation_error", "nees", "pan"), "f K N"),
+    **dict.fromkeys(("ended", "route_count", "route_drawn"), "i K N"),
+    "sight": "i K N A",
+    "inbox_tick": "i K N N",
+    "terms": "f K N R",
+    "route": "f K N P 3",
+    "traffic_rotation": "f K Z 3 3",
+    **dict.fromkeys(("traffic_position", "traffic_half"), "f K Z 3"),
+}
+"""By field of a frame its kind (whole number or not) and axes; F: all frames, K: all, or one for a constant field."""
+_WHOLE = frozenset(name for name, rule in FIELDS.items() if rule.startswith("i"))
+
+
+SCENE_FILE = "scene.npz"
+_HEADER = "header"
+
+
+class Source(Section):
+    """Environment, observer, driver and seed of a scene, for its heading."""
+
+    name: str
+    """Of the environment, the recording or the deployment."""
+    observer: str
+    policy: str = ""
+    """Name of the driver; empty: no driver."""
+    seed: int | None = None
+    """None: the episode was not drawn at random."""
+    terms: tuple[str, ...] = ()
+    """Names of the reward terms of a frame."""
+    honest: bool = True
+    """Whether the observer's P is meant as a covariance; of the paper's it is a gain matrix."""
+
+    @classmethod
+    def of(cls, name: str, scenario: Scenario, **more: Any) -> Self:
+        """Return the source of a scene of a scenario; `more` are further fields."""
+        observer = scenario.observer.name
+        terms = tuple(scenario.reward.by_name)
+        return cls(name=name, observer=observer, terms=terms, honest=states_covariance(observer), **more)
+
+    @property
+    def words(self) -> str:
+        """Return it in a line, such as "busy_intersection, observer riccati, seed 0"."""
+        parts = [self.name, f"observer {self.observer}"]
+        parts += [f"driven by {self.policy}"] if self.policy else []
+        return ", ".join([*parts, *([f"seed {self.seed}"] if self.seed is not None else [])])
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """K frames of an episode."""
+
+    scenario: Scenario
+    source: Source
+    fields: dict[str, np.ndarray]
+    """By name of a frame's field, (K, ...)."""
+
+    def __len__(self) -> int:
+        """Return K."""
+        return len(self.fields["tick"])
+
+    def frame(self, k: int) -> Frame:
+        """Return frame k."""
+        return Frame(**{name: values[k] for name, values in self.fields.items()})
+
+    @property
+    def time(self) -> np.ndarray:
+        """(K,) s since the start."""
+        return np.asarray(self.fields["tick"] / self.scenario.rates.camera)
+
+    @property
+    def length(self) -> float:
+        """Time from the first to the last frame, s."""
+        return float(self.time[-1] - self.time[0])
+
+    @classmethod
+    def of_frames(cls, scenario: Scenario, source: Source, frames: Sequence[Frame]) -> Self:
+        """Return the record of at least one frame."""
+        return cls(scenario, source, {name: np.stack([getattr(frame, name) for frame in frames]) for name in FIELDS})
+
+    def of(self, frames: np.ndarray) -> "SceneRecord":
+        """Return some of the frames."""
+        return SceneRecord(self.scenario, self.source, {name: values[frames] for name, values in self.fields.items()})
+
+    def save(self, path: Path) -> None:
+        """Write everything in single precision.
+
+        Raises:
+            OutputError: it cannot be written; an older file is untouched.
+        """
+        arrays: dict[str, Any] = {}
+        for name, values in self.fields.items():
+            whole = name in _WHOLE
+            small = values.astype(np.int32 if whole else np.float32)
+            same = len(small) > 1 and np.array_equal(
+                small, np.broadcast_to(small[:1], small.shape), equal_nan=not whole
+            )
+            arrays[name] = small[:1] if same else small  # an array that never changes is kept once
+        scenario = without_own_terms(jsonable(self.scenario))
+        header = {"frames": len(self), "source": self.source.model_dump(), "scenario": scenario}
+        arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        with replacing_file(path) as new, new.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file written by `save`.
+
+        Raises:
+            DataError: there is no such file, or it is no scene.
+        """
+        header = read_npz(path, "scene", {_HEADER: "u B"})[_HEADER]
+        try:
+            facts = json.loads(header.tobytes())
+            count, source = int(facts["frames"]), validated(Source, facts["source"], str(path), DataError)
+            scenario = parse_scenario(facts["scenario"], str(path))
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            if isinstance(error, CoopenvError):
+                raise
+            raise DataError(f"{path}: not a scene: header: {error}") from None
+        if count < 1:
+            raise DataError(f"{path}: not a scene: header: {count} frames")
+        n = len(scenario.vehicles)
+        lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}
+        lengths["R"] = (len(source.terms),)
+        fields = {}
+        for name, values in read_npz(path, "scene", FIELDS, lengths).items():
+            whole = values.astype(np.int64 if name in _WHOLE else np.float64)
+            fields[name] = np.broadcast_to(whole, (count, *values.shape[1:]))
+        return cls(scenario, source, fields)

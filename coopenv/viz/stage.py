@@ -1,0 +1,330 @@
+"""The static side of a picture of a world and its geometry: fields of view, occlusion, and everything in plan.
+
+In plan x is east and y north; all is in the map frame, m.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coopenv.estimation.lens import largest_radius, undistort
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario
+from coopenv.scenario.base import rotation_of
+from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.scenario.routes import compile_motion, even_points, left_jacobian
+from coopenv.scenario.sensing import Camera
+from coopenv.scenario.schema import agent_starts
+from coopenv.viz.scene import Frame, semi_axes
+
+_CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
+CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+"""Of a square about the origin, in turn."""
+_FAN_RAYS = 65
+_PATH_SAMPLES = 121
+_UNKNOWN = ("static", "driven", "traffic")  # motions that say nothing of a way
+_MARGIN = 0.05  # share of the scene around it
+
+
+def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return 3-sigma outlines (N, 97, 2) of covariances (N, 2, 2) and major semi-axes (N,); NaN where one is none."""
+    semi, axes = semi_axes(covariance)
+    circle = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
+    return center[:, None] + np.swapaxes((axes * semi[:, None]) @ circle, 1, 2), semi[:, 1]
+
+
+def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return body-fixed outlines (N, K, 2) in plan, of rotations (N, 3, 3), places (N, 2), `shape` (N, K, 2)."""
+    return np.asarray(position[:, None] + shape @ np.swapaxes(rotation[:, :2, :2], 1, 2))
+
+
+def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
+    """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
+    half = np.array(size[:2]) / 2
+    corners = np.array(center[:2]) + half * CORNERS
+    return np.asarray(corners * max(1.0, shortest / (2 * half.max())))
+
+
+def nose_shape(corners: np.ndarray) -> np.ndarray:
+    """Return the triangle (3, 2) that marks the front of a box of four corners."""
+    rear, front = corners.min(axis=0), corners.max(axis=0)
+    waist = 0.42 * rear[0] + 0.58 * front[0]
+    inset = 0.18 * (front[1] - rear[1])
+    return np.array([(waist, rear[1] + inset), (front[0] - inset, (rear[1] + front[1]) / 2), (waist, front[1] - inset)])
+
+
+def ways(scenario: Scenario) -> np.ndarray:
+    """Return the angle (N,), rad, from each vehicle's x axis to its direction of travel at the start.
+
+    In the paper's intersection bodies are not turned: R = I also of those that go north. There, where bodies hide
+    nothing, a vehicle is drawn in its direction of travel; everywhere else the angle is zero.
+    """
+    if scenario.topology.mode != "fixed":
+        return np.zeros(len(scenario.vehicles))
+    starts = zip(scenario.vehicles, agent_starts(scenario)[1][len(scenario.landmarks) :], strict=True)
+    first = [
+        np.zeros(3) if v.motion.kind in _UNKNOWN else compile_motion(v.motion, R, scenario.horizon).linear[0]
+        for v, R in starts
+    ]
+    return np.array([np.arctan2(velocity[1], velocity[0]) for velocity in first])
+
+
+def camera_fan(camera: Camera) -> np.ndarray:
+    """Return unit rays (K, 3) in the body frame over the width of the image, at the height of its centre."""
+    edges = (np.array([0.0, camera.image_size[0]]) - camera.principal_point[0]) / camera.focal_length[0]
+    imaged, has_ray = undistort(np.column_stack([edges, np.zeros(2)]), camera.distortion)
+    widest = np.copysign(largest_radius(camera.distortion), edges)  # where the lens images nothing at the edge
+    left, right = np.arctan(np.where(has_ray, imaged[:, 0], widest)).tolist()
+    x = np.linspace(left, right, _FAN_RAYS)
+    rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
+    return np.asarray(rays @ camera.to_body().T)
+
+
+_SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+_FACES = np.array([(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 4, 6, 2), (1, 5, 7, 3)])
+
+
+class Box(NamedTuple):
+    """A box that occludes targets."""
+
+    name: str
+    rotation: np.ndarray  # (3, 3) to map
+    center: np.ndarray  # (3,) map, m
+    size: Any  # (3,) m
+
+    @property
+    def faces(self) -> np.ndarray:
+        """Return the corners (6, 4, 3) of its faces; the first two are across x, the last two across z."""
+        corners = self.center + 0.5 * _SIGNS[_FACES] * np.asarray(self.size, float) @ self.rotation.T
+        return np.asarray(corners)
+
+    @property
+    def footprint(self) -> np.ndarray:
+        """Return its corners (4, 2) in plan, if it is upright."""
+        return np.asarray(self.faces[-2, :, :2])
+
+
+def crossings(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> tuple[np.ndarray, np.ndarray]:
+    """Return at which shares of straight paths boxes are entered and left, (B, K) each.
+
+    A path misses a box where the first share is not below the second one.
+
+    Args:
+        start: (K, 3) map, m.
+        path: (K, 3) from there to the ends, map, m.
+        boxes: B of them, at least one.
+    """
+    turn, center = np.array([box.rotation for box in boxes]), np.array([box.center for box in boxes])
+    half = np.array([box.size for box in boxes], float)[:, None] / 2
+    a, along = (start - center[:, None]) @ turn, path @ turn
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    one, other = (-half - a) / along, (half - a) / along
+    return np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+
+
+def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, boxes: Sequence[Box]) -> np.ndarray:
+    """Return how far rays (N, K, 3) from cameras (N, 3) get before a box stops them, (N, K) m, up to `reach`.
+
+    `reach` is one for all, or (N,) of each camera. Rays are unit vectors in the map frame.
+    """
+    length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
+    if not boxes:
+        return length
+    enter, leave = crossings(np.repeat(origin, rays.shape[1], axis=0), rays.reshape(-1, 3), boxes)
+    free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf).min(axis=0)
+    return np.asarray(np.minimum(length, free.reshape(length.shape)))
+
+
+def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return opposite corners (2,) of a square around all that is known of the episode beforehand, with a margin.
+
+    Landmarks, roads, starts, prescribed motions over the horizon, and goals.
+    """
+    origin = np.array(scenario.map.origin)[:2]
+    corners = np.array([(-1, -1), (1, 1)])
+    goals = [(v.goal.position[:2], v.goal.radius) for v in scenario.vehicles if v.goal and v.goal.position]
+    around = [np.array(place) - origin + radius * corners for place, radius in goals]
+    followed = {name: vehicle.goal_radius for vehicle in scenario.vehicles for name in vehicle.routes}
+    for route in scenario.routes:
+        margin = followed.get(route.name, 0.0) + route.breadth
+        around += [point - origin + margin * corners for point in even_points(route)[:, :2]]
+    for group in scenario.landmark_groups:
+        for corner, first, second in group.parallelograms:
+            around.append(np.array([corner, np.add(corner, first), np.add(corner, second)]) - origin)
+    around += [road_corners(road.start, road.end, road.width) - origin for road in scenario.roads]
+    points = np.concatenate([*around, *_paths(scenario)])
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = (0.5 + _MARGIN) * max(1.0, float((high - low).max()))
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
+def _paths(scenario: Scenario) -> list[np.ndarray]:
+    """Return points (K, 2) along the prescribed motion of every agent, or its start."""
+    agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    paths = []
+    for agent, position, rotation in zip(agents, *agent_starts(scenario), strict=True):
+        table = compile_motion(agent.motion, rotation, scenario.horizon)
+        t = np.linspace(0.0, scenario.horizon, 1 if agent.motion.kind in _UNKNOWN else _PATH_SAMPLES)
+        segment = np.searchsorted(table.start, t, side="right") - 1
+        h = (t - table.start[segment])[:, None]
+        step = left_jacobian(table.angular[segment] * h) @ (table.linear[segment] * h)[..., None]
+        relative = table.position[segment] + (table.rotation[segment] @ step)[..., 0]
+        paths.append((position + relative @ rotation.T)[:, :2])
+    return paths
+
+
+def road_corners(start: tuple[float, float], end: tuple[float, float], width: float) -> np.ndarray:
+    """Return the corners (4, 2) of a road."""
+    a, b = np.array(start), np.array(end)
+    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+    aside = np.array([-along[1], along[0]]) * width / 2
+    return np.array([a - aside, b - aside, b + aside, a + aside])
+
+
+def pointers(
+    origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
+) -> tuple[list[np.ndarray], list[int]]:
+    """Return triangles (3, 2) at the border, pointing to each `point` (N, 2) outside the picture, and their indices.
+
+    The pointing lines come from `origin` (N, 2), or from the picture's middle where that is outside too. `low` and
+    `high` are corners of the picture, `size` is the length of a triangle, m.
+    """
+    triangles, which = [], []
+    for i, (start, end) in enumerate(zip(origin, point, strict=True)):
+        if not np.isfinite(end).all() or np.all((end >= low) & (end <= high)):
+            continue
+        if not np.all((start > low) & (start < high)):
+            start = (low + high) / 2
+        way = end - start
+        room = np.where(way > 0, high - start, start - low)
+        share = np.min(room / np.maximum(np.abs(way), 1e-9))
+        ahead = way / np.linalg.norm(way)
+        aside = np.array([-ahead[1], ahead[0]])
+        tip = start + share * way - 0.15 * size * ahead
+        base = tip - size * ahead
+        triangles.append(np.array([tip, base + 0.45 * size * aside, base - 0.45 * size * aside]))
+        which.append(i)
+    return triangles, which
+
+
+_REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
+_SHORTEST = 0.035  # of the picture's side, drawn length of a vehicle
+_CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
+
+_ALL = slice(None)
+
+
+class Stage:
+    """The static side of a scene; lengths in m, everything in the map frame."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Derive the static side from a scenario."""
+        self.scenario = scenario
+        self.landmarks, self.vehicles = len(scenario.landmarks), len(scenario.vehicles)
+        self.origin = np.array(scenario.map.origin, float)
+        low, high = limits(scenario)
+        self.low, self.high = low, high
+        """(2,) corners of a square in plan around all that is known beforehand."""
+        self.side = float(high[0] - low[0])
+        agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+        self.marker = np.array([agent.marker for agent in agents], float)
+        """(A, 3) the point that cameras see, body frame."""
+        self.camera = np.array([camera.position for camera in scenario.cameras], float)
+        """(N, 3) optical centres, body frame."""
+        limit = _REACH * self.side
+        self.reach = np.array([min(c.range or limit, limit) * (c.model == "pinhole") for c in scenario.cameras])
+        """(N,) how far fields of view are drawn."""
+        self.moving = np.array([m.motion.kind != "static" for m in scenario.landmarks], dtype=bool)
+        """(L,) which landmarks move."""
+
+    def short_name(self, target: int) -> str:
+        """Return f1 for the first vehicle, and a landmark's name; L1 for landmark_1."""
+        if target >= self.landmarks:
+            return f"f{target - self.landmarks + 1}"
+        name = self.scenario.target_names[target]
+        return f"L{name.removeprefix('landmark_')}" if name.startswith("landmark_") else name
+
+    @cached_property
+    def sees_a_part(self) -> bool:
+        """Whether cameras have a field of view that matters."""
+        s = self.scenario
+        sensed = s.topology.mode == "sensed" and s.sensing == "sensed"
+        return sensed and any(camera.model == "pinhole" for camera in s.cameras)
+
+    @cached_property
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) sizes and (N, 3) centres of the vehicles' boxes as drawn: those too small to be seen are enlarged."""
+        stand_in = Body(size=tuple(1.2 * _SHORTEST * self.side / _CAR[0] * np.array(_CAR)))
+        given = [v.body or stand_in for v in self.scenario.vehicles]
+        size, center = np.array([b.size for b in given], float), np.array([b.center for b in given], float)
+        grown = np.maximum(1.0, _SHORTEST * self.side / size[:, :1])
+        return size * grown, center * grown
+
+    @cached_property
+    def _fan(self) -> np.ndarray:
+        """(N, K, 3) unit rays over the width of each camera's image, body frame without pan."""
+        return np.array([camera_fan(camera) for camera in self.scenario.cameras])
+
+    def eyes(self, frame: Frame) -> np.ndarray:
+        """Return where cameras are, (N, 3)."""
+        return np.asarray(frame.vehicle_position + (frame.vehicle_rotation @ self.camera[..., None])[..., 0])
+
+    def targets(self, frame: Frame) -> np.ndarray:
+        """Return the points that cameras see, (A, 3)."""
+        return np.asarray(frame.position + (frame.rotation @ self.marker[..., None])[..., 0])
+
+    def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:
+        """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
+
+        Buildings end them. Of the rays along the rim every so many are taken, and of the vehicles those `of` a slice.
+        """
+        if not self.sees_a_part:
+            return None
+        eye = self.eyes(frame)[of]
+        turned = np.array([rotation_of(pan, None) for pan in frame.pan[of]])
+        rays = self._fan[of, ::every] @ np.swapaxes(frame.vehicle_rotation[of] @ turned, 1, 2)
+        length = free_lengths(eye, rays, self.reach[of], self.buildings)
+        return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
+
+    def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:
+        """Return the short name of the box that hides a target from a vehicle's camera; None: no drawn box does."""
+        kind = frame.sight[vehicle, target]
+        start, end = self.eyes(frame)[vehicle], self.targets(frame)[target]
+        if kind == Sight.OCCLUDED_BY_BUILDING:
+            boxes = self.buildings
+        elif kind == Sight.OCCLUDED_BY_BODY:
+            boxes = self.solid(frame, (target, self.landmarks + vehicle))
+        else:
+            return None
+        hits = [(entry(start, end, box), box.name) for box in boxes]
+        share, name = min(hits, default=(np.inf, ""))
+        return name if np.isfinite(share) else None
+
+    @cached_property
+    def buildings(self) -> list[Box]:
+        """The buildings."""
+        return [
+            Box(o.name, rotation_of(o.yaw, None), np.array(o.center) - self.origin, o.size)
+            for o in self.scenario.obstacles
+        ]
+
+    def solid(self, frame: Frame, without: tuple[int, ...] = ()) -> list[Box]:
+        """Return the bodies that move, but for those of some agents."""
+        s = self.scenario
+        agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
+        boxes = []
+        for i, agent in enumerate(agents):
+            if agent.body is not None and i not in without:
+                R = frame.rotation[i]
+                boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ agent.body.center, agent.body.size))
+        there = np.flatnonzero(frame.traffic_half[:, 0] > 0.0)
+        R, center, size = frame.traffic_rotation, frame.traffic_position, 2.0 * frame.traffic_half
+        return boxes + [Box("traffic", R[z], center[z], size[z]) for z in there]
+
+
+def entry(start: np.ndarray, end: np.ndarray, box: Box) -> float:
+    """Return at which share of a straight path from start to end (3,) a box is entered; infinite where it is not."""
+    enter, leave = (float(share[0, 0]) for share in crossings(start[None], (end - start)[None], [box]))
+    return max(enter, 0.0) if enter < leave and leave > 0.0 and enter < 1.0 else np.inf
