@@ -16,7 +16,7 @@ from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entry
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim, guarded_server
-from coopenv.viz.web.panel import NO_FAULT, History, Panel
+from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
 
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
@@ -39,8 +39,9 @@ class Viewer:
             raise CoopenvError(f"{reel.source.name}: has no frames to show")
         self._server, self._reel = server, reel
         self._stage = Stage(reel.scenario)
-        first = reel.frames[0]
-        magnification = useful_magnification(first.three_sigma, self._stage.side) if reel.source.honest else 1.0
+        magnification = (
+            useful_magnification(reel.frames[0].three_sigma, self._stage.side) if reel.source.honest else 1.0
+        )
         self._look = Look(magnification=magnification)
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
         aim(server.initial_camera, self._stage)
@@ -50,7 +51,6 @@ class Viewer:
             lambda event: self._panel.wish("vehicle", event.instance_index, vehicles)
         )
         server.on_client_connect(self._welcome)
-        self._history = History(reel.scenario.rates.camera)
         self._k, self._speed, self.playing = 0, 1.0, True
         self._live = reel.real_time
         self._due = self._shown_at = self._faded_at = -np.inf
@@ -58,7 +58,6 @@ class Viewer:
         self._follow, self._alone = True, False
         self.shown = 0
         """How many frames have been sent."""
-        self._history.add(first)
         self._show(monotonic())
 
     def pick(self, vehicle: int | None) -> None:
@@ -99,7 +98,6 @@ class Viewer:
         if self._k + 1 == len(self._reel.frames) and not self._reel.more():
             return False
         self._k += 1
-        self._history.add(self._frame)
         return True
 
     @property
@@ -116,7 +114,8 @@ class Viewer:
             if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
                 place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
             self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
-            self._panel.show(self._frame, self._history, now, exact=not self.playing)
+            frames = self._reel.frames[max(0, self._k + 1 - LONGEST) : self._k + 1]
+            self._panel.show(frames, now, exact=not self.playing)
         self._shown_at = now
         self.shown += 1
 
@@ -188,7 +187,6 @@ class Viewer:
 
     def _wish_restart(self, _: object) -> None:
         self._k = 0
-        self._history.add(self._frame)
         self._panel.set_status("")
         self._set_playing(True)
 
@@ -202,8 +200,6 @@ class Viewer:
             pass
         ticks = np.array([frame.tick for frame in self._reel.frames])
         self._k = int(np.argmin(np.abs(ticks - tick)))
-        for frame in self._reel.frames[max(0, self._k - 300) : self._k + 1]:
-            self._history.add(frame)
 
     _wish_vehicle = pick
 
@@ -225,9 +221,6 @@ class Viewer:
         self._server.flush()
         self._reel.change(**changes)
         self._k = min(self._k, len(self._reel.frames) - 1)
-        self._history = History(self._reel.scenario.rates.camera)
-        for frame in self._reel.frames[: self._k + 1]:
-            self._history.add(frame)
         self._picture.actors.set_source(self._reel.source)
         self._panel.set_source(self._reel.source)
         self._panel.set_status("")

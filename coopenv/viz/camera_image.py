@@ -11,7 +11,7 @@ from coopenv.scenario.base import rotation_of
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Box, Stage
-from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.style import DARK_BLUE, GREY, INK, NOTE, vehicle_colour
 from coopenv.viz.topview_ground import GROUND, ROOF, TRAFFIC, WALL
 
 SKY = "#E6EEF5"
@@ -32,14 +32,15 @@ def camera_image(stage: Stage, frame: Frame, vehicle: int) -> np.ndarray:
     width, height = lens.size
     image = Image.new("RGB", (_SCALE * width, _SCALE * height), SKY)
     draw = ImageDraw.Draw(image)
-    if not np.isfinite(frame.vehicle_position[vehicle]).all():
-        draw.text((12, 12), "not there", fill=INK, font=_font(22))
-        return _small(image)
-    _draw_ground(draw, lens)
-    for box, colour, edge in sorted(_boxes(stage, frame, vehicle), key=lambda each: -lens.distance(each[0].center)):
-        _draw_box(draw, lens, box, colour, edge)
-    _draw_targets(draw, stage, frame, vehicle, lens)
-    return _small(image)
+    if np.isfinite(frame.vehicle_position[vehicle]).all():
+        _draw_ground(draw, lens)
+        far = sorted(_boxes(stage, frame, vehicle), key=lambda each: -float(np.linalg.norm(each[0].center - lens.eye)))
+        for box, colour, edge in far:
+            _draw_box(draw, lens, box, colour, edge)
+        _draw_targets(draw, stage, frame, vehicle, lens)
+    else:
+        draw.text((12, 12), "not there", fill=INK, font=ImageFont.load_default(22))
+    return np.asarray(image.resize(lens.size, Image.Resampling.LANCZOS))
 
 
 class Lens:
@@ -54,10 +55,6 @@ class Lens:
         pan = float(frame.pan[vehicle])
         to_body = rotation_of(pan, None) if self.around else self._camera.to_body(pan)
         self._to_map = frame.vehicle_rotation[vehicle] @ to_body
-
-    def distance(self, point: np.ndarray) -> float:
-        """Return how far a point of the map is, m."""
-        return float(np.linalg.norm(point - self.eye))
 
     def in_camera(self, points: np.ndarray) -> np.ndarray:
         """Return points (..., 3) of the map in the camera's frame; z ahead, but of a panorama x ahead and z up."""
@@ -151,19 +148,6 @@ def _draw_targets(draw: ImageDraw.ImageDraw, stage: Stage, frame: Frame, vehicle
         words = stage.short_name(int(target)) + (f" behind {hider}" if hider else "")
         side = "rs" if x > _SCALE * width * 0.7 else "ls"
         gap = -radius - 3 if side == "rs" else radius + 3
-        look: dict[str, Any] = {
-            "font": _font(11 * _SCALE),
-            "stroke_width": _SCALE,
-            "stroke_fill": "white",
-            "anchor": side,
-        }
-        draw.text((x + gap, y - 2), words, fill=INK if kind == Sight.VISIBLE else "#595959", **look)
-
-
-def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
-    return ImageFont.load_default(size)
-
-
-def _small(image: Image.Image) -> np.ndarray:
-    size = image.width // _SCALE, image.height // _SCALE
-    return np.asarray(image.resize(size, Image.Resampling.LANCZOS))
+        look: dict[str, Any] = {"stroke_width": _SCALE, "stroke_fill": "white", "anchor": side}
+        look |= {"font": ImageFont.load_default(11 * _SCALE), "fill": INK if kind == Sight.VISIBLE else NOTE}
+        draw.text((x + gap, y - 2), words, **look)

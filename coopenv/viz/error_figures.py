@@ -1,7 +1,7 @@
 """Errors, consistency and observability over time."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,15 +34,6 @@ _USUAL = 0.9  # share of the last errors that are drawn linearly
 _DOT = 4.0  # pt
 
 
-class _Quantity(NamedTuple):
-    """Data of a column of panels."""
-
-    components: list[np.ndarray]  # per vehicle (k, 3), m or deg
-    title: str
-    tolerance: float  # m or deg, of settling
-    names: tuple[str, str, str]
-
-
 def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, width: float | None = None) -> Figure:
     """Draw position (map frame, m) and orientation errors (roll, pitch, yaw of Rtilde, deg) against time.
 
@@ -60,19 +51,18 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, wi
     events = [
         mask if mask[:ticks].mean() < _ALWAYS else np.zeros_like(mask) for mask, ticks in zip(seen, live, strict=True)
     ]
-    for quantity, column in zip(_quantities(trajectory, live), axes.T, strict=True):
+    titles = (("position", "[m]", CONVERGED.position_m), ("orientation", "[deg]", CONVERGED.orientation_deg))
+    for components, (title, unit, tolerance), column in zip(_errors(trajectory, live), titles, axes.T, strict=True):
         for vehicle, (ax, ticks) in enumerate(zip(column, live, strict=True)):
             style.tidy(ax)
             style.shade(ax, style.runs(trajectory.t, events[vehicle], style.MERGED_GAP))
             style.shade_ended(ax, trajectory.t, ticks)
-            _draw(ax, trajectory.t[:ticks], quantity, vehicle, style.bins_of(inches / 2))
+            _draw(ax, trajectory.t[:ticks], components[vehicle], tolerance, style.bins_of(inches / 2))
             if np.isfinite(converged[vehicle]):
                 ax.axvline(converged[vehicle], color=style.INK, linewidth=0.8, linestyle=_DASHED)
             style.time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
-        _share_scale(column, quantity)
-        column[0].set_title(
-            quantity.title.replace(" error", "" if narrow else " error"), fontsize=style.NORMAL, color=style.INK
-        )
+        _share_scale(column, components, tolerance)
+        column[0].set_title(f"{title} {unit}" if narrow else f"{title} error {unit}", **style.TEXT)
     for vehicle, ax in enumerate(axes[:, 0]):
         name, last = style.vehicle_label(trajectory.vehicles[vehicle]), converged[vehicle]
         ax.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=style.NORMAL + 2, color=style.INK)
@@ -83,7 +73,8 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, wi
     return figure
 
 
-def _quantities(trajectory: Trajectory, live: np.ndarray) -> tuple[_Quantity, _Quantity]:
+def _errors(trajectory: Trajectory, live: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return errors of position, m, and orientation, deg: per vehicle (k, 3) while it is under way."""
     positions, angles = [], []
     for vehicle, ticks in enumerate(live):
         part = slice(ticks), vehicle
@@ -92,10 +83,7 @@ def _quantities(trajectory: Trajectory, live: np.ndarray) -> tuple[_Quantity, _Q
             error = np.asarray(trajectory.position[part], float) - trajectory.position_estimate[part]
         positions.append(style.drawable(error))
         angles.append(unwrapped(style.drawable(roll_pitch_yaw_deg(tilde))))
-    return (
-        _Quantity(positions, "position error [m]", CONVERGED.position_m, ("x", "y", "z")),
-        _Quantity(angles, "orientation error [deg]", CONVERGED.orientation_deg, ("roll", "pitch", "yaw")),
-    )
+    return positions, angles
 
 
 def unwrapped(angles: np.ndarray) -> np.ndarray:
@@ -113,24 +101,24 @@ def unwrapped(angles: np.ndarray) -> np.ndarray:
     return result
 
 
-def _draw(ax: Axes, t: np.ndarray, quantity: _Quantity, vehicle: int, bins: int) -> None:
+def _draw(ax: Axes, t: np.ndarray, components: np.ndarray, tolerance: float, bins: int) -> None:
     ax.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
-    for level in (-quantity.tolerance, quantity.tolerance):
+    for level in (-tolerance, tolerance):
         ax.axhline(level, color=style.GREY, linewidth=0.9, linestyle=_DOTTED)
-    for component, colour in zip(quantity.components[vehicle].T, style.AXES_COLOURS, strict=True):
+    for component, colour in zip(components.T, style.AXES_COLOURS, strict=True):
         first = 1 if len(t) > 1 else 0  # the error before the first correction is a dot
         style.draw_band(ax, t[first:], component[first:], bins, color=colour, linewidth=style.LINE)
         ax.plot(t[:1], component[:1], "o", color=colour, markersize=_DOT, clip_on=False, zorder=4)
 
 
-def _share_scale(column: Sequence[Axes], quantity: _Quantity) -> None:
+def _share_scale(column: Sequence[Axes], components: Sequence[np.ndarray], tolerance: float) -> None:
     """Give panels the same ordinate: linear up to the size of the last errors, logarithmic beyond."""
-    late = np.concatenate([part[int(_LATE * len(part)) :].ravel() for part in quantity.components])
-    whole = np.concatenate([part.ravel() for part in quantity.components])
+    late = np.concatenate([part[int(_LATE * len(part)) :].ravel() for part in components])
+    whole = np.concatenate([part.ravel() for part in components])
     late, whole = np.abs(late[np.isfinite(late)]), np.abs(whole[np.isfinite(whole)])
     usual = float(np.quantile(late, _USUAL)) if len(late) else 0.0
-    largest = float(whole.max(initial=quantity.tolerance))
-    linear = float(np.clip(10 ** np.ceil(np.log10(max(usual, 1e-12))), _LEAST_LINEAR, quantity.tolerance))
+    largest = float(whole.max(initial=tolerance))
+    linear = float(np.clip(10 ** np.ceil(np.log10(max(usual, 1e-12))), _LEAST_LINEAR, tolerance))
     decades = linear * 10.0 ** np.arange(0, np.floor(np.log10(largest / linear) + 1e-9) + 1)
     decades = decades[:: -(-len(decades) // _MOST_DECADES)]
     for ax in column:
@@ -228,7 +216,7 @@ def consistency_figure(
     for column, room in zip(axes.T, (_ROOM, 0.0, 0.0), strict=True):
         _share_decades(column, room)
     for ax, title in zip(axes[0], _NARROW_TITLES if narrow else _TITLES, strict=True):
-        ax.set_title(title, fontsize=style.NORMAL, color=style.INK)
+        ax.set_title(title, **style.TEXT)
     style.explain(figure, GAIN if gain else CONSISTENT)
     ended = [Patch(facecolor=style.ENDED, label="ended, parked")] if live.min() < len(trajectory.t) else []
     style.legend_above(figure, [*_nees_marks(trajectory.t, steady_from), *ended])
@@ -328,7 +316,7 @@ def observability_figure(
     local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=_DASHES[1])
     handles.append(Line2D([], [], color=style.INK, linewidth=0.9, linestyle=_DASHES[1], label="threshold"))
     window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-]"
-    local.set_ylabel(window, fontsize=style.NORMAL, color=style.INK)
+    local.set_ylabel(window, **style.TEXT)
     style.show_decades(local)
     occurring = _draw_verdict(verdict, cut)
     for ax in (local, verdict):

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgba_array
+from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from scipy.spatial.transform import Rotation
 
@@ -204,13 +205,18 @@ class TopView:
         self._time = self._layers.keep(title)
         if not self._panel:  # the title leaves room beside it
             title.set_text(f"{self._error_words} 00.00 m   t = 000.00 s")
-            ground.shrink(self._figure.texts[0], ground.MAP_RIGHT - ground.LEFT - title.get_window_extent().width - 10)
+            room = ground.MAP_RIGHT - ground.LEFT - title.get_window_extent().width - 10  # px
+            name = self._figure.texts[0]
+            name.set_fontsize(float(name.get_fontsize()) * min(1.0, room / name.get_window_extent().width))
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
         head = f"{'':6}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':6}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
         rows = [self._figure.text(*places[i], "", color=INK, **look) for i in range(shown)]
-        ground.draw_swatches(self._figure, places[:shown])
+        for i, corner in enumerate(places[:shown]):
+            look_of: dict[str, Any] = {"facecolor": vehicle_colour(i), "edgecolor": INK, "linewidth": 0.5}
+            side = ground.pixels(ground.SWATCH, ground.SWATCH)
+            self._figure.add_artist(Rectangle(corner, *side, transform=self._figure.transFigure, **look_of))
         self._rows = [self._layers.keep(row) for row in rows]
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
@@ -269,12 +275,9 @@ class TopView:
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
             name.set_visible(bool(np.isfinite(target[i]).all()))
-            name.xy = (float(target[i, 0]), float(target[i, 1]) + self._above(frame, i))
-
-    def _above(self, frame: Frame, landmark: int) -> float:
-        """Return how far the body of a landmark reaches to the north of its middle, m; its name stands beyond."""
-        body = self.scenario.landmarks[landmark].body
-        return 0.0 if body is None else float(np.abs(frame.rotation[landmark, 1]) @ np.array(body.size) / 2)
+            body = self.scenario.landmarks[i].body
+            above = 0.0 if body is None else float(np.abs(frame.rotation[i, 1]) @ np.array(body.size) / 2)
+            name.xy = (float(target[i, 0]), float(target[i, 1]) + above)
 
     def _place_marks(self, frame: Frame) -> None:
         L, R, position, ended = self._landmarks, frame.rotation, frame.position, frame.ended

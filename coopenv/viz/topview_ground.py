@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patches import Patch, Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 
@@ -31,7 +31,7 @@ SMALLER = 6.5  # pt
 ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px
 MOST_ROWS = 16
-_SWATCH = 8  # px
+SWATCH = 8  # px
 LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
 GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
@@ -75,12 +75,6 @@ def new_ground(stage: Stage) -> tuple[Figure, Axes]:
     figure.text(*pixels(LEFT, HEIGHT - 21), stage.scenario.title, fontsize=NORMAL + 1.5, color=INK)
     draw_site(ax, stage)
     return figure, ax
-
-
-def shrink(text: Text, width: float) -> None:
-    """Make a text small enough for a width, px."""
-    wide = text.get_window_extent().width
-    text.set_fontsize(float(text.get_fontsize()) * min(1.0, width / wide))
 
 
 def draw_site(ax: Axes, stage: Stage) -> None:
@@ -145,14 +139,6 @@ def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
     legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
 
 
-def draw_swatches(figure: Figure, places: Sequence[tuple[float, float]]) -> None:
-    """Draw squares in the colours of the first vehicles, where the rows of the table begin (figure coordinates)."""
-    side = np.array(pixels(_SWATCH, _SWATCH))
-    for i, (x, y) in enumerate(places):
-        look: dict[str, Any] = {"facecolor": vehicle_colour(i), "edgecolor": INK, "linewidth": 0.5}
-        figure.add_artist(Rectangle((x, y), *side, transform=figure.transFigure, **look))
-
-
 def _sight(sight: Sight, label: str) -> Line2D:
     return Line2D([], [], label=label, **{"color": GREY, **SIGHT_LOOKS[sight]})  # type: ignore[arg-type]
 
@@ -182,9 +168,7 @@ class Layers:
 
     def points(self, marker: str, face: str, edge: str, size: float) -> Any:
         """Add points, in axes coordinates; `size` in pt."""
-        line = Line2D([], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.9)
-        line.set(markerfacecolor=face, markeredgecolor=edge)
-        return self.keep(self._axes.add_line(line))
+        return self.keep(self._axes.add_line(_mark(marker, edge, face, size, "")))
 
     def keep(self, artist: Any) -> Any:
         """Add an artist that is already in the figure."""
@@ -242,18 +226,14 @@ class Goals:
         self._rims.set_verts(list(shapes))
         groups = touching(center, self._radius)
         for name, members in zip(self._names, groups + [[]] * (len(self._names) - len(groups)), strict=True):
-            name.set_text(self._text(members))
+            named = len(members) if len(members) <= _MOST_NAMES else _MOST_NAMES - 1
+            marks = ", ".join(vehicle_mark(self._there[k]) for k in members[:named])
+            name.set_text(marks + (f" +{len(members) - named}" if len(members) > named else ""))
             if members:
                 self._put(name, center[members], self._radius[members])
         drawn = [i for i in self._there if frame.route_drawn[i] >= 0]
         self._routes.set_segments([frame.route[i, : int(frame.route_count[i]), :2] for i in drawn])
         self._routes.set_color([vehicle_colour(i) for i in drawn])
-
-    def _text(self, members: list[int]) -> str:
-        """Return the name of goals that touch one another."""
-        named = len(members) if len(members) <= _MOST_NAMES else _MOST_NAMES - 1
-        marks = ", ".join(vehicle_mark(self._there[k]) for k in members[:named])
-        return marks + (f" +{len(members) - named}" if len(members) > named else "")
 
     def _put(self, name: Text, center: np.ndarray, radius: np.ndarray) -> None:
         """Write a name into a goal if it fits, else to the right of it, or to the left, where no other name is."""

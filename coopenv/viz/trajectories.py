@@ -50,17 +50,13 @@ def clipped(path: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         leave = np.where(still, np.inf, np.maximum(to_low, to_high)).min(axis=1)
         enter, leave = np.maximum(enter, 0.0), np.minimum(leave, 1.0)
         drawn = enter <= leave  # False for NaN
-    points: list[np.ndarray] = []
-    gap = np.full(path.shape[1], np.nan)
-    connected = False
-    for i in np.flatnonzero(drawn):
-        connected = connected and bool(drawn[i - 1]) and enter[i] == 0.0
-        if not connected:
-            points += [gap] if points else []
-            points.append(start[i] + enter[i] * step[i] if enter[i] > 0 else start[i])
-        points.append(path[i + 1] if leave[i] == 1.0 else start[i] + leave[i] * step[i])
-        connected = bool(leave[i] == 1.0)
-    return np.array(points).reshape(-1, path.shape[1])
+        rows = np.stack(
+            [np.full_like(start, np.nan), start + enter[:, None] * step, start + leave[:, None] * step], axis=1
+        )
+    goes_on = np.append(False, drawn[:-1] & (leave[:-1] == 1.0)) & (enter == 0.0)
+    used = np.column_stack([~goes_on, ~goes_on, drawn])[drawn]
+    used[:1, 0] = False  # no gap before the first part
+    return np.asarray(rows[drawn][used])
 
 
 class Drawing:

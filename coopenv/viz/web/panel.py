@@ -1,6 +1,5 @@
 """The panel beside the live scene: switches, numbers, plots and the legend."""
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -20,7 +19,8 @@ from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, vehic
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import Look
 
-_LONGEST = 600  # frames that are kept
+LONGEST = 600
+"""Frames in a plot."""
 _LEAST = 1e-4  # on a logarithmic axis
 _MOST_TERMS = 6
 _X: dict[str, Any] = {"x": {"time": False, "auto": True}}
@@ -30,31 +30,6 @@ _LOOK: dict[str, Any] = {
     "axes": ({"size": 28}, {"size": 52}),
     "padding": (10, 14, 0, 0),
 }
-
-
-class History:
-    """Recent frames of all vehicles, for the plots."""
-
-    def __init__(self, rate: float) -> None:
-        """Start without frames; `rate` is in camera ticks per second."""
-        self._rate = rate
-        self._frames: deque[tuple[float, Frame]] = deque(maxlen=_LONGEST)
-
-    def add(self, frame: Frame) -> None:
-        """Add a frame; a frame that is not later than the last one clears the history."""
-        time = float(frame.tick) / self._rate
-        if self._frames and time <= self._frames[-1][0]:
-            self._frames.clear()
-        self._frames.append((time, frame))
-
-    def of(self, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return times (K,) and error, three sigma, NEES and terms, (K, 3 + R), of a vehicle."""
-        frames = [frame for _, frame in self._frames]
-        plan = np.array([frame.position_covariance[vehicle, :2, :2] for frame in frames]).reshape(-1, 2, 2)
-        rows = [(frame.position_error[vehicle], frame.nees[vehicle], *frame.terms[vehicle]) for frame in frames]
-        return np.array([time for time, _ in self._frames]), np.insert(
-            np.array(rows), 1, semi_axes(plan)[0][:, -1], axis=1
-        )
 
 
 class Plots:
@@ -78,17 +53,19 @@ class Plots:
             words = " &nbsp; ".join(f"{swatch(colour)} {escape(name)}" for name, colour in named)
             gui.add_html(f'<div style="font-size:12px;padding:0 14px">{words}</div>')
 
-    def show(self, history: History, vehicle: int) -> None:
-        """Show the last seconds of a vehicle."""
-        time, values = history.of(vehicle)
-        if len(time) < 2:
+    def show(self, frames: Sequence[Frame], vehicle: int, rate: float) -> None:
+        """Show a vehicle in some frames; `rate` is in camera ticks per second."""
+        if len(frames) < 2:
             return
-        error, sigma, nees = (_positive(values[:, k]) for k in range(3))
-        self._error.data = (time, error, sigma)
-        bound = np.ones_like(time)
-        self._nees.data = (time, nees, NEES_BOUNDS[0] * bound, NEES_BOUNDS[1] * bound)
+        time = np.array([frame.tick / rate for frame in frames])
+        sigma = semi_axes(np.array([frame.position_covariance[vehicle, :2, :2] for frame in frames]))[0][:, -1]
+        error, nees = (
+            np.array([getattr(frame, name)[vehicle] for frame in frames]) for name in ("position_error", "nees")
+        )
+        self._error.data = (time, _positive(error), _positive(sigma))
+        self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in NEES_BOUNDS))
         if self._reward is not None:
-            terms = np.nan_to_num(values[:, 3 : 3 + len(self._terms)])
+            terms = np.nan_to_num([frame.terms[vehicle, : len(self._terms)] for frame in frames])
             self._reward.data = (time, *np.ascontiguousarray(terms.T))
 
 
@@ -112,6 +89,7 @@ SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")
 MAGNIFICATIONS = ("1", "10", "100")
 _CELL = "padding:2px 5px;text-align:right"
 NONE_PICKED = "none"
+_PICK = "*Pick a vehicle above, or click on one in the scene.*"
 NO_FAULT = "none"
 REFUSED = "refused"
 """Name of a wish for a value that was not offered; its value is the reason."""
@@ -163,7 +141,7 @@ class Panel:
             self._table = gui.add_html("")
             self._add_world()
         with tabs.add_tab("Vehicle"):
-            self._vehicle_words = gui.add_markdown("*Pick a vehicle above, or click on one in the scene.*")
+            self._vehicle_words = gui.add_markdown(_PICK)
             self._image = gui.add_image(np.full((2, 3, 3), 255, np.uint8), visible=False)
             self._plots = Plots(gui, source)
         with tabs.add_tab("Show"):
@@ -194,15 +172,11 @@ class Panel:
             meant = [meaning for value, meaning in offered.items() if value == given]
         self.wishes.put((name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered"))
 
-    def _button(self, name: str, label: str, **look: Any) -> Any:
-        button = self._gui.add_button(label, **look)
-        button.on_click(lambda event: self.wishes.put((name, None)))
-        return button
-
     def _add_playback(self, length: float) -> None:
         if not self._abilities.pace:
             return
-        self._playing = self._button("play", "Pause")
+        self._playing = self._gui.add_button("Pause")
+        self._playing.on_click(lambda event: self.wishes.put(("play", None)))
         group = self._gui.add_button_group("Go", ("Step", "Restart"))
         group.on_click(lambda event: self.wish("go", event.target.value, {"Step": "step", "Restart": "restart"}))
         speed = self._gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint="Times real time.")
@@ -267,23 +241,22 @@ class Panel:
     def pick(self, vehicle: int | None) -> None:
         """Look at a vehicle, or at none."""
         self.picked = vehicle
-        none = vehicle is None
-        self._vehicles.value = (
-            NONE_PICKED if vehicle is None else self._stage.short_name(self._stage.landmarks + vehicle)
-        )
-        self._image.visible = not none
-        if none:
-            self._vehicle_words.content = "*Pick a vehicle above, or click on one in the scene.*"
+        stage = self._stage
+        self._vehicles.value = NONE_PICKED if vehicle is None else stage.short_name(stage.landmarks + vehicle)
+        self._image.visible = vehicle is not None
+        if vehicle is None:
+            self._vehicle_words.content = _PICK
         self._plots_at = -np.inf
 
-    def show(self, frame: Frame, history: History, now: float, exact: bool = False) -> None:
-        """Show the numbers of a frame, not more often than can be read; `now` is real time, s.
+    def show(self, frames: Sequence[Frame], now: float, exact: bool = False) -> None:
+        """Show the numbers of the last frame, not more often than can be read; `now` is real time, s.
 
         With `exact` the time is shown in any case.
         """
+        frame, rate = frames[-1], self._stage.scenario.rates.camera
         if self._time is not None and (exact or now - self._time_at >= TIME_EVERY):
             self._time_at = now
-            self._time.value = round(float(frame.tick) / self._stage.scenario.rates.camera, 2)
+            self._time.value = round(float(frame.tick) / rate, 2)
         if now - self._texts_at >= TEXTS_EVERY:
             self._texts_at = now
             self._table.content = table_html(self._stage, self._source, frame)
@@ -291,7 +264,7 @@ class Panel:
             self._plots_at = now
             self._image.image = camera_image(self._stage, frame, self.picked)
             self._vehicle_words.content = sight_words(self._stage, frame, self.picked)
-            self._plots.show(history, self.picked)
+            self._plots.show(frames, self.picked, rate)
 
 
 _ROW = "display:flex;gap:8px;align-items:center;line-height:1.45"
