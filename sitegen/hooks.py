@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: generated pages, links into the repository, notebooks, and a check of what was built."""
+"""Hooks of MkDocs: generated pages, links into the repository, notebooks, and what a page needs on disk."""
 
 import sys
 from pathlib import Path, PurePosixPath
@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import links, markup, mirror, notebooks, pages, tables  # noqa: E402
+from sitegen import markup, mirror, notebooks, pages, tables  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -88,9 +88,3 @@ def on_post_template(output_content: str, template_name: str, config: Any) -> st
     """Do the same for 404.html, which also opens from disk."""
     text = output_content.replace(SHIM, "/javascripts/iframe-worker.js")
     return markup.with_own_addresses(text) if template_name == "404.html" else text
-
-
-def on_post_build(config: Any) -> None:
-    """Refuse a site with links that lead nowhere."""
-    if found := list(links.problems(Path(config.site_dir))):
-        raise PluginError("\n".join(["the site has broken links:", *found]))

@@ -1,5 +1,6 @@
-"""Pages of the reference that are made from docstrings: `python -m sitegen.reference` writes them to docs/reference."""
+"""Tables of the reference, made from docstrings: `python -m sitegen.reference` writes them into docs/reference."""
 
+import re
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin
 
@@ -15,69 +16,6 @@ from coopenv.runs.page import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
 from sitegen.mirror import ROOT
-
-OBSERVATION = """# What each observation entry means
-
-<!-- Written by `python -m sitegen.reference`. -->
-
-An observation holds what one vehicle knows: its own estimate, the measurements of its camera, and received messages. No
-entry uses the truth. An entry is (value - center) / scale, clipped to [-1, 1], or to [0, 1] if it cannot be negative.
-`observation.scales.NAME` and `observation.centers.NAME` change both for one field.
-
-`coopenv describe ENV` prints the layout of an environment. In a program:
-
-```python
-import coopenv
-from coopenv.api.terms.layout import observation_layout
-
-layout = observation_layout(coopenv.load_scenario("open_square"))
-goal = layout["goal"]
-print(layout.size, goal.start, goal.stop, goal.unit, goal.meaning)
-```
-
-With `parallel_env(name, observation="dict")` an observation is a dictionary by field name instead of one vector.
-
-The tables below hold every field by group. *One per*: the vehicle itself, every target (landmarks, then vehicles),
-every neighbour, or each of the nearest landmarks of the map. *Planar* is the number of entries that
-`observation.planar = true` keeps. `observation.include` of a scenario chooses groups or single fields.
-[Terms](../terms.md) shows how to add a field of your own.
-
-The layout of each environment, with sizes, scales and centers:
-"""
-
-DEPLOYMENT = """# Deployment file of cars
-
-<!-- Written by `python -m sitegen.reference`. -->
-
-A deployment file lists the cars of a fleet, their network and their limits. [Cars](../cars.md) shows how to use one;
-[`examples/fleet`](../../examples/fleet) has three. Paths are relative to the file. Unknown keys are refused.
-
-`--connect ENDPOINT` of `coopenv svea run` and `fake`, and `connect=` of `parallel_env`, replace `network.connect`;
-that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is one table per car; `cars.name` is a key.
-"""
-
-
-TOPIC = """# Topics of cars
-
-<!-- Written by `python -m sitegen.reference`. -->
-
-These are the topics of SVEA, `coopenv/cars/profiles/svea.toml`. They are below `fleet/CAR/`, in CDR as
-zenoh-bridge-ros2dds sends it: the Zenoh key is the ROS name without its leading slash. Motion capture is
-`fleet/qualisys/CAR/odom`. Presence is a Zenoh liveliness token, `fleet/alive/NAME`. Rates are those of
-[fake cars](../fake_cars.md). Messages above the maximal age are not used. Bearings in messages point from the target to
-the camera, in the optical frame.
-
-`network.kind = "nats"` or `"ros1"` is for the authors' cars with their names: `agentN.riccatiPoint`,
-`/agentN/pixy_node/objectsInfo`, `/agentN/actuation_twist`, `/qualisys/CAR/odom`, `/agentN/lli/ctrl_request`.
-
-"""
-
-PROFILE = """## Profile of a make
-
-A profile is one TOML file with the keys below; `topics.KEY` is `topics.ROLE.KEY`. Roles and an example are in
-`svea.toml`. A deployment file names its profile (`profile = "my_make.toml"`), the map of a bag too (`names`).
-
-"""
 
 TOPIC_ROWS = {
     Role.DETECTIONS: ("car", "60", "blocks of the Pixy, pixels; also frames without blocks"),
@@ -101,43 +39,16 @@ TOPIC_ROWS = {
 }
 """Sender, rate (of fake cars, Hz) and content of the topics of a car."""
 
-BAG_MAP = """# Map of a ROS bag
-
-<!-- Written by `python -m sitegen.reference`. -->
-
-A map gives the environment of a bag, its cars, and their topics. [ROS bags](../bags.md) shows how to use one. Unknown
-keys are refused. `[[cars]]` is one table per car; `cars.name` is a key.
-
-"""
-
-TRAINING = """# Settings of a training
-
-<!-- Written by `python -m sitegen.reference`. -->
-
-Settings of `coopenv train` are a TOML file ([trainers](../trainers.md#coopenv-train)). Unknown keys are refused.
-`[clone]` is optional: without it the policy starts at random.
-
-"""
-
 
 def topics() -> str:
-    """Return the page of the topics of a car."""
+    """Return the table of the topics of a car."""
     rows = []
     for role, (sender, rate, content) in TOPIC_ROWS.items():
         topic = SVEA.topics[role]
+        name, kind = topic.name.removeprefix("fleet/").removeprefix("{car}/"), topic.type.replace("/msg/", "/")
         age = "" if topic.max_age is None else f"{topic.max_age:g}"
-        rows.append(
-            (
-                f"`{topic.name.removeprefix('fleet/').removeprefix('{car}/')}`",
-                f"`{topic.type.replace('/msg/', '/')}`",
-                sender,
-                rate,
-                age,
-                content,
-            )
-        )
-    found = table(("topic", "type", "from", "Hz", "max. age, s", "content"), rows)
-    return f"{TOPIC}{found}\n\n{PROFILE}{_reference(CarProfile)}"
+        rows.append((f"`{name}`", f"`{kind}`", sender, rate, age, content))
+    return table(("topic", "type", "from", "Hz", "max. age, s", "content"), rows)
 
 
 def _reference(part: type[Section]) -> str:
@@ -145,7 +56,7 @@ def _reference(part: type[Section]) -> str:
     rows = [
         (f"`{key}`", _default(field), _values(field), " ".join(meaning.split())) for key, field, meaning in _keys(part)
     ]
-    return table(("key", "default", "values", "meaning"), rows) + "\n"
+    return table(("key", "default", "values", "meaning"), rows)
 
 
 def _keys(part: type[Section], prefix: str = "") -> Iterator[tuple[str, FieldInfo, str]]:
@@ -189,9 +100,8 @@ COLUMNS = ("field", "meaning", "unit", "scale", "center", "one per", "entries", 
 
 
 def observation() -> str:
-    """Return the page that says what every entry of an observation and every term of the reward means."""
-    parts = [OBSERVATION.strip()]
-    parts += [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]
+    """Return what every entry of an observation and every term of the reward means."""
+    parts = [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]
     groups: dict[str, list[tuple[str, ...]]] = {}
     for name, field in OBSERVATION_FIELDS.built_in.items():
         planar = "" if field.planar is None else str(len(field.planar))
@@ -205,18 +115,28 @@ def observation() -> str:
         for name, term in REWARD_TERMS.built_in.items()
     ]
     parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
-    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)]) + "\n"
+    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)])
 
 
-PAGES: dict[str, Callable[[], str]] = {
-    "bag_map.md": lambda: BAG_MAP + _reference(TopicMap),
-    "deployment.md": lambda: DEPLOYMENT + _reference(Deployment),
-    "observation.md": observation,
-    "topics.md": topics,
-    "training.md": lambda: TRAINING + _reference(Settings),
+TABLES: dict[str, Callable[[], str]] = {
+    "bag_map": lambda: _reference(TopicMap),
+    "deployment": lambda: _reference(Deployment),
+    "observation": observation,
+    "profile": lambda: _reference(CarProfile),
+    "topics": topics,
+    "training": lambda: _reference(Settings),
 }
-"""Files in docs/reference, and their texts."""
+PAGES = ("bag_map.md", "deployment.md", "observation.md", "topics.md", "training.md")
+"""Files in docs/reference that hold them."""
+_PLACE = re.compile(r"(<!-- (\w+): written by [^>]* -->\n\n).*?(?=\n\n<!-- end -->)", re.DOTALL)
+
+
+def filled(text: str) -> str:
+    """Return a page with its tables as they are now, each between two comments."""
+    return _PLACE.sub(lambda place: place[1] + TABLES[place[2]](), text)
+
 
 if __name__ == "__main__":
-    for name, page in PAGES.items():
-        (ROOT / "docs" / "reference" / name).write_text(page(), encoding="utf-8")
+    for name in PAGES:
+        path = ROOT / "docs" / "reference" / name
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -76,22 +76,6 @@ def test_every_page_opens(site: Path, browser: Any, size: str) -> None:
     assert not problems, "\n".join(problems)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "<p style='width: 2000px'>Far beyond the edge.</p>",
-        "<div style='overflow: hidden; width: 50px; white-space: nowrap'>Cut in the middle.</div>",
-    ],
-)
-def test_text_that_is_cut_is_noticed(browser: Any, text: str) -> None:
-    page = browser.new_page(viewport={"width": 390, "height": 844})
-    page.set_content(f"<article><h1>A page</h1><pre style='overflow: auto'>{'x' * 500}</pre></article>")
-    assert page.evaluate(CUT) == []
-    page.set_content(f"<article><h1>A page</h1>{text}</article>")
-    assert page.evaluate(CUT)
-    page.close()
-
-
 @pytest.mark.parametrize("name", ["results", "benchmarks", "how-to/figures", "reference/command_line", "bags"])
 def test_options_and_numbers_are_whole_and_nothing_covers_code(site: Path, browser: Any, name: str) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 844})
@@ -157,22 +141,3 @@ def test_a_page_that_is_missing_leads_on(site: Path, browser: Any) -> None:
     page.wait_for_url("http://site.test/*.html*")
     assert page.inner_text("article h1") != "404 - Not found"
     page.close()
-
-
-@pytest.mark.parametrize(
-    ("words", "goal"),
-    [
-        ("plug in your own observer", "tutorials/own_observer.html"),
-        ("train and watch an agent", "tutorials/train.html"),
-        ("open a log or a bag", "tutorials/logs.html"),
-        ("what each observation entry means", "reference/observation.html"),
-    ],
-)
-def test_what_newcomers_look_for_is_a_click_away(site: Path, browser: Any, words: str, goal: str) -> None:
-    for width, height in SIZES.values():
-        page = browser.new_page(viewport={"width": width, "height": height})
-        page.goto((site / "index.html").as_uri())
-        page.locator(f"article a:text-is('{words}')").first.click()
-        page.wait_for_load_state()
-        assert page.url == (site / goal).as_uri()
-        page.close()

@@ -49,8 +49,3 @@ def test_numbers_stay_with_their_units(cell: str, whole: list[str]) -> None:
     page = marked(f"<tr><td>{cell}</td></tr>")
     assert re.findall(r'<span class="quantity">(.*?)</span>', page) == whole
     assert re.sub(r"</?span[^>]*>", "", page).replace(' class="words"', "") == f"<tr><td>{cell}</td></tr>"
-
-
-def test_text_outside_of_tables_stays() -> None:
-    page = "<p>0.5 m</p>"
-    assert marked(page) == page

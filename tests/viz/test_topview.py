@@ -33,7 +33,6 @@ from coopenv.viz.stage import (
     free_lengths,
     limits,
     pointers,
-    ways,
 )
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
@@ -179,15 +178,6 @@ def test_ended_vehicles_are_marked() -> None:
     assert 100 < np.any(plain != marked, axis=-1).sum() < 2000
 
 
-def test_world_0_of_a_batch_is_drawn() -> None:
-    scenario = load_scenario(FOUR_WAY)
-    one, two = Engine(scenario), Engine(scenario, worlds=2)
-    one.reset([5])
-    two.reset([5, 6])
-    view = TopView(scenario)
-    np.testing.assert_array_equal(view.draw(one), view.draw(two))
-
-
 def test_position_covariance_agrees_with_monte_carlo() -> None:
     rng = np.random.default_rng(0)
     R_hat = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
@@ -210,15 +200,6 @@ def test_position_covariance_agrees_with_monte_carlo() -> None:
     assert np.linalg.norm(position_covariance(R_hat, p_hat, P) - sampled) < 0.02 * scale
     other_sign = np.diag([-1.0, -1, -1, 1, 1, 1])
     assert np.linalg.norm(position_covariance(R_hat, p_hat, other_sign @ P @ other_sign) - sampled) > 0.2 * scale
-
-
-def test_position_covariance_takes_leading_axes() -> None:
-    rng = np.random.default_rng(1)
-    R = Rotation.random(4, rng).as_matrix()
-    p, root = rng.standard_normal((4, 3)), rng.standard_normal((4, 6, 6))
-    P = root @ np.swapaxes(root, 1, 2)
-    each = [position_covariance(R[i], p[i], P[i]) for i in range(4)]
-    np.testing.assert_allclose(position_covariance(R, p, P), each)
 
 
 def test_ellipse_is_the_3_sigma_contour() -> None:
@@ -408,12 +389,6 @@ def test_vehicles_point_where_they_go(name: str) -> None:
         if fast.all():
             break
     assert fast.any() or name == "urban_crossing"  # nobody drives there by itself
-
-
-def test_ways_differ_from_bodies_only_where_the_paper_has_them_so() -> None:
-    turned = ways(load_scenario("busy_intersection"))
-    np.testing.assert_allclose(turned, [np.pi / 2, np.pi / 2, 0, 0, 0], atol=1e-9)
-    assert not ways(load_scenario("urban_crossing")).any()
 
 
 def test_goals_that_touch_share_a_name() -> None:
