@@ -152,10 +152,10 @@ def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest
     later = viewer._reel.frames[len(viewer._reel.frames) // 2]
     for turn in (0, 1):
         picture.show(later, turn)
-    by_turns = [handle.handle.vertices.copy() for handle in picture._views]
+    by_turns = [handle.vertices.copy() for handle in picture._views]
     picture.show(later)
     for kept, handle in zip(by_turns, picture._views, strict=True):
-        np.testing.assert_array_equal(kept, handle.handle.vertices)
+        np.testing.assert_array_equal(kept, handle.vertices)
 
 
 def test_wrong_wishes_are_answered_and_the_view_goes_on(viewer: Viewer) -> None:
