@@ -23,7 +23,7 @@ import typer
 from coopenv.api.arguments import FIELDS, OTHERS
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.study import read_study
+from coopenv.bench.learning import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli import app
 from coopenv.observers import registry
@@ -231,7 +231,7 @@ def test_the_settings_of_training(tmp_path: Path) -> None:
     assert read_settings(path, "plain", "facade").scenario == {"observation.planar": False}
     (tmp_path / "study.toml").write_text(study, encoding="utf-8")
     path.write_text("[arms.quality]\n[arms.plain]\n", encoding="utf-8")
-    assert len(list(read_study(tmp_path / "study.toml").runs)) == 12
+    assert len(list(read_study(tmp_path / "study.toml").plans)) == 12
 
 
 @pytest.mark.train

@@ -1,25 +1,141 @@
-"""The card of an agent: its figures per environment, as `card.json` for programs and `card.md` for people."""
+"""Drivers on the same held-out worlds, and their figures on cards: JSON for programs, Markdown for people."""
 
-import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
+from coopenv.api.engine import Engine
+from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
-from coopenv.bench.contest import IDEAL, Entrant, Evaluation, contest, enter
-from coopenv.evaluation import Difference, Result
-from coopenv.policies import agents_for
+from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
+from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
-from coopenv.runs.console import number_table
-from coopenv.runs.page import plain, table
+from coopenv.runs import page
 from coopenv.scenario import Scenario
+
+BASELINE, IDEAL = "route_follower", "ideal_sensing"
+"""Reference of all comparisons, and the name of the same driver under ideal sensing."""
+IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A driver, and the world it drives in."""
+
+    agent: Agent
+    name: str
+    kind: str
+    scenario: Scenario
+    policy: Policy
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results of drivers, by their names."""
+
+    environment: str
+    block: int
+    entrants: tuple[Entrant, ...]
+    episodes: Mapping[str, Episodes]
+    results: Mapping[str, Sequence[Result]]
+    reference: str
+    """Driver that the differences are to."""
+    differences: Mapping[str, Sequence[Difference]]
+
+    @property
+    def worlds(self) -> int:
+        """Number of worlds of every driver."""
+        return next(iter(self.episodes.values())).worlds
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one flat row per driver and metric."""
+        return [
+            {"agent": entrant.name, "kind": entrant.kind, "environment": self.environment, **asdict(result)}
+            for entrant in self.entrants
+            for result in self.results[entrant.name]
+        ]
+
+    def difference_rows(self) -> list[dict[str, Any]]:
+        """Return one flat row per driver that was compared with the reference, and metric."""
+        return [
+            {"agent": name, "reference": self.reference, "environment": self.environment, **asdict(difference)}
+            for name, differences in self.differences.items()
+            for difference in differences
+        ]
+
+
+def enter(environment: str, overrides: Mapping[str, Any], agents: Sequence[str], ideal: bool = False) -> list[Entrant]:
+    """Return the drivers of an evaluation, built.
+
+    Args:
+        environment: name or TOML file.
+        overrides: dotted keys of the scenario.
+        agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
+        ideal: let the baseline drive under ideal sensing, too.
+
+    Raises:
+        CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
+    """
+    scenario, name = open_simulation(environment, overrides), Path(environment).stem
+    if not scenario.driven:
+        raise CoopenvError(f"{environment}: all motion here is prescribed, there is nothing to drive")
+    found = [find_agent(text) for text in agents or agents_for(name)]
+    if not found:
+        raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
+    entrants = [Entrant(agent, agent.name, agent.kind, scenario, agent.policy(scenario)) for agent in found]
+    names = [entrant.name for entrant in entrants]
+    for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
+        raise CoopenvError(f"--agents: two are called '{twice}'")
+    if ideal:
+        agent, seeing = find_agent(BASELINE), open_simulation(environment, {**overrides, **IDEAL_SENSING})
+        entrants.append(Entrant(agent, IDEAL, "reference", seeing, agent.policy(seeing)))
+    return entrants
+
+
+def contest(
+    environment: str,
+    entrants: Sequence[Entrant],
+    worlds: int,
+    block: int,
+    on_progress: Callable[[float, str], None] = lambda done, name: None,
+) -> Evaluation:
+    """Let every entrant drive an episode in each of the same worlds, and judge them.
+
+    Args:
+        environment: its name or TOML file.
+        entrants: those of one environment.
+        worlds: how many.
+        block: number of the block of held-out seeds.
+        on_progress: called with the number of drivers that are done, shares included, and the driver's name.
+    """
+    seeds, episodes, engines = held_out_seeds(block, worlds), dict[str, Episodes](), dict[int, Engine]()
+    with ExitStack() as stack:
+        for place, entrant in enumerate(entrants):
+            world = id(entrant.scenario)
+            if world not in engines:
+                engines[world] = stack.enter_context(closing(Engine(entrant.scenario, worlds)))
+                engines[world].load()
+
+            def report(share: float, place: int = place, name: str = entrant.name) -> None:
+                on_progress(place + share, name)
+
+            episodes[entrant.name] = drive(engines[world], entrant.policy, seeds, report)
+    results = {name: score(own, block) for name, own in episodes.items()}
+    reference = BASELINE if BASELINE in episodes else entrants[0].name
+    others = {
+        name: compare_paired(own, episodes[reference], block) for name, own in episodes.items() if name != reference
+    }
+    return Evaluation(Path(environment).stem, block, tuple(entrants), episodes, results, reference, others)
+
 
 COLUMNS = {
     "arrival_rate": ("arrived\n[%]", 100.0),
@@ -32,27 +148,27 @@ COLUMNS = {
     "return": ("return\n", 1.0),
 }
 """Metric, its heading, and the factor to the heading's unit."""
-COMPARED = ("travel_time_s", "e50_m", "e95_m", "orientation_e95_deg")
+EXPLANATIONS = {
+    "intervals": "95 %, bootstrap over worlds",
+    "e50, e95": "median and 95th percentile of the error of vehicles under way, from 3 s on",
+    "few": "share of that time with fewer than three targets in view",
+    "return": "sum of the rewards of a vehicle",
+}
+"""What the words of the tables mean."""
 
 
-def results_table(evaluation: Evaluation) -> Table:
-    """Return one row per driver: figures, with their intervals below."""
-    table = number_table(("agent",), [heading for heading, _ in COLUMNS.values()], gap=0)
-    for name, results in evaluation.results.items():
-        known = {result.metric: result for result in results}
-        table.add_row(name, *(_cell(known[metric], factor) for metric, (_, factor) in COLUMNS.items()))
-    return table
+def figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
+    """Return results as cards hold them, by metric."""
+    return {r.metric: {"mean": r.mean, "ci_low": r.ci_low, "ci_high": r.ci_high, "n": r.n} for r in results}
 
 
-def differences_table(evaluation: Evaluation) -> Table:
-    """Return one row per driver but the reference: relative differences, with their intervals below."""
-    headings = [COLUMNS[metric][0].split("\n")[0] for metric in COMPARED]
-    headings[-1] += " (deg)"
-    table = number_table((f"against {evaluation.reference}",), [f"{heading}\n[%]" for heading in headings], gap=0)
-    for name, differences in evaluation.differences.items():
-        known = {difference.metric: difference for difference in differences}
-        table.add_row(name, *(_change(known[metric]) for metric in COMPARED))
-    return table
+def changes(differences: Sequence[Difference], metrics: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Return differences as shares of the other agent's figures, as cards hold them, by metric."""
+    return {
+        d.metric: {"relative": d.relative, "ci_low": d.relative_ci_low, "ci_high": d.relative_ci_high}
+        for d in differences
+        if d.metric in metrics
+    }
 
 
 def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
@@ -65,78 +181,33 @@ def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
     return first, second, third
 
 
+def values_of(found: Mapping[str, Any], factor: float, figure: str = "mean") -> list[float]:
+    """Return figure and interval as a card holds them, where null stands for no number."""
+    return [float("nan") if found[key] is None else factor * found[key] for key in (figure, "ci_low", "ci_high")]
+
+
 def cell(result: Mapping[str, Any], factor: float) -> str:
-    """Return a figure of a file, `mean` with `ci_low` and `ci_high`, with its interval in brackets."""
-    values = [float("nan") if result[key] is None else factor * result[key] for key in ("mean", "ci_low", "ci_high")]
-    mean, low, high = shown(*values)
+    """Return a figure of a card with its interval in brackets."""
+    mean, low, high = shown(*values_of(result, factor))
     return NONE if mean == NONE else f"{mean} [{low}, {high}]"
 
 
-def _cell(result: Result, factor: float) -> str:
-    mean, low, high = shown(factor * result.mean, factor * result.ci_low, factor * result.ci_high)
-    return mean if low == NONE else f"{mean}\n{low}..{high}"
+def _percent(change: Mapping[str, Any]) -> str:
+    """Return a relative difference of a card and its interval, in percent."""
+    mean, low, high = shown(*values_of(change, 100.0, "relative"))
+    return f"{signed(mean)} [{low}, {high}] %"
 
 
-def _change(difference: Difference) -> str:
-    percent = [100 * v for v in (difference.relative, difference.relative_ci_low, difference.relative_ci_high)]
-    mean, low, high = (text if text.startswith("-") else f"+{text}" for text in shown(*percent))
-    return f"{mean}\n{low}..{high}" if np.isfinite(percent[1]) else mean
-
-
-EXPLANATIONS = {
-    "intervals": "95 %, bootstrap over worlds",
-    "e50, e95": "median and 95th percentile of the error of vehicles under way, from 3 s on",
-    "few": "share of that time with fewer than three targets in view",
-    "return": "sum of the rewards of a vehicle",
-}
-"""What the words of the tables mean."""
-
-
-WITHIN = 0.15
-"""Seeds whose e95 is at most so much above the best one's count as alike."""
-
-
-def seeds_section(study: dict[str, Any]) -> list[str]:
-    """Return lines of Markdown: figures of every seed and of scripted drivers, differences, spread."""
-    headings = [heading.strip().replace("\n", " ") for heading, _ in COLUMNS.values()]
-    lines = [f"| on the same worlds | {' | '.join(headings)} | trained |", "|---" * (len(headings) + 2) + "|"]
-    for seed, entry in study["seeds"].items():
-        best = " (best)" if int(seed) == study["best"] else ""
-        minutes = f"{entry['runs']['steps'] / 1e6:.1f} M steps, {entry['runs']['cpu_minutes']:.1f} min"
-        lines.append(_row(f"seed {seed}{best}", entry["results"], minutes))
-    lines += [_row(name, figures, "") for name, figures in study["beside"].items()]
-    lines += [
-        "",
-        "Minutes are of one core. The best has the highest return by its own reward, in worlds that are not these.",
-        "",
-    ]
-    for name, changes in study["against"].items():
-        figures = ", ".join(f"{word} {percent(changes[metric])}" for metric, word in CHANGES.items())
-        lines.append(f"- Best against `{name}`: {figures}.")
-    command = study["seeds"][str(study["best"])]["runs"]["command"]
-    lines += [f"- {_spread(study)}", "", "Trained with, in this folder,", "", f"    {command}"]
-    return lines
+def signed(text: str) -> str:
+    """Return a number with its sign."""
+    return text if text.startswith("-") else f"+{text}"
 
 
 CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}
 
 
-def _row(name: str, figures: dict[str, Any], trained: str) -> str:
-    cells = [cell(figures[metric], factor) for metric, (_, factor) in COLUMNS.items()]
-    return f"| {name} | {' | '.join(cells)} | {trained} |"
-
-
-def percent(change: dict[str, float]) -> str:
-    """Return a relative difference and its interval, in percent."""
-    mean, low, high = shown(*(100.0 * change[key] for key in ("relative", "ci_low", "ci_high")))
-    return f"{mean if mean.startswith('-') else '+' + mean} [{low}, {high}] %"
-
-
-def _spread(study: dict[str, Any]) -> str:
-    errors = sorted(entry["results"]["e95_m"]["mean"] for entry in study["seeds"].values())
-    alike = sum(error <= (1.0 + WITHIN) * errors[0] for error in errors)
-    span = f"e95 over seeds: {100 * errors[0]:.1f} to {100 * errors[-1]:.1f} cm"
-    return f"{span}; {alike} of {len(errors)} within {100 * WITHIN:.0f} % of the least."
+def _changes_text(found: Mapping[str, Any], metrics: Iterable[str] = CHANGES) -> str:
+    return ", ".join(f"{CHANGES[metric]} {_percent(found[metric])}" for metric in metrics)
 
 
 JSON_FILE, TEXT_FILE = CARD_FILES
@@ -182,132 +253,143 @@ def write(evaluation: Evaluation, command: str) -> list[Path]:
         if folder is None or entrant.name == IDEAL:
             continue
         card = read(folder)
-        rows = [row for row in evaluation.rows() if row["agent"] == entrant.name]
         known = card["environments"]
-        known[evaluation.environment] = {
-            "command": command,
-            "coopenv": version(),
-            "worlds": evaluation.worlds,
-            "seed_block": evaluation.block,
-            "results": {row["metric"]: {key: row[key] for key in ("mean", "ci_low", "ci_high", "n")} for row in rows},
-        }
+        results = figures(evaluation.results[entrant.name])
+        known[evaluation.environment] = measured(command, evaluation.worlds, evaluation.block, results)
         card |= {"agent": entrant.name, "kind": entrant.kind, "environments": dict(sorted(known.items()))}
-        replace_text(folder / JSON_FILE, json_text(card))
-        replace_text(folder / TEXT_FILE, text(entrant.agent.description, card))
-        written.append(folder / TEXT_FILE)
+        written.append(save(folder, entrant.agent.description, card))
     return written
 
 
-def text(description: str, card: dict[str, Any]) -> str:
-    """Return a card for people, in Markdown."""
-    headings = [heading.strip().replace("\n", " ") for heading, _ in COLUMNS.values()]
-    lines = [f"# {card['agent']}", "", " ".join(description.split()), ""]
-    lines += [f"| environment | worlds | {' | '.join(headings)} |", "|---" * (len(headings) + 2) + "|"]
-    for name, entry in card["environments"].items():
-        cells = [cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
-        lines.append(f"| {name} | {entry['worlds']} | {' | '.join(cells)} |")
-    meaning = "; ".join(f"{word}: {words}" for word, words in EXPLANATIONS.items())
-    lines += ["", f"{meaning[0].upper()}{meaning[1:]}. Measured with", ""]
-    commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in card["environments"].values())
-    lines += [f"    {command} --write-card  # coopenv {number}" for command, number in commands]
-    if "study" in card:
-        lines += ["", *seeds_section(card["study"])]
-    return "\n".join(lines) + "\n"
+def measured(command: str, worlds: int, block: int, results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry of an environment in a card."""
+    return {"command": command, "coopenv": version(), "worlds": worlds, "seed_block": block, "results": results}
 
 
-SETTINGS = ("ideal", "sensed", "blind")
-"""Values of the key `sensing` of the scenario; all else is equal."""
-DRIVERS = ("route_follower", "peek")
-"""A driver that looks straight ahead, and one that plans its view."""
-METRICS = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
-KEYS = ("sensing", "agent", "metric", "mean", "ci_low", "ci_high", "n")
+def save(folder: Path, description: str, card: Mapping[str, Any]) -> Path:
+    """Write a card to an agent's folder, and return the path of the one for people."""
+    replace_text(folder / JSON_FILE, json_text(card))
+    replace_text(folder / TEXT_FILE, text(description, card))
+    return folder / TEXT_FILE
 
 
-def has_value_of_sensing(name: str) -> bool:
-    """Return whether the value of sensing can be measured: both drivers were made for the environment."""
-    return {*DRIVERS} <= {*agents_for(name)}
-
-
-def entrants(environment: str, sensing: str = "sensed") -> list[Entrant]:
-    """Return the drivers at a setting of `sensing`, built.
-
-    Raises:
-        CoopenvError: one cannot drive here, or nothing is driven.
-    """
-    return enter(environment, Path(environment).stem, {"sensing": sensing}, DRIVERS, ideal=False)
-
-
-def measure_value_of_sensing(
-    environment: str, scenario: Scenario, worlds: int, on_progress: Callable[[float, str], None]
-) -> dict[str, Any]:
-    """Let both drivers drive in the same held-out worlds at every setting of `sensing`.
+def figure_table(
+    first: Sequence[str],
+    rows: Iterable[tuple[Sequence[str], Mapping[str, Any], Sequence[str]]],
+    last: Sequence[str] = (),
+    metrics: Iterable[str] = COLUMNS,
+) -> str:
+    """Return a table in Markdown; each row has what stands before its figures, these by metric, and what stands after.
 
     Args:
-        environment: name or TOML file.
-        scenario: what it is now.
-        worlds: how many.
-        on_progress: called with the share that is done, and the driver.
-
-    Returns:
-        Plain data, as `read_value_of_sensing` reads it.
+        first: headings of what stands before.
+        rows: of the table.
+        last: headings of what stands after.
+        metrics: of the columns between.
     """
-    rows: list[dict[str, Any]] = []
-    for place, how in enumerate(SETTINGS):
-
-        def report(done: float, name: str, place: int = place, how: str = how) -> None:
-            on_progress((place + done / len(DRIVERS)) / len(SETTINGS), f"{how}: {name}")
-
-        found = contest(Path(environment).stem, entrants(environment, how), worlds, 0, report).rows()
-        rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in METRICS]
-    return {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
-
-
-def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
-    """Return what was measured earlier; None where nothing was.
-
-    Raises:
-        CoopenvError: the file holds something else.
-    """
-    if not path.exists():
-        return None
-    try:
-        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _by_place(value)
-        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "rows")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise CoopenvError(f"{path}: no figures of a page ({why}); --measure makes them anew") from None
-
-
-def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[str, Any]) -> str:
-    """Return the figures in Markdown, with the commands that give them."""
-    cells = _by_place(value)
-    headings = [COLUMNS[metric][0].strip().replace("\n", " ") for metric in METRICS]
-    rows = [(how, agent, *(cells[how, agent, metric] for metric in METRICS)) for how in SETTINGS for agent in DRIVERS]
-    worlds = value["worlds"]
-    contest = f"coopenv evaluate {environment} --agents {','.join(DRIVERS)} --worlds {worlds} --set sensing=blind"
-    parts = [
-        "Everything else being equal, `sensing` says whether every target is measured in every frame (`ideal`), what "
-        "the camera sees (`sensed`), or nothing (`blind`).",
-        table(("sensing", "agent", *headings), rows),
-        f"Over {worlds} held-out worlds, with 95 % intervals (bootstrap over worlds); e50 and e95 of the position "
-        "error of vehicles under way, from 3 s on.",
-        f"```\ncoopenv page {environment} --measure --worlds {worlds}  # coopenv {value['coopenv']}\n"
-        f"{contest}  # a third of it\n```",
+    columns = [COLUMNS[metric] for metric in metrics]
+    headings = [heading.strip().replace("\n", " ") for heading, _ in columns]
+    factors = {metric: factor for metric, (_, factor) in zip(metrics, columns, strict=True)}
+    lines = [
+        (*before, *(cell(found[metric], factor) for metric, factor in factors.items()), *after)
+        for before, found, after in rows
     ]
-    if value["scenario"] != fingerprint(scenario):
-        parts.insert(0, "*The environment has changed since these figures were measured.*")
-    return "\n\n".join(plain(part) if part[0] not in "`|" else part for part in parts)
+    return page.table((*first, *headings, *last), lines)
 
 
-def _by_place(value: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
-    """Return the cells of the table by sensing, agent and metric."""
-    found = {(row["sensing"], row["agent"], row["metric"]): row for row in value["rows"]}
-    keys = [(how, agent, metric) for how in SETTINGS for agent in DRIVERS for metric in METRICS]
-    return {key: cell(found[key], COLUMNS[key[2]][1]) for key in keys}
+def text(description: str, card: Mapping[str, Any]) -> str:
+    """Return a card for people, in Markdown."""
+    known = card["environments"]
+    rows = [((name, str(entry["worlds"])), entry["results"], ()) for name, entry in known.items()]
+    meaning = "; ".join(f"{word}: {words}" for word, words in EXPLANATIONS.items())
+    commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in known.values())
+    parts = [
+        f"# {card['agent']}",
+        " ".join(description.split()),
+        figure_table(("environment", "worlds"), rows),
+        f"{meaning[0].upper()}{meaning[1:]}. Measured with",
+        "\n".join(f"    {command} --write-card  # coopenv {number}" for command, number in commands),
+        *(_study_parts(card["study"]) if "study" in card else []),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
-def fingerprint(scenario: Scenario) -> str:
-    """Return a digest of a scenario's settings, without its texts and without defaults."""
-    settings = scenario.model_dump(mode="json", exclude_unset=True, exclude={"title", "description", "source"})
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+WITHIN = 0.15
+"""Seeds whose e95 is at most so much above the best one's count as alike."""
+
+
+def _study_parts(study: Mapping[str, Any]) -> list[str]:
+    """Return parts of Markdown: figures of every seed and of scripted drivers, differences, spread."""
+    rows = []
+    for seed, entry in study["seeds"].items():
+        best = " (best)" if int(seed) == study["best"] else ""
+        minutes = f"{entry['runs']['steps'] / 1e6:.1f} M steps, {entry['runs']['cpu_minutes']:.1f} min"
+        rows.append(((f"seed {seed}{best}",), entry["results"], (minutes,)))
+    rows += [((name,), found, ("",)) for name, found in study["beside"].items()]
+    errors = sorted(entry["results"]["e95_m"]["mean"] for entry in study["seeds"].values())
+    alike = sum(error <= (1.0 + WITHIN) * errors[0] for error in errors)
+    lines = [f"- Best against `{name}`: {_changes_text(found)}." for name, found in study["against"].items()]
+    lines.append(
+        f"- e95 over seeds: {100 * errors[0]:.1f} to {100 * errors[-1]:.1f} cm; {alike} of {len(errors)} within "
+        f"{100 * WITHIN:.0f} % of the least."
+    )
+    return [
+        figure_table(("on the same worlds",), rows, ("trained",)),
+        "Minutes are of one core. The best has the highest return by its own reward, in worlds that are not these.",
+        "\n".join(lines),
+        "Trained with, in this folder,",
+        f"    {study['seeds'][str(study['best'])]['runs']['command']}",
+    ]
+
+
+OVERVIEW = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
+INTRODUCTION = """# Agents
+
+One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) describes the scripted drivers.
+`study.toml` lists the learned agents, `train.toml` their settings and arms. `make agents` trains them and writes this
+page. It shows the best seed of each agent, chosen by the training reward in other worlds.
+"""
+LEGEND = """95 % intervals over {worlds} held-out worlds, the same for all agents. e50 and e95: percentiles of
+the position error of vehicles under way, from 3 s on. The last column lists the seeds in their order."""
+
+
+def overview_section(
+    environment: str, found: Mapping[str, Mapping[str, Any]], base: str | None, against: Mapping[str, Any]
+) -> str:
+    """Return the part of the page of agents on one environment.
+
+    Args:
+        environment: its name.
+        found: cards of studies by agent.
+        base: agent that others are compared with, one of these; None: it is not there.
+        against: of those others, their changes against it.
+    """
+    newest = list(found.values())[-1]
+    rows = [((name,), known, ("",)) for name, known in newest["study"]["beside"].items()]
+    for name, card in found.items():
+        errors = ", ".join(f"{100 * error:.1f}" for error in seeds_of(card, "e95_m"))
+        rows.append(((f"[`{name}`]({name}/card.md)",), card["environments"][environment]["results"], (errors,)))
+    lines = []
+    for name, card in found.items():
+        others = [f"{other} {_percent(known['e95_m'])}" for other, known in card["study"]["against"].items()]
+        lines.append(f"- `{name}`: e95 against {', '.join(others)}.")
+    for name, known in against.items():
+        change = _changes_text(known, ("e50_m", "e95_m", "travel_time_s"))
+        shares = {
+            metric: median(seeds_of(found[name], metric)) / median(seeds_of(found[str(base)], metric)) - 1
+            for metric in ("e50_m", "e95_m")
+        }
+        medians = ", ".join(f"{CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
+        lines.append(f"- `{name}` against `{base}`: {change}; median seed against median seed: {medians}.")
+    parts = [
+        f"## {environment}",
+        figure_table(("agent",), rows, ("e95 of seeds [cm]",), OVERVIEW),
+        LEGEND.format(worlds=newest["environments"][environment]["worlds"]),
+        "\n".join(lines),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def seeds_of(card: Mapping[str, Any], metric: str) -> list[float]:
+    """Return a figure of every seed of a study."""
+    return [entry["results"][metric]["mean"] for entry in card["study"]["seeds"].values()]

@@ -15,7 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from coopenv.api.engine import Engine
-from coopenv.bench.contest import Entrant, Evaluation
+from coopenv.bench.cards import Entrant, Evaluation
 from coopenv.evaluation import held_out_seeds
 from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import Quantile, interval, resamples
@@ -37,20 +37,16 @@ _RAREST = 1e-3
 """Share of time that is at the centre of the directions looked in."""
 
 
-def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: str | None = None) -> list[Path]:
+def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: str | None = None) -> None:
     """Write all figures of an evaluation to a folder, for a page or a column of `coopenv.viz.figures`."""
-    inches = inches_of(width)
-    figures = {
-        "error_along_the_way": error_figure(evaluation, inches),
-        "time_against_error": pareto_figure(evaluation, inches),
-        "looking": looking_figure(evaluation, inches),
-    }
     about = {"environment": evaluation.environment, "worlds": evaluation.worlds, "block": evaluation.block}
     about["agents"] = ", ".join(evaluation.episodes)
-    if width is not None:
-        for figure in figures.values():
+    kinds = {"error_along_the_way": error_figure, "time_against_error": pareto_figure, "looking": looking_figure}
+    for name, draw in kinds.items():
+        figure = draw(evaluation, inches_of(width))
+        if width is not None:
             restyle(figure, width)
-    return [style.save(figure, folder / f"{name}.{file_format}", about=about) for name, figure in figures.items()]
+        style.save(figure, folder / f"{name}.{file_format}", about=about)
 
 
 def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
@@ -154,7 +150,7 @@ COLUMNS = 3
 WIDEST = 1920  # px
 
 
-def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
+def write_film(evaluation: Evaluation, folder: Path, log: Console) -> None:
     """Film the first world of an evaluation, one picture per driver, until the last has ended."""
     scenario = evaluation.entrants[0].scenario
     seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
@@ -167,21 +163,17 @@ def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
                 progress.update(done * stride)
 
         write_pictures(path, scenario.rates.camera / stride, whole())
-    return path
 
 
 def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
     """Yield the pictures, (H, W, 3) uint8, of a driver's episode: its name, the error and the time above the map."""
     scenario = entrant.scenario
-    engine = Engine(scenario)
-    view = TopView(engine.backend.scenario.model_copy(update={"title": entrant.name}), panel=False)
-    try:
-        for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
-            if tick % frame_stride(scenario) == 0:
-                yield view.draw(engine)
-    finally:
-        engine.close()
-        view.close()
+    with closing(Engine(scenario)) as engine:
+        titled = engine.backend.scenario.model_copy(update={"title": entrant.name})
+        with closing(TopView(titled, panel=False)) as view:
+            for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
+                if tick % frame_stride(scenario) == 0:
+                    yield view.draw(engine)
 
 
 def _together(films: list[Iterator[np.ndarray]]) -> Iterator[list[np.ndarray]]:
@@ -207,35 +199,21 @@ def tiled(pictures: list[np.ndarray]) -> np.ndarray:
     return np.asarray(Image.fromarray(whole).resize(size, Image.Resampling.LANCZOS))
 
 
-OTHERS = "replay_*.html"
-"""Names of the pages but that of `shown_of`, which is `replay.html`."""
+def write_replays(evaluation: Evaluation, folder: Path, log: Console) -> None:
+    """Write a page per driver; none, and a line, where the extra `view` is missing.
 
-
-def write_replays(evaluation: Evaluation, folder: Path, log: Console) -> list[Path]:
-    """Write the pages; none, and a line, where the extra `view` is missing."""
-    files, seed = replay_files(evaluation), held_out_seeds(evaluation.block, evaluation.worlds)[0]
-    written = []
-    for entrant in sorted(evaluation.entrants, key=lambda e: e is not shown_of(evaluation)):
+    `replay.html` is that of the first driver that has learnt, else of the first of all.
+    """
+    entrants, files = evaluation.entrants, dict[str, str]()
+    shown = next((entrant for entrant in entrants if entrant.kind == "learned"), entrants[0])
+    for number, entrant in enumerate(entrants):
+        plain = re.sub(r"[^\w.-]+", "_", entrant.name)
+        file = REPLAY_FILE if entrant is shown else f"replay_{plain}.html"
+        files[entrant.name] = file if file not in files.values() else f"replay_{plain}_{number}.html"
+    seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
+    for entrant in sorted(entrants, key=lambda e: e is not shown):
         source = Source.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
         with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
             record = scene_of(engine, source, entrant.policy, progress.update)
-        page = write_page(record, folder / files[entrant.name], log, files)
-        if page is None:
-            return []
-        written.append(page)
-    return written
-
-
-def shown_of(evaluation: Evaluation) -> Entrant:
-    """Return the driver whose page is `replay.html`: the first that has learnt, else the first of all."""
-    return next((e for e in evaluation.entrants if e.kind == "learned"), evaluation.entrants[0])
-
-
-def replay_files(evaluation: Evaluation) -> dict[str, str]:
-    """Return the name of each driver's page, in the order of the drivers."""
-    shown, files = shown_of(evaluation).name, dict[str, str]()
-    for number, entrant in enumerate(evaluation.entrants):
-        plain = re.sub(r"[^\w.-]+", "_", entrant.name)
-        file = REPLAY_FILE if entrant.name == shown else OTHERS.replace("*", plain)
-        files[entrant.name] = file if file not in files.values() else OTHERS.replace("*", f"{plain}_{number}")
-    return files
+        if write_page(record, folder / files[entrant.name], log, files) is None:
+            return

@@ -1,91 +1,244 @@
-"""`coopenv bench learning`: train what is missing, side by side, and write a card as each run ends."""
+"""`coopenv bench learning`: train what a study lacks, side by side, and write a card as each run ends."""
 
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tomlkit
+from pydantic import Field
 from rich.console import Console
 from rich.table import Table
 
+from coopenv.api.engine import Engine
+from coopenv.backends.sources import open_simulation
+from coopenv.base.errors import CoopenvError, suggest
 from coopenv.base.files import replace_text
-from coopenv.base.format import json_text
-from coopenv.base.installation import version
-from coopenv.bench import cards as agents_cards
-from coopenv.bench.cards import cell, percent
+from coopenv.base.sections import Section, read_toml, validated
+from coopenv.bench import cards
 from coopenv.bench.executors import Local
-from coopenv.bench.study import REPORTED, Group, Judge, Run, Study, is_finished, perform, tasks
-from coopenv.evaluation import Difference, Result
-from coopenv.policies.loader import AGENT_FILE
+from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
+from coopenv.policies import load_agent
+from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.runs.console import Progress, number_table
-from coopenv.training.settings import SETTINGS_FILE
+from coopenv.training.settings import SETTINGS_FILE, Plan, Settings, read_settings
+
+T = TypeVar("T")
+Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+
+
+class StudyFile(Section):
+    """The contents of a study's TOML file."""
+
+    settings: str
+    """TOML file of `coopenv train`, beside this one, with a table under `arms` for each arm."""
+    environments: tuple[Name, ...] = Field(min_length=1)
+    arms: tuple[Name, ...] = Field(min_length=1)
+    seeds: tuple[Seed, ...] = Field(min_length=1)
+
+
+class Group(NamedTuple):
+    """The runs that differ in nothing but their seed; one agent comes of them."""
+
+    environment: str
+    arm: str
+
+    @property
+    def name(self) -> str:
+        """Of the agent and its folder."""
+        return f"{self.environment}_{self.arm}"
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is to be trained."""
+
+    settings: dict[Group, Settings]
+    """Of every agent, by environment and then by arm."""
+    seeds: tuple[int, ...]
+
+    @property
+    def plans(self) -> Iterator[Plan]:
+        """All trainings; every agent's first one before any agent's second."""
+        return (self.plan(group, seed) for seed in self.seeds for group in self.settings)
+
+    def plan(self, group: Group, seed: int) -> Plan:
+        """Return what exactly is trained for an agent with a seed."""
+        return Plan(group.environment, self.settings[group], seed, group.arm)
+
+    def only(self, words: Sequence[str]) -> "Study":
+        """Return the part of the study that names of environments and arms and numbers of seeds choose.
+
+        Raises:
+            CoopenvError: it has nothing of such a name.
+        """
+        environments, arms = ({*names} for names in zip(*self.settings, strict=True))
+        seeds = {str(seed): seed for seed in self.seeds}
+        known = (*environments, *arms, *seeds)
+        for word in words:
+            if word not in known:
+                known_names = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
+                raise CoopenvError(f"--only: the study has no '{word}'{known_names}")
+        chosen = [{*words} & {*names} or {*names} for names in (environments, arms, seeds)]
+        kept = {g: s for g, s in self.settings.items() if g.environment in chosen[0] and g.arm in chosen[1]}
+        return Study(kept, tuple(seed for text, seed in seeds.items() if text in chosen[2]))
+
+
+def read_study(path: Path) -> Study:
+    """Read a study and the settings that it names.
+
+    Raises:
+        CoopenvError: one of the files is not valid; one line that names file and field.
+    """
+    file = validated(StudyFile, read_toml(path), str(path))
+    groups = [Group(environment, arm) for environment in file.environments for arm in file.arms]
+    settings = {group: read_settings(path.parent / file.settings, group.arm, group.environment) for group in groups}
+    return Study(settings, file.seeds)
+
+
+def place_of(plan: Plan) -> Path:
+    """Return where the agent of a training goes, in the study's folder."""
+    return Path(Group(plan.environment, str(plan.arm)).name, f"seed_{plan.seed}")
+
+
+def is_finished(plan: Plan, folder: Path) -> bool:
+    """Return whether a training's agent is there, trained as in the present study and environment."""
+    from coopenv.training.export import scenario_digest  # needs the extra `train`
+
+    place = folder / place_of(plan)
+    if not (place / AGENT_FILE).is_file() or not (place / SETTINGS_FILE).is_file():
+        return False
+    try:
+        card, settings = read_card(place), read_settings(place / SETTINGS_FILE)
+    except (CoopenvError, tomllib.TOMLDecodeError):
+        return False
+    known = [card.training.get(key) for key in ("environment", "seed", "arm", "scenario")]
+    scenario = scenario_digest(open_simulation(plan.environment, plan.all_overrides))
+    return known == [plan.environment, plan.seed, plan.arm, scenario] and settings == plan.settings
+
+
+def unfinished(study: Study, folder: Path) -> list[Plan]:
+    """Return the trainings of a study that are not finished.
+
+    Raises:
+        CoopenvError: one of them is not possible: better now than when the others have been waited for.
+    """
+    from coopenv.training.command import possible  # needs the extra `train`
+
+    plans = [plan for plan in study.plans if not is_finished(plan, folder)]
+    for plan in plans:
+        try:
+            possible(plan)
+        except CoopenvError as error:
+            raise CoopenvError(f"{place_of(plan)}: {error}") from None
+    return plans
+
+
+def perform(folder: Path, logs: Path, plan: Plan) -> None:
+    """Train on one core, going on from a checkpoint where there is one of the same training.
+
+    An agent that is there has been trained with other settings, and is replaced.
+
+    Raises:
+        CoopenvError: what `train` raises.
+    """
+    from coopenv.training.command import read, train  # needs the extra `train`
+
+    out, own_logs = folder / place_of(plan), logs / place_of(plan)
+    path = out / CHECKPOINT_FILE
+    resume = path.is_file() and read(path).plan == plan
+    if not resume:
+        path.unlink(missing_ok=True)  # of a training with other settings
+    own_logs.mkdir(parents=True, exist_ok=True)
+    train(plan, out, resume=resume, threads=1, logs=own_logs, force=True)
+
+
+REPORTED, CHOSEN = 0, 1
+"""Blocks of held-out seeds: figures on cards are of the first; which seed is the best is decided in the second."""
+
+Key = tuple[str, ...]
+"""Environment, agent, overrides, and when its weights were written."""
+
+
+class Judge:
+    """Drives agents in the same worlds, and remembers what came of it: figures, and one environment's episodes."""
+
+    def __init__(self, worlds: int) -> None:
+        """Take so many worlds of either block."""
+        self.worlds = worlds
+        self._environment = ""
+        self._episodes: dict[Key, Episodes] = {}
+        self._known: dict[Hashable, Any] = {}
+
+    def results(self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None) -> list[Result]:
+        """Return the figures of an agent in the reported worlds, under overrides of the environment."""
+        key = _key(environment, agent, overrides or {})
+        return self._once(key, lambda: score(self._reported(environment, agent, overrides or {})))
+
+    def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
+        """Return how much an agent's figures differ from another's in the same worlds."""
+
+        def compared() -> list[Difference]:
+            own, others = (self._reported(environment, each, {}) for each in (agent, other))
+            return compare_paired(own, others)
+
+        return self._once((_key(environment, agent, {}), _key(environment, other, {})), compared)
+
+    def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
+        """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""
+
+        def driven() -> float:
+            results = score(self._drive(environment, agent, overrides, CHOSEN))
+            return {result.metric: result.mean for result in results}["return"]
+
+        return self._once(("merit", _key(environment, agent, overrides)), driven)
+
+    def _once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return what is known of a key, or make it."""
+        if key not in self._known:
+            self._known[key] = make()
+        found: T = self._known[key]
+        return found
+
+    def _reported(self, environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> Episodes:
+        if environment != self._environment:  # episodes are large, and those of one environment are wanted together
+            self._environment = environment
+            self._episodes.clear()
+        key = _key(environment, agent, overrides)
+        if key not in self._episodes:
+            self._episodes[key] = self._drive(environment, agent, overrides, REPORTED)
+        return self._episodes[key]
+
+    def _drive(self, environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Episodes:
+        scenario = open_simulation(environment, overrides)
+        engine = Engine(scenario, self.worlds)
+        try:
+            return drive(engine, load_agent(agent, scenario), held_out_seeds(block, self.worlds))
+        finally:
+            engine.close()
+
+
+def _key(environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> Key:
+    """Return what episodes depend on: weights that are trained anew are another agent."""
+    weights = sorted(str(path.stat().st_mtime_ns) for path in Path(agent).glob("*.safetensors"))
+    return (environment, str(agent), repr(sorted(overrides.items())), *weights)
+
 
 BASELINES = ("route_follower", "peek", "look_ahead")
-COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
+PAGE_FILE = "README.md"
+BASE_ARM = "plain"
+"""The arm that others are compared with."""
 
 
-def finished_groups(study: Study, folder: Path) -> dict[Group, list[Run]]:
-    """Return the runs that are finished, as study and environments are now, of each group that has any."""
-    done = {group: [Run(group, seed) for seed in study.seeds] for group in study.groups}
-    done = {group: [run for run in runs if is_finished(study, run, folder)] for group, runs in done.items()}
-    return {group: runs for group, runs in done.items() if runs}
-
-
-def is_reported(group: Group, runs: Sequence[Run], folder: Path) -> bool:
+def is_reported(group: Group, plans: Sequence[Plan], folder: Path) -> bool:
     """Return whether a group has a card that tells of just these finished runs."""
-    seeds = agents_cards.read(folder / group.name).get("study", {}).get("seeds", {})
+    seeds = cards.read(folder / group.name).get("study", {}).get("seeds", {})
     found = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
-    return found == {run.seed: _trained(folder / run.folder)["sha256"] for run in runs}
-
-
-def write_cards(study: Study, group: Group, finished: Sequence[Run], folder: Path, judge: Judge) -> None:
-    """Write the agent and the card of a group of which some runs are finished.
-
-    Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
-    """
-    runs = {run.seed: run for run in finished}
-    overrides, place = study.settings[group].scenario, folder / group.name
-    merits = {seed: judge.merit(group.environment, folder / run.folder, overrides) for seed, run in runs.items()}
-    best = max(merits, key=lambda seed: merits[seed])
-    results = {seed: judge.results(group.environment, folder / run.folder) for seed, run in runs.items()}
-    description = _write_agent(place, runs[best].folder.name, group, sorted(runs))
-    chosen = folder / runs[best].folder
-    against = {name: judge.against(group.environment, chosen, name) for name in BASELINES}
-    baselines = {name: judge.results(group.environment, name) for name in BASELINES}
-    baselines["ideal_sensing"] = judge.ideal(group.environment, BASELINES[0])
-    agents = ",".join(str(folder / run.folder) for run in runs.values())
-    command = f"coopenv evaluate {group.environment} --agents {agents},{','.join(BASELINES)} --worlds {judge.worlds}"
-    card = {
-        "agent": group.name,
-        "kind": "learned",
-        "environments": {
-            group.environment: {
-                "command": f"{command} --seed-block {REPORTED} --ideal",
-                "coopenv": version(),
-                "worlds": judge.worlds,
-                "seed_block": REPORTED,
-                "results": _figures(results[best]),
-            }
-        },
-        "study": {
-            "arm": group.arm,
-            "best": best,
-            "seeds": {
-                str(seed): {
-                    "runs": _trained(folder / run.folder),
-                    "merit": merits[seed],
-                    "results": _figures(results[seed]),
-                }
-                for seed, run in runs.items()
-            },
-            "beside": {name: _figures(found) for name, found in baselines.items()},
-            "against": {name: _changes(found) for name, found in against.items()},
-        },
-    }
-    replace_text(place / agents_cards.JSON_FILE, json_text(card))
-    replace_text(place / agents_cards.TEXT_FILE, agents_cards.text(description, card))
+    return found == {plan.seed: _trained(folder / place_of(plan))["sha256"] for plan in plans}
 
 
 def _trained(place: Path) -> dict[str, Any]:
@@ -94,6 +247,40 @@ def _trained(place: Path) -> dict[str, Any]:
     training = document["training"]
     found = {key: training[key] for key in ("steps", "cpu_minutes", "command")}
     return {"sha256": document["network"]["sha256"], **found}
+
+
+def write_card(group: Group, finished: Sequence[Plan], folder: Path, judge: Judge) -> None:
+    """Write the agent and the card of a group of which some runs are finished.
+
+    Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
+    """
+    environment, place = group.environment, folder / group.name
+    agents = {plan.seed: folder / place_of(plan) for plan in finished}
+    overrides = finished[0].settings.scenario
+    merits = {seed: judge.merit(environment, agent, overrides) for seed, agent in agents.items()}
+    best = max(merits, key=lambda seed: merits[seed])
+    results = {seed: cards.figures(judge.results(environment, agent)) for seed, agent in agents.items()}
+    description = _write_agent(place, agents[best].name, group, sorted(agents))
+    against = {name: judge.against(environment, agents[best], name) for name in BASELINES}
+    beside = {name: judge.results(environment, name) for name in BASELINES}
+    beside[cards.IDEAL] = judge.results(environment, BASELINES[0], cards.IDEAL_SENSING)
+    driven = ",".join(map(str, (*agents.values(), *BASELINES)))
+    command = (
+        f"coopenv evaluate {environment} --agents {driven} --worlds {judge.worlds} --seed-block {REPORTED} --ideal"
+    )
+    study = {
+        "arm": group.arm,
+        "best": best,
+        "seeds": {
+            str(seed): {"runs": _trained(agent), "merit": merits[seed], "results": results[seed]}
+            for seed, agent in agents.items()
+        },
+        "beside": {name: cards.figures(found) for name, found in beside.items()},
+        "against": {name: cards.changes(found, cards.OVERVIEW) for name, found in against.items()},
+    }
+    entry = cards.measured(command, judge.worlds, REPORTED, results[best])
+    card = {"agent": group.name, "kind": "learned", "environments": {environment: entry}, "study": study}
+    cards.save(place, description, card)
 
 
 def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:
@@ -108,92 +295,19 @@ def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> 
     return description
 
 
-def _figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
-    return {r.metric: {"mean": r.mean, "ci_low": r.ci_low, "ci_high": r.ci_high, "n": r.n} for r in results}
-
-
-def _changes(differences: Sequence[Difference]) -> dict[str, dict[str, float]]:
-    return {d.metric: relative(d) for d in differences if d.metric in COMPARED}
-
-
-def relative(difference: Difference) -> dict[str, float]:
-    """Return a difference as a share of the other one's figure."""
-    ends = {"ci_low": difference.relative_ci_low, "ci_high": difference.relative_ci_high}
-    return {"relative": difference.relative, **ends}
-
-
-PAGE_FILE = "README.md"
-BASE_ARM = "plain"
-"""The arm that others are compared with."""
-COLUMNS = {metric: agents_cards.COLUMNS[metric] for metric in COMPARED}
-"""Metric, its heading, and the factor to the heading's unit."""
-INTRODUCTION = """# Agents
-
-One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) describes the scripted drivers.
-`study.toml` lists the learned agents, `train.toml` their settings and arms. `make agents` trains them and writes this
-page. It shows the best seed of each agent, chosen by the training reward in other worlds.
-"""
-LEGEND = """95 % intervals over {worlds} held-out worlds, the same for all agents. e50 and e95: percentiles of
-the position error of vehicles under way, from 3 s on. The last column lists the seeds in their order."""
-
-
 def write_overview(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
     """Write the page of agents, each of which has a card; those that are to be trained anew are left out of it."""
-    parts = [INTRODUCTION]
+    parts = [cards.INTRODUCTION]
     for environment in dict.fromkeys(group.environment for group in groups):
-        found = {group: agents_cards.read(folder / group.name) for group in groups if group.environment == environment}
-        parts.append(_section(environment, found, folder, judge))
+        own = {group.name: group.arm for group in groups if group.environment == environment}
+        found = {name: cards.read(folder / name) for name in own}
+        best = {name: folder / name / f"seed_{card['study']['best']}" for name, card in found.items()}
+        base = next((name for name, arm in own.items() if arm == BASE_ARM), None)
+        others = [name for name in own if base is not None and name != base]
+        against = {name: judge.against(environment, best[name], best[str(base)]) for name in others}
+        relative = {name: cards.changes(found, cards.OVERVIEW) for name, found in against.items()}
+        parts.append(cards.overview_section(environment, found, base, relative))
     replace_text(folder / PAGE_FILE, "\n".join(parts))
-
-
-def _section(environment: str, found: dict[Group, dict[str, Any]], folder: Path, judge: Judge) -> str:
-    headings = " | ".join(heading.replace("\n", " ") for heading, _ in COLUMNS.values())
-    lines = [f"## {environment}", "", f"| agent | {headings} | e95 of seeds [cm] |", "|---" * (len(COLUMNS) + 2) + "|"]
-    newest = list(found.values())[-1]
-    for name, figures in newest["study"]["beside"].items():
-        lines.append(_row(name, figures, ""))
-    for group, card in found.items():
-        seeds = card["study"]["seeds"].values()
-        errors = ", ".join(f"{100 * entry['results']['e95_m']['mean']:.1f}" for entry in seeds)
-        results = card["environments"][environment]["results"]
-        lines.append(_row(f"[`{group.name}`]({group.name}/card.md)", results, errors))
-    lines += ["", LEGEND.format(worlds=newest["environments"][environment]["worlds"]), ""]
-    for group, card in found.items():
-        others = [f"{name} {percent(changes['e95_m'])}" for name, changes in card["study"]["against"].items()]
-        lines.append(f"- `{group.name}`: e95 against {', '.join(others)}.")
-    base = next((group for group in found if group.arm == BASE_ARM), None)
-    for group in found:
-        if base is not None and group != base:
-            best, bases = (folder / g.name / f"seed_{found[g]['study']['best']}" for g in (group, base))
-            differences = judge.against(environment, best, bases)
-            change = (
-                f"{_changes_of(differences)}; median seed against median seed: {_medians(found[group], found[base])}"
-            )
-            lines.append(f"- `{group.name}` against `{base.name}`: {change}.")
-    return "\n".join([*lines, ""])
-
-
-def _row(name: str, figures: dict[str, Any], errors: str) -> str:
-    cells = [cell(figures[metric], factor) for metric, (_, factor) in COLUMNS.items()]
-    return f"| {name} | {' | '.join(cells)} | {errors} |"
-
-
-def _medians(card: dict[str, Any], base: dict[str, Any]) -> str:
-    """Return how the medians over seeds differ, which no lucky seed moves."""
-    found = []
-    for word, metric in (("e50", "e50_m"), ("e95", "e95_m")):
-        own, other = (
-            median(entry["results"][metric]["mean"] for entry in each["study"]["seeds"].values())
-            for each in (card, base)
-        )
-        found.append(f"{word} {100 * (own / other - 1):+.0f} %")
-    return ", ".join(found)
-
-
-def _changes_of(differences: Sequence[Difference]) -> str:
-    words = {"e50_m": "e50", "e95_m": "e95", "travel_time_s": "travel time"}
-    found = {d.metric: d for d in differences}
-    return ", ".join(f"{word} {percent(relative(found[metric]))}" for metric, word in words.items())
 
 
 WIDTH = 100
@@ -218,47 +332,43 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
         CoopenvError: a training cannot be done.
         OutputError: something cannot be written.
     """
-    judge, missing = Judge(worlds), tasks(part, folder, logs)
-    total = len(list(part.runs))
+    judge, missing = Judge(worlds), unfinished(part, folder)
+    total = len(list(part.plans))
+    before = total - len(missing)
     folder.mkdir(parents=True, exist_ok=True)
 
     def judge_finished() -> None:
-        finished = finished_groups(study, folder)
-        stale = {group: runs for group, runs in finished.items() if not is_reported(group, runs, folder)}
-        for group, runs in stale.items():
-            write_cards(study, group, runs, folder, judge)
+        finished: dict[Group, list[Plan]] = {}
+        for group, seed in product(study.settings, study.seeds):
+            if is_finished(plan := study.plan(group, seed), folder):
+                finished.setdefault(group, []).append(plan)
+        stale = {group: plans for group, plans in finished.items() if not is_reported(group, plans, folder)}
+        for group, plans in stale.items():
+            write_card(group, plans, folder, judge)
         if stale or not (folder / PAGE_FILE).exists():
             write_overview(list(finished), folder, judge)
 
-    with Progress(
-        log, f"{total - len(missing)} of {total} trainings were done", total=len(missing) or None
-    ) as progress:
+    with Progress(log, f"{before} of {total} trainings were done", total=len(missing) or None) as progress:
+
+        def on_done(done: int) -> None:
+            progress.update(done, f"{before + done} of {total} trainings are done")
+            judge_finished()
+
         judge_finished()
-        on_done = _reporter(judge_finished, progress, total - len(missing), total)
         if missing:
-            Local(jobs).map(perform, missing, on_done)
-
-
-def _reporter(judge_finished: Callable[[], None], progress: Progress, before: int, total: int) -> Callable[[int], None]:
-    def on_done(done: int) -> None:
-        progress.update(done, f"{before + done} of {total} trainings are done")
-        judge_finished()
-
-    return on_done
+            Local(jobs).map(partial(perform, folder, logs), missing, on_done)
 
 
 def results_table(study: Study, folder: Path) -> Table:
     """Return one row per agent: the figures of its best seed, and how its seeds differ."""
-    table = number_table(
-        ("agent", "seeds"), [*(heading for heading, _ in COLUMNS.values()), "e95 of\nseeds [cm]"], gap=0
-    )
-    for group in study.groups:
-        card = agents_cards.read(folder / group.name)
+    columns = {metric: cards.COLUMNS[metric] for metric in cards.OVERVIEW}
+    headings = [*(heading for heading, _ in columns.values()), "e95 of\nseeds [cm]"]
+    table = number_table(("agent", "seeds"), headings, gap=0)
+    for group in study.settings:
+        card = cards.read(folder / group.name)
         if "study" not in card:
             continue
-        seeds = card["study"]["seeds"]
-        results = card["environments"][group.environment]["results"]
-        errors = " ".join(f"{100 * entry['results']['e95_m']['mean']:.0f}" for entry in seeds.values())
-        figures = [cell(results[metric], factor).replace(" ", "\n", 1) for metric, (_, factor) in COLUMNS.items()]
-        table.add_row(group.name, str(len(seeds)), *figures, errors)
+        results, errors = card["environments"][group.environment]["results"], cards.seeds_of(card, "e95_m")
+        figures = [cards.cell(results[m], factor).replace(" ", "\n", 1) for m, (_, factor) in columns.items()]
+        table.add_row(group.name, str(len(errors)), *figures, " ".join(f"{100 * error:.0f}" for error in errors))
     return table

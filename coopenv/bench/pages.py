@@ -1,6 +1,8 @@
 """Pages of environments as files: text, picture, film and measured figures of each, and an index."""
 
-from collections.abc import Callable
+import hashlib
+import json
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -8,11 +10,12 @@ from typing import Any
 from PIL import Image
 
 from coopenv.api.engine import Engine
-from coopenv.base.errors import world_keys
+from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
-from coopenv.bench.cards import measure_value_of_sensing, read_value_of_sensing, value_of_sensing_text
-from coopenv.policies import Policy
+from coopenv.base.installation import version
+from coopenv.bench.cards import OVERVIEW, Entrant, contest, enter, figure_table
+from coopenv.policies import agents_for
 from coopenv.runs.page import index_text, page_text
 from coopenv.runs.scenes import driver_of, scene_of, write_film
 from coopenv.scenario import Scenario
@@ -28,7 +31,7 @@ _IDLE = "zero"  # the driver of a scene without a route
 
 def film_words(name: str, scenario: Scenario) -> str:
     """Return what a film shows; empty: nothing moves, so there is no film."""
-    _, driver = _driver(name, scenario)
+    _, driver = driver_of(None, scenario, name, _SEED)
     if not _moves(scenario, driver):
         return ""
     driven = f" driven by `{driver}`," if driver else ""
@@ -39,7 +42,7 @@ def film_words(name: str, scenario: Scenario) -> str:
 def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Callable[[float], None]) -> None:
     """Film an environment for the page in a folder; where nothing moves there is no film."""
     path = folder / f"{name}.webp"
-    policy, driver = _driver(name, scenario)
+    policy, driver = driver_of(None, scenario, name, _SEED)
     if not _moves(scenario, driver):
         path.unlink(missing_ok=True)
         return
@@ -50,15 +53,111 @@ def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Ca
     write_film(record, path, FPS, max(1.0, record.length / _LASTS), WIDTH, panel=False, on_progress=drawn)
 
 
-def _driver(name: str, scenario: Scenario) -> tuple[Policy | None, str]:
-    return driver_of(None, scenario, name, _SEED)
-
-
 def _moves(scenario: Scenario, driver: str) -> bool:
     if driver:
         return driver != _IDLE
     moving = [vehicle.motion.kind for vehicle in scenario.vehicles] + [m.motion.kind for m in scenario.landmarks]
     return any(kind != "static" for kind in moving)
+
+
+SETTINGS = ("ideal", "sensed", "blind")
+"""Values of the key `sensing` of the scenario; all else is equal."""
+DRIVERS = ("route_follower", "peek")
+"""A driver that looks straight ahead, and one that plans its view."""
+KEYS = ("sensing", "agent", "metric", "mean", "ci_low", "ci_high", "n")
+
+
+def has_value_of_sensing(name: str) -> bool:
+    """Return whether the value of sensing can be measured: both drivers were made for the environment."""
+    return {*DRIVERS} <= {*agents_for(name)}
+
+
+def entrants(environment: str, sensing: str = "sensed") -> list[Entrant]:
+    """Return the drivers at a setting of `sensing`, built.
+
+    Raises:
+        CoopenvError: one cannot drive here, or nothing is driven.
+    """
+    return enter(environment, {"sensing": sensing}, DRIVERS)
+
+
+def write_figures(
+    environment: str, scenario: Scenario, folder: Path, worlds: int, on_progress: Callable[[float, str], None]
+) -> None:
+    """Measure what sensing is worth in an environment, and write it for the page.
+
+    Both drivers drive in the same held-out worlds at every setting of `sensing`.
+
+    Args:
+        environment: name or TOML file.
+        scenario: what it is now.
+        folder: of the page.
+        worlds: how many.
+        on_progress: called with the share that is done, and the driver.
+    """
+    rows: list[dict[str, Any]] = []
+    for place, how in enumerate(SETTINGS):
+
+        def report(done: float, name: str, place: int = place, how: str = how) -> None:
+            on_progress((place + done / len(DRIVERS)) / len(SETTINGS), f"{how}: {name}")
+
+        found = contest(environment, entrants(environment, how), worlds, 0, report).rows()
+        rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]
+    value = {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
+    replace_text(folder / f"{Path(environment).stem}.json", json_text(value))
+
+
+def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
+    """Return what was measured earlier; None where nothing was.
+
+    Raises:
+        CoopenvError: the file holds something else.
+    """
+    if not path.exists():
+        return None
+    try:
+        value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _value_table(value)
+        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "rows")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise CoopenvError(f"{path}: no figures of a page ({why}); --measure makes them anew") from None
+
+
+def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[str, Any]) -> str:
+    """Return the figures in Markdown, with the commands that give them."""
+    worlds = value["worlds"]
+    contest = f"coopenv evaluate {environment} --agents {','.join(DRIVERS)} --worlds {worlds} --set sensing=blind"
+    changed = "*The environment has changed since these figures were measured.*"
+    return "\n\n".join(
+        [
+            *([changed] if value["scenario"] != fingerprint(scenario) else []),
+            "Everything else being equal, `sensing` says whether every target is measured in every frame (`ideal`), "
+            "what the camera sees (`sensed`), or nothing (`blind`).",
+            _value_table(value),
+            f"Over {worlds} held-out worlds, with 95 % intervals (bootstrap over worlds); e50 and e95 of the position "
+            "error of vehicles under way, from 3 s on.",
+            f"```\ncoopenv page {environment} --measure --worlds {worlds}  # coopenv {value['coopenv']}\n"
+            f"{contest}  # a third of it\n```",
+        ]
+    )
+
+
+def _value_table(value: Mapping[str, Any]) -> str:
+    """Return the table by sensing and agent."""
+    found = {(row["sensing"], row["agent"], row["metric"]): row for row in value["rows"]}
+    rows = [
+        ((how, agent), {metric: found[how, agent, metric] for metric in OVERVIEW}, ())
+        for how in SETTINGS
+        for agent in DRIVERS
+    ]
+    return figure_table(("sensing", "agent"), rows, metrics=OVERVIEW)
+
+
+def fingerprint(scenario: Scenario) -> str:
+    """Return a digest of a scenario's settings, without its texts and without defaults."""
+    settings = scenario.model_dump(mode="json", exclude_unset=True, exclude={"title", "description", "source"})
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 INDEX = "README.md"
@@ -102,33 +201,15 @@ def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[f
     if on_film is not None:
         write_page_film(name, scenario, folder, on_film)
     text = environment_page(name, scenario, folder)
-    picture = Image.fromarray(first_picture(scenario)).quantize(COLOURS, kmeans=REFINED, dither=Image.Dither.NONE)
+    with closing(Engine(scenario)) as engine, closing(TopView(engine.backend.scenario)) as view:
+        engine.reset([world_keys(_SEED)[0]])
+        drawn = Image.fromarray(view.draw(engine))
+    picture = drawn.quantize(COLOURS, kmeans=REFINED, dither=Image.Dither.NONE)
     with replacing_file(folder / f"{name}.png") as path:
         picture.save(path, optimize=True)
     replace_text(folder / f"{name}.md", text)
 
 
-def write_figures(
-    environment: str,
-    name: str,
-    scenario: Scenario,
-    folder: Path,
-    worlds: int,
-    on_progress: Callable[[float, str], None],
-) -> dict[str, Any]:
-    """Measure what sensing is worth in an environment, and write it for the page."""
-    value = measure_value_of_sensing(environment, scenario, worlds, on_progress)
-    replace_text(folder / f"{name}.json", json_text(value))
-    return value
-
-
 def write_index(scenarios: dict[str, Scenario], folder: Path) -> None:
-    """Write the list of those environments whose pages are in the folder."""
-    replace_text(folder / INDEX, index_text({k: s for k, s in scenarios.items() if (folder / f"{k}.md").is_file()}))
-
-
-def first_picture(scenario: Scenario) -> Any:
-    """Return the top view, (H, W, 3) uint8, of the start of the episode of seed 0."""
-    with closing(Engine(scenario)) as engine, closing(TopView(engine.backend.scenario)) as view:
-        engine.reset([world_keys(0)[0]])
-        return view.draw(engine)
+    """Write the list of environments, whose pages are in the folder."""
+    replace_text(folder / INDEX, index_text(scenarios))

@@ -156,7 +156,6 @@ def page(
     """Write the pages of environments: description, picture, film, value of sensing."""
     from coopenv.base.installation import list_envs
     from coopenv.bench import pages
-    from coopenv.bench.cards import entrants, has_value_of_sensing
     from coopenv.runs.console import Progress
 
     if bool(environments) == everything:
@@ -166,9 +165,9 @@ def page(
     if len(stems) < len(names):
         raise CoopenvError("two environments have the same name")
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
-    measured = [name for name in stems if measure and (has_value_of_sensing(name) or not everything)]
+    measured = [name for name in stems if measure and (pages.has_value_of_sensing(name) or not everything)]
     for name in measured:
-        entrants(stems[name])
+        pages.entrants(stems[name])
     pages.prepare(out, list(stems))
     log = options.console(stderr=True)
     with Progress(log, "pages", total=len(stems)) as progress:
@@ -179,7 +178,7 @@ def page(
                 progress.update(number + done, f"{name}, {doing}")
 
             if name in measured:
-                pages.write_figures(stems[name], name, scenario, out, worlds, report)
+                pages.write_figures(stems[name], scenario, out, worlds, report)
             pages.write_page(name, scenario, out, report if film else None)
     if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
         pages.write_index(shipped, out)

@@ -27,7 +27,7 @@ def bench_seeds(
 ) -> None:
     """Run many seeds at once: settling, and the steady errors."""
     scenario = options.load(environment, options.parse_overrides(overrides))
-    from coopenv.bench.seeds import seed_table, study_seeds
+    from coopenv.bench.observers.convergence import seed_table, study_seeds
     from coopenv.estimation.metrics import SETTLED, steady_start
     from coopenv.runs.console import Progress
 
@@ -142,8 +142,8 @@ OF_THE_OUTPUT = ("jobs", "engine", "address", "out", "figures", "width", "open_r
 def bench_observers(given: ObserverOptions) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import find_executor
-    from coopenv.bench.observers.basin import check_source
     from coopenv.bench.observers.command import REPORT_FILE, Request, perform
+    from coopenv.bench.observers.convergence import check_source
     from coopenv.bench.observers.tables import WIDE
 
     if given.open_report and given.out is None:
@@ -181,12 +181,11 @@ def bench_learning(
     except ImportError as error:
         raise CoopenvError(f"coopenv bench learning needs the extra train: pip install '.[train]' ({error})") from None
     from coopenv.base.installation import available_cores
-    from coopenv.bench.study import read_study
 
-    whole, log = read_study(study), options.console(stderr=True)
+    whole, log = learning.read_study(study), options.console(stderr=True)
     chosen, folder = whole.only(options.words(only)), out or study.parent
     with options.warned():
-        for group in chosen.groups:
+        for group in chosen.settings:
             options.load(group.environment, chosen.settings[group].scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
     printed = options.console(least=learning.WIDTH)

@@ -204,7 +204,7 @@ def evaluate(given: EvaluateOptions) -> None:
         entrants = request.entrants()
     if given.write_card:
         cards.check(entrants)
-    result = evaluate.run(request, entrants, log) if out is None else evaluate.write(out, request, entrants, log)
+    result = evaluate.run(request, entrants, log)
     written = cards.write(result, request.command) if given.write_card else []
     if given.as_json:
         options.print_json(evaluate.document(request, result))

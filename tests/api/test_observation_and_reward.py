@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.cards import has_value_of_sensing
+from coopenv.bench.pages import has_value_of_sensing
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario

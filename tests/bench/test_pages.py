@@ -11,8 +11,15 @@ import pytest
 from PIL import Image
 
 from coopenv.base.installation import list_envs
-from coopenv.bench.cards import DRIVERS, METRICS, SETTINGS, fingerprint, has_value_of_sensing, value_of_sensing_text
-from coopenv.bench.pages import environment_page
+from coopenv.bench.cards import OVERVIEW
+from coopenv.bench.pages import (
+    DRIVERS,
+    SETTINGS,
+    environment_page,
+    fingerprint,
+    has_value_of_sensing,
+    value_of_sensing_text,
+)
 from coopenv.cli import main
 from coopenv.runs.page import index_text
 from coopenv.scenario import Scenario, load_scenario
@@ -141,7 +148,7 @@ def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:
 def made_up_value_of_sensing(scenario: Scenario) -> dict[str, object]:
     rows = [
         {"sensing": how, "agent": who, "metric": metric, "mean": 0.5, "ci_low": 0.25, "ci_high": 0.75, "n": 2}
-        for how, who, metric in product(SETTINGS, DRIVERS, METRICS)
+        for how, who, metric in product(SETTINGS, DRIVERS, OVERVIEW)
     ]
     return {"coopenv": "1.2.3", "worlds": 2, "scenario": fingerprint(scenario), "rows": rows}
 

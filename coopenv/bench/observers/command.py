@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,20 +20,12 @@ from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text, jsonable, with_error
 from coopenv.base.installation import versions
 from coopenv.bench.executors import Executor
-from coopenv.bench.observers.basin import (
-    RADIUS,
-    Basin,
-    Draw,
-    basin_failures,
-    basin_table,
-    basins_of,
-    study_basin,
-)
 from coopenv.bench.observers.comparison import Comparison, Plan
+from coopenv.bench.observers.convergence import RADIUS, basin_failures, study_basin
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.figures import basin_figure, chart_data, page_file, plotly
-from coopenv.bench.observers.rows import Row, spread
-from coopenv.bench.observers.tables import BOUNDS, Leaderboard, csv_text, failures, headline, honest_line, quality
+from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file
+from coopenv.bench.observers.rows import BOUNDS, Leaderboard, Row, spread
+from coopenv.bench.observers.tables import csv_text, failures, headline, honest_line, quality
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
@@ -60,32 +52,17 @@ class Request(NamedTuple):
     """Whether the content of `leaderboard.json` is printed in place of the tables."""
 
 
-class Found(NamedTuple):
-    """The results of a request."""
-
-    comparison: Comparison
-    draws: list[Draw]
-    basins: list[Basin]
-
-    def document(self, command: str) -> dict[str, Any]:
-        """Return the content of `leaderboard.json`."""
-        packages, board = versions("coopenv", "numpy", "scipy", "warp-lang"), self.comparison
-        content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
-        content["windows"] = board.window_rows
-        return dict(jsonable(content | ({"basin": self.basins} if self.basins else {})))
-
-
 def perform(request: Request, executor: Executor, printed: Console, log: Console) -> None:
     """Compare, print the tables (or JSON) and write the files.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    plan, out = request.plan, request.out
+    plan, out, found = request.plan, request.out, None
     wanted = figure_files(plan.variants, request.figures)
     if wanted and out is None:
         raise CoopenvError(f"--figures {request.figures}: figures need a folder, --out DIR")
-    found, names = None, [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
+    names = [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
@@ -95,34 +72,33 @@ def perform(request: Request, executor: Executor, printed: Console, log: Console
                 names = sorted(path.name for path in folder.iterdir())
     finally:  # hours of work are printed even if they cannot be written
         if found is not None and request.as_json:
-            sys.stdout.write(json_text(found.document(request.command)))
+            sys.stdout.write(json_text(document(found, request.command)))
         elif found is not None:
-            print_tables(found, printed)
+            printed.print(found)
     if out is not None and not request.as_json:
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
 
-def _compare(request: Request, executor: Executor, log: Console) -> Found:
-    plan, draws = request.plan, []
+def _compare(request: Request, executor: Executor, log: Console) -> Comparison:
+    plan = request.plan
     for name, reason in plan.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     with Progress(log, plan.work, total=1.0) as progress:
         comparison = plan.run(executor, progress.update)
-    if request.basin:
-        work = f"{len(plan.observers)} observers, {request.basin} initial estimates"
-        with Progress(log, work, total=1.0) as progress:
-            draws = study_basin(plan.source, plan.observers, request.basin, executor, progress.update)
-    return Found(comparison, draws, basins_of(plan.source.name, draws))
+    if not request.basin:
+        return comparison
+    work = f"{len(plan.observers)} observers, {request.basin} initial estimates"
+    with Progress(log, work, total=1.0) as progress:
+        draws = study_basin(plan.source, plan.observers, request.basin, executor, progress.update)
+    return replace(comparison, draws=draws)
 
 
-def print_tables(found: Found, printed: Console) -> None:
-    """Print the tables of the comparison and of the basins, and the failures."""
-    printed.print(found.comparison)
-    if found.basins:
-        printed.print()
-        printed.print(basin_table(found.basins))
-    for line in basin_failures(found.basins):
-        printed.print(line, soft_wrap=True)
+def document(board: Leaderboard, command: str) -> dict[str, Any]:
+    """Return the content of `leaderboard.json`."""
+    packages = versions("coopenv", "numpy", "scipy", "warp-lang")
+    content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
+    content["windows"] = board.window_rows
+    return dict(jsonable(content | ({"basin": board.basins} if board.basins else {})))
 
 
 def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[str, str]]:
@@ -141,23 +117,18 @@ def _as_file(variant: str) -> str:
 
 
 def write_files(
-    found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]], width: str | None = None
+    board: Comparison, command: str, out: Path, figures: Mapping[str, tuple[str, str]], width: str | None
 ) -> None:
     """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
-    from coopenv.bench.observers.figures import KINDS
-
-    comparison, draws, basins = found
-    content = found.document(command)
-    texts = {JSON_FILE: json_text(content), CSV_FILE: comparison.to_csv()}
-    texts[WINDOWS_FILE] = csv_text(comparison.window_rows)
-    texts |= {BASIN_FILE: csv_text(draws)} if draws else {}
-    texts[LATEX_FILE] = comparison.to_latex()
-    texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
+    content = document(board, command)
+    texts = {JSON_FILE: json_text(content), CSV_FILE: board.to_csv(), WINDOWS_FILE: csv_text(board.window_rows)}
+    texts |= {BASIN_FILE: csv_text(board.draws)} if board.draws else {}
+    texts |= {LATEX_FILE: board.to_latex(), REPORT_FILE: report_text(board, content)}
     for name, text in texts.items():
         replace_text(out / name, text)
     for name, (kind, variant) in figures.items():
-        if KINDS[kind](comparison, variant, None) is not None:
-            comparison.figure(kind, variant=variant, width=width, path=out / name)
+        if KINDS[kind](board, variant, None) is not None:
+            board.figure(kind, variant=variant, width=width, path=out / name)
 
 
 MOST_BYTES = 1_950_000
@@ -166,45 +137,32 @@ _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 """A coordinate of a line in SVG, of which hundredths of a point are enough."""
 
 
-def report_text(
-    board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw] = (), basins: Sequence[Basin] = ()
-) -> str:
+def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
     """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
-    text = _rendered(board, content, draws, basins, with_rows=True)
-    return text if len(text.encode()) < MOST_BYTES else _rendered(board, content, draws, basins, with_rows=False)
-
-
-def _rendered(
-    board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw], basins: Sequence[Basin], with_rows: bool
-) -> str:
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
-    return (
-        _environment(board)
-        .get_template("report.html.j2")
-        .render(
-            board=board,
-            with_rows=with_rows,
-            headline=headline(board),
-            data=chart_data(board),
-            plotly=plotly(),
-            charts=Markup(page_file("charts.js").decode()),
-            content=content,
-            vehicles=board.samples[0].scene.vehicles,
-            boards=variants[:1] if nominal else variants,  # faults have one table
-            variants=variants,
-            nominal=nominal,
-            honest=honest_line(board.rows),
-            failures=failures(board.rows),
-            basins=basins,
-            basin_failures=basin_failures(basins),
-            basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
-            radius=RADIUS,
-            tolerance=CONVERGED.text,
-            columns=[f.name for f in fields(Row) if f.name not in ("environment", "failure")],
-            definitions={f.name: f.metadata["meaning"] for f in fields(Row)},
-        )
-    )
+    values: dict[str, Any] = {
+        "board": board,
+        "headline": headline(board),
+        "data": chart_data(board),
+        "plotly": packed(page_file(PLOTLY)),
+        "charts": Markup(page_file("charts.js").decode()),
+        "content": content,
+        "boards": variants[:1] if nominal else variants,  # faults have one table
+        "variants": variants,
+        "nominal": nominal,
+        "honest": honest_line(board.rows),
+        "failures": failures(board.rows),
+        "basin_failures": basin_failures(board.basins),
+        "basin_map": _svg(basin_figure(board)) if board.draws else "",
+        "radius": RADIUS,
+        "tolerance": CONVERGED.text,
+        "columns": [f.name for f in fields(Row) if f.name not in ("environment", "failure")],
+        "definitions": {f.name: f.metadata["meaning"] for f in fields(Row)},
+    }
+    template = _environment(board).get_template("report.html.j2")
+    text = template.render(values, with_rows=True)
+    return text if len(text.encode()) < MOST_BYTES else template.render(values, with_rows=False)
 
 
 def _environment(board: Leaderboard) -> Environment:
@@ -212,6 +170,7 @@ def _environment(board: Leaderboard) -> Environment:
         loader=PackageLoader("coopenv.bench.observers", "page"), autoescape=True, undefined=StrictUndefined
     )
     environment.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
+    environment.globals["spread"] = spread
     environment.filters["append"] = lambda text, more: text + more
     return environment
 
@@ -231,18 +190,7 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
             }
             for observer in board.ranked
         },
-        "windows": {observer: _windows(board, name, observer) for observer in board.ranked},
     }
-
-
-def _windows(board: Leaderboard, variant: str, observer: str) -> list[dict[str, Any]]:
-    """Return what the template shows of one observer by window; the steady state alone is no table."""
-    found = [(window, board.windows_in(variant, observer, window)) for window in board.windows]
-    columns = ("ratio_to_bound_ancestors", "anees")
-    return [
-        {"name": window.name, "rows": rows, **{column: spread(rows, column) for column in columns}}
-        for window, rows in (found if len(found) > 1 else ())
-    ]
 
 
 def _breakable(name: str) -> Markup:

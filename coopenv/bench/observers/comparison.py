@@ -17,9 +17,8 @@ from coopenv.base.files import replace_text
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import Task, judge
-from coopenv.bench.observers.rows import EDGES, Row, WindowRow, checked_edges
+from coopenv.bench.observers.rows import EDGES, Leaderboard, Row, WindowRow, checked_edges
 from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
-from coopenv.bench.observers.tables import Leaderboard
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
 from coopenv.runs.console import Progress

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,6 @@ from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.scenario.sensing import LONGEST_REPLAY
 
 if TYPE_CHECKING:
-    from coopenv.observers.interference import Interference
     from coopenv.observers.recording import Recording
 
 NOMINAL = "nominal"
@@ -34,7 +34,7 @@ def with_loss(recording: Recording, probability: float, seed: int = 0) -> Record
     """Lose each message, per receiver, with a probability in [0, 1]; the last received message stays known."""
     inbox = recording.inbox_tick
     news = np.diff(inbox, axis=0, prepend=-1) > 0
-    kept = news & (_generator(seed, 1).random(inbox.shape) >= probability)
+    kept = news & (np.random.default_rng([seed, 1]).random(inbox.shape) >= probability)
     return changed(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
 
 
@@ -53,7 +53,7 @@ def with_wrong_association(recording: Recording, share: float, seed: int = 0) ->
     it is part of one with (nearly) the whole. A frame with a single bearing stays as it is.
     """
     bearings = recording.bearings.copy()
-    generator = _generator(seed, 2)
+    generator = np.random.default_rng([seed, 2])
     starts = recording.visible & (generator.random(recording.visible.shape) < share / 2)
     partners = generator.random(recording.visible.shape)
     for k, i, target in np.argwhere(starts):
@@ -76,37 +76,49 @@ def without_landmarks(recording: Recording, start: float, duration: float) -> Re
 
 def with_lie(recording: Recording, fault: Fault) -> Recording:
     """Let vehicles broadcast another pose, as `[faults.lie]` of a scenario does; default: the usual sender."""
-    names = [setup.name for setup in recording.setups]
-    senders = [names.index(name) for name in fault.vehicles] or [usual_sender(recording)]
-    first = math.ceil(fault.start_in(float(recording.t[-1])) / recording.dt - 1e-6)
-    since = np.arange(recording.ticks) - first
-    lying = since >= 0
-    false = recording.interference or _honest(recording)
-    shift, std, replay, kept = false.shift.copy(), false.std.copy(), false.replay.copy(), false.kept.copy()
-    for sender in senders:
-        if fault.word == "replay":
-            period = recording.period
-            kept[sender] = period * max(1, round(fault.value / (recording.dt * period)))
-            replay[lying, sender] = kept[sender]
-        else:
-            size = fault.value * (since * recording.dt if fault.word == "drift" else np.ones(len(since)))
-            shift[lying, sender] += (size[:, None] * DIRECTION)[lying]
-        if "std" in fault.options:
-            std[lying, sender] = fault.options["std"]
-    return replace(recording, interference=replace(false, shift=shift, std=std, replay=replay, kept=kept))
-
-
-def _honest(recording: Recording) -> Interference:
-    """Return no interference, in arrays of a recording's size."""
     from coopenv.observers.interference import Interference
 
-    K, N = recording.ticks, len(recording.setups)
-    vectors, zeros = np.zeros((K, N, 3)), np.zeros((K, N), np.int64)
-    none = zeros[0].copy()
-    return Interference(vectors, vectors.copy(), np.zeros((K, N)), zeros, none, np.zeros((K, N), bool), none.copy())
+    names, period = [setup.name for setup in recording.setups], recording.period
+    K, N = recording.ticks, len(names)
+    senders = [names.index(name) for name in fault.vehicles] or [usual_sender(recording)]
+    since = np.arange(K) - math.ceil(fault.start_in(float(recording.t[-1])) / recording.dt - 1e-6)
+    lying = since >= 0
+    false = deepcopy(recording.interference) or Interference(
+        shift=np.zeros((K, N, 3)),
+        turn=np.zeros((K, N, 3)),
+        std=np.zeros((K, N)),
+        replay=np.zeros((K, N), np.int64),
+        clock=np.zeros(N, np.int64),
+        restarts=np.zeros((K, N), bool),
+        kept=np.zeros(N, np.int64),
+    )
+    for sender in senders:
+        if fault.word == "replay":
+            false.kept[sender] = period * max(1, round(fault.value / (recording.dt * period)))
+            false.replay[lying, sender] = false.kept[sender]
+        else:
+            size = fault.value * (since * recording.dt if fault.word == "drift" else np.ones(K))
+            false.shift[lying, sender] += (size[:, None] * DIRECTION)[lying]
+        if "std" in fault.options:
+            false.std[lying, sender] = fault.options["std"]
+    return replace(recording, interference=false)
 
 
-def usual_sender(recording: Recording) -> int:
+NO_FOLLOWERS = "no vehicle has another one as its neighbour"
+
+
+def leaders_of(world: Recording | Scenario) -> list[int]:
+    """Return the vehicles, in the order of estimation, that another one has as its neighbour."""
+    sets: Sequence[Any]
+    if isinstance(world, Scenario):
+        sets, landmarks = neighbour_sets(world), len(world.landmarks)
+        order: Iterable[int] = processing_order(world, sets)
+    else:
+        sets, landmarks, order = [setup.targets for setup in world.setups], world.setups[0].landmarks, world.order
+    return [i for i in order if any(landmarks + i in targets for targets in sets)]
+
+
+def usual_sender(world: Recording | Scenario) -> int:
     """Return the second vehicle, in the order of estimation, that has followers, or the only one.
 
     The first one is mostly seen by vehicles that see the landmarks, too.
@@ -114,18 +126,10 @@ def usual_sender(recording: Recording) -> int:
     Raises:
         CoopenvError: no vehicle has followers.
     """
-    leaders = [i for i in recording.order if followers(recording, i)]
+    leaders = leaders_of(world)
     if not leaders:
         raise CoopenvError(NO_FOLLOWERS)
     return leaders[min(1, len(leaders) - 1)]
-
-
-NO_FOLLOWERS = "no vehicle has another one as its neighbour"
-
-
-def followers(recording: Recording, vehicle: int) -> list[int]:
-    """Return the vehicles that have this one as a neighbour."""
-    return [i for i, setup in enumerate(recording.setups) if setup.landmarks + vehicle in setup.targets]
 
 
 @dataclass(frozen=True)
@@ -137,24 +141,15 @@ class RecordFault(FaultKind):
 
 @dataclass(frozen=True)
 class WorldFault(FaultKind):
-    """A fault of simulated environments: keys of a vehicle in the scenario, by section."""
+    """A fault of simulated environments: keys of a vehicle in the scenario."""
 
-    section: str = ""
     key: str = ""
-    """Of the value."""
-    start_key: str = ""
-    option_keys: Mapping[str, str] | None = None
-    constants: Mapping[str, Any] | None = None
+    """Of the value; start and options are keys of the same section."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Those keys that are not called like the option, or `start`."""
     vehicles: bool = True
     of_one: bool = False
     """Whether the usual sender alone has the fault by default; else all vehicles."""
-
-    def keys_of(self, fault: Fault, horizon: float) -> dict[str, Any]:
-        """Return the keys of the section; the horizon is in s."""
-        keys = dict(self.constants or {})
-        keys |= {self.key: fault.value} if self.key else {}
-        keys |= {self.start_key: fault.start_in(horizon)} if self.start_key else {}
-        return keys | {(self.option_keys or {}).get(name, name): value for name, value in fault.options.items()}
 
 
 FAULTS: dict[str, RecordFault | WorldFault] = {
@@ -188,37 +183,28 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         vehicles=True,
         change=lambda r, f, seed: with_lie(r, f),
     ),
-    "odometry_scale": WorldFault("STD", "of the odometry's scale error", section="noise", key="odometry_scale"),
-    "gyro_bias": WorldFault("STD", "of the gyro's bias per axis, rad/s", section="noise", key="gyro_bias"),
+    "odometry_scale": WorldFault("STD", "of the odometry's scale error", key="noise.odometry_scale"),
+    "gyro_bias": WorldFault("STD", "of the gyro's bias per axis, rad/s", key="noise.gyro_bias"),
     "slip": WorldFault(
-        "RATE",
-        "at which wheels begin to slip, 1/s",
-        section="noise.slip",
-        key="rate",
-        options=("duration", "size", "angle"),
+        "RATE", "at which wheels begin to slip, 1/s", options=("duration", "size", "angle"), key="noise.slip.rate"
     ),
     "extrinsics": WorldFault(
         "STD",
         "per axis of the rotation of the true camera against the nominal one, rad; position: likewise, m",
-        section="camera",
-        key="extrinsics_error",
         options=("position",),
-        option_keys={"position": "extrinsics_position_error"},
+        key="camera.extrinsics_error",
+        renamed={"position": "extrinsics_position_error"},
     ),
-    "focal_length": WorldFault(
-        "STD", "of the focal length's error, relative", section="camera", key="focal_length_error"
-    ),
-    "clock": WorldFault("STD", "of the clocks' offset, s", section="faults", key="clock_offset"),
+    "focal_length": WorldFault("STD", "of the focal length's error, relative", key="camera.focal_length_error"),
+    "clock": WorldFault("STD", "of the clocks' offset, s", key="faults.clock_offset"),
     "restart": WorldFault(
         "",
         "at START a vehicle's observer loses its state and starts anew",
-        0.0,
+        1.0,
         start=True,
-        section="faults.restart",
-        start_key="time",
         options=("spread",),
-        option_keys={"spread": "time_spread"},
-        constants={"chance": 1.0},
+        key="faults.restart.chance",
+        renamed={"start": "time", "spread": "time_spread"},
         of_one=True,
     ),
     "corruption": WorldFault(
@@ -226,10 +212,8 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "that a message's pose is altered on the way",
         high=1.0,
         start=True,
-        section="faults.corruption",
-        key="probability",
-        start_key="start",
         options=("size", "turn"),
+        key="faults.corruption.probability",
     ),
 }
 """By name."""
@@ -247,7 +231,12 @@ class FaultVariant:
     @property
     def summary(self) -> str:
         """Its faults in words."""
-        return "; ".join(f"{fault.text}: {_in_words(fault)}" for fault in self.faults) or "as simulated"
+        words = []
+        for fault in self.faults:
+            kind = FAULTS[fault.name]
+            meaning = kind.meaning.partition(": ")[0]
+            words.append(f"{fault.text}: {meaning if kind.words else f'{kind.value.lower()} {meaning}'.strip()}")
+        return "; ".join(words) or "as simulated"
 
     @property
     def needs_followers(self) -> bool:
@@ -261,12 +250,6 @@ class FaultVariant:
             if isinstance(kind, RecordFault):
                 recording = kind.change(recording, fault, seed)
         return recording
-
-
-def _in_words(fault: Fault) -> str:
-    kind = FAULTS[fault.name]
-    meaning = kind.meaning.partition(": ")[0]
-    return meaning if kind.words else f"{kind.value.lower()} {meaning}".strip()
 
 
 def variant_of(text: str, name: str = "") -> FaultVariant:
@@ -356,31 +339,29 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
         overrides: these.
 
     Raises:
-        CoopenvError: as for `overrides_of`, or a value is not possible.
-    """
-    keys = overrides_of(variant, scenario)
-    return replace(variant, scenario=load_scenario(text, {**overrides, **keys})) if keys else variant
-
-
-def overrides_of(variant: FaultVariant, scenario: Scenario) -> dict[str, Any]:
-    """Return the dotted keys of a scenario that realise a variant's faults.
-
-    Raises:
-        CoopenvError: unknown vehicle, no followers, or errors of sensors without noise.
+        CoopenvError: unknown vehicle, no followers, errors of sensors without noise, or a value is not possible.
     """
     found: dict[str, Any] = {}
     for fault in variant.faults:
-        kind = FAULTS[fault.name]
+        kind, names = FAULTS[fault.name], fault.vehicles or scenario.vehicle_names
         check_vehicles(fault, scenario.vehicle_names)
         if not isinstance(kind, WorldFault):
             continue
-        for name in fault.vehicles or (_usual_sender(fault, scenario) if kind.of_one else scenario.vehicle_names):
-            noisy = scenario.noises[scenario.vehicle_names.index(name)].enabled
-            if kind.section.partition(".")[0] in ("noise", "camera") and not noisy:
+        if kind.of_one and not fault.vehicles:
+            if not leaders_of(scenario):
+                raise CoopenvError(f"fault {fault.text}: {NO_FOLLOWERS}; name one, VEHICLE:{fault.text}")
+            names = [scenario.vehicle_names[usual_sender(scenario)]]
+        section, _, key = kind.key.rpartition(".")
+        start = {"start": fault.start_in(scenario.horizon)} if kind.start else {}
+        given = {kind.renamed.get(k, k): value for k, value in {key: fault.value, **start, **fault.options}.items()}
+        for name in names:
+            if (
+                section.startswith(("noise", "camera"))
+                and not scenario.noises[scenario.vehicle_names.index(name)].enabled
+            ):
                 raise CoopenvError(f"fault {fault.text}: needs noise.enabled = true, which is off")
-            keys = kind.keys_of(fault, scenario.horizon)
-            found |= {f"vehicles.{name}.{kind.section}.{key}": value for key, value in keys.items()}
-    return found
+            found |= {f"vehicles.{name}.{section}.{k}": value for k, value in given.items()}
+    return replace(variant, scenario=load_scenario(text, {**overrides, **found})) if found else variant
 
 
 def check_vehicles(fault: Fault, names: Iterable[str]) -> None:
@@ -399,19 +380,6 @@ def check_recorded(variant: FaultVariant, recording: Recording) -> None:
         if isinstance(FAULTS[fault.name], WorldFault):
             raise CoopenvError(f"fault {fault.text}: is of a simulated world, this one is recorded")
         check_vehicles(fault, [setup.name for setup in recording.setups])
-
-
-def _usual_sender(fault: Fault, scenario: Scenario) -> tuple[str, ...]:
-    """Return the name of the vehicle of `usual_sender`."""
-    sets, L = neighbour_sets(scenario), len(scenario.landmarks)
-    leaders = [i for i in processing_order(scenario, sets) if any(L + i in targets for targets in sets)]
-    if not leaders:
-        raise CoopenvError(f"fault {fault.text}: {NO_FOLLOWERS}; name one, VEHICLE:{fault.text}")
-    return (scenario.vehicle_names[leaders[min(1, len(leaders) - 1)]],)
-
-
-def _generator(seed: int, stream: int) -> np.random.Generator:
-    return np.random.default_rng([seed, stream])
 
 
 def changed(recording: Recording, **arrays: Any) -> Recording:

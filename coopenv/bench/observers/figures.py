@@ -21,11 +21,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from coopenv.base.format import jsonable, number
-from coopenv.bench.observers.basin import ANGLE_BINS, RADIUS, Draw, basins_of, by_angle
+from coopenv.bench.observers.convergence import ANGLE_BINS, RADIUS, Draw, by_angle
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import Sample
-from coopenv.bench.observers.rows import FAILED, mean_of, short_name
-from coopenv.bench.observers.tables import BOUNDS, Leaderboard
+from coopenv.bench.observers.rows import BOUNDS, Leaderboard
+from coopenv.bench.observers.tables import FAILED, mean_of, short_name
 from coopenv.estimation.metrics import mean_bounds, wilson_interval
 from coopenv.estimation.poses import Array
 from coopenv.viz import style
@@ -255,11 +255,6 @@ def packed(data: bytes) -> str:
     return b64encode(data).decode()
 
 
-def plotly() -> str:
-    """Return plotly.js, packed."""
-    return packed(page_file(PLOTLY))
-
-
 def chart_data(board: Leaderboard) -> str:
     """Return the data of all charts, packed."""
     text = json.dumps(jsonable(_document(board)), separators=(",", ":"))
@@ -327,16 +322,20 @@ def _short(values: Array) -> list[float]:
 _PANEL, _BASIN_MARGIN = 2.6, 0.6  # inches
 
 
-def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = None) -> Figure:
+def basin_figure(board: Leaderboard, width: float | None = None) -> Figure:
     """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
-    basins = basins_of(environment, draws)
+    basins = board.basins
     columns = style.fitting(width or style.PAGE, 3.0, min(3, len(basins)))
     rows = -(-len(basins) // columns)
     figure, _ = style.canvas(
-        width, _BASIN_MARGIN + _PANEL * rows, f"{environment}, {basins[0].draws} initial estimates"
+        width, _BASIN_MARGIN + _PANEL * rows, f"{board.environment}, {basins[0].draws} initial estimates"
     )
-    for n, ((cloud, bars), basin) in enumerate(zip(_pairs(figure, rows, columns, len(basins)), basins, strict=True)):
-        own = [draw for draw in draws if draw.observer == basin.observer]
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[2, 1] * rows)
+    for n, basin in enumerate(basins):
+        y, x = divmod(n, columns)
+        cloud = figure.add_subplot(grid[2 * y, x])
+        bars = figure.add_subplot(grid[2 * y + 1, x], sharex=cloud)
+        own = [draw for draw in board.draws if draw.observer == basin.observer]
         _draw_cloud(cloud, own, first=n % columns == 0)
         _draw_shares(bars, own, first=n % columns == 0)
         low, high = (100 * end for end in basin.interval)
@@ -348,15 +347,6 @@ def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = 
     ]
     style.legend_above(figure, handles)
     return figure
-
-
-def _pairs(figure: Figure, rows: int, columns: int, count: int) -> list[tuple[Axes, Axes]]:
-    """Return the two axes of every panel, one above the other."""
-    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[2, 1] * rows)
-    places = [divmod(n, columns) for n in range(count)]
-    clouds = [figure.add_subplot(grid[2 * y, x]) for y, x in places]
-    bars = [figure.add_subplot(grid[2 * y + 1, x], sharex=clouds[n]) for n, (y, x) in enumerate(places)]
-    return list(zip(clouds, bars, strict=True))
 
 
 def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:

@@ -1,11 +1,11 @@
 """One record, judged: the errors of every observer against the truth and the bounds."""
 
-from collections import OrderedDict
+import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from coopenv.bench.observers.sources import Source
 from coopenv.estimation.metrics import (
     CONVERGED,
     SETTLED,
-    SettlingTolerance,
     absolute_error,
     diverged,
     fit_exponential_rate,
@@ -55,22 +54,28 @@ def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[
     return (*between, Window(steady_from, end, steady=True))
 
 
+BOUNDS = ("joint", "ancestors", "alone")
+"""Bounds of a vehicle's position: joint over all vehicles, over it and its ancestors, and with known neighbours."""
+
+
 @dataclass(frozen=True)
 class Scene:
-    """Properties of the record, the same for all observers; arrays (N,), NaN where unknown."""
+    """Properties of the record, the same for all observers; NaN where unknown."""
 
     vehicles: tuple[str, ...]
-    bound_mse: Array  # m^2 in the steady state: joint over all vehicles,
-    bound_ancestors_mse: Array  # joint over a vehicle and its ancestors,
-    bound_single_mse: Array  # and alone with known neighbours
-    gramian: Array  # smallest eigenvalue over the run, as in the theorem: about the map origin, mixed units
-    gramian_local: Array  # the same about the vehicle, without unit
-    steady_from: float  # s
+    windows: tuple[Window, ...]  # W stretches that are judged one by one, the steady state last
+    bounds: Array  # (3, N, W) m^2, those of `BOUNDS` in each window
+    gramians: (
+        Array  # (2, N) least eigenvalues over the run: about the map origin, mixed units; about the vehicle, no unit
+    )
     t: Array  # (S,) s
     bound: Array  # (S, N) m, joint
     paper_noise: bool  # bearings are noisy on the image plane, and so less than the bound assumes off the optical axis
-    windows: tuple[Window, ...]  # W stretches that are judged one by one, the steady state last
-    window_bound_mse: Array  # (N, W) m^2, joint over a vehicle and its ancestors
+
+    @property
+    def steady_from(self) -> float:
+        """Start of the steady state, s."""
+        return self.windows[-1].start
 
 
 class Series(NamedTuple):
@@ -89,27 +94,24 @@ class Sample:
     observer: str
     scene: Scene
     measures: Mapping[str, Array]
-    """Arrays (N,) by name, (N, W) in windows, see `judge`; none where it failed."""
-    bytes_per_s: Array
-    us_per_update: Array
+    """Arrays (N,) by name, those of `IN_WINDOWS` (N, W), see `_measures`; costs alone where it failed."""
     nees_dof: int
     failure: str
     series: Series
 
-    def measured(self, name: str, vehicles: int | slice = slice(None)) -> Any:
-        """Return what was measured of some vehicles; NaN where the observer failed, which has diverged."""
-        nothing = np.full(len(self.scene.vehicles), 1.0 if name == "diverged" else np.nan)
-        return self.measures.get(name, nothing)[vehicles]
-
-    def in_windows(self, name: str) -> Array:
-        """Return (N, W) what was measured in each window of the scene; NaN where the observer failed."""
-        return self.measures.get(name, np.full((len(self.scene.vehicles), len(self.scene.windows)), np.nan))
+    def measured(self, name: str) -> Array:
+        """Return what was measured of the vehicles; NaN where the observer failed, which has diverged."""
+        if name in self.measures:
+            return self.measures[name]
+        shape = (len(self.scene.vehicles), len(self.scene.windows))
+        return np.full(shape if name in IN_WINDOWS else shape[:1], 1.0 if name == "diverged" else np.nan)
 
 
+IN_WINDOWS = ("position_mse", "anees")
 SERIES_TICKS = 250  # instants that are kept for figures
 MOST_KEPT = 2  # bounds of records; those of many vehicles take minutes, and often every seed has the same
 
-_kept: OrderedDict[bytes, list[Bound]] = OrderedDict()
+_kept: dict[bytes, list[Bound]] = {}
 
 
 def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = ()) -> Scene:
@@ -117,28 +119,21 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
 
     The noise of recorded robots is not known, and so neither is their bound.
     """
-    N = len(recording.setups)
-    kept, unknown = kept_ticks(recording), np.full(N, np.nan)
+    names = tuple(setup.name for setup in recording.setups)
+    kept, known = kept_ticks(recording), bool(recording.truth.known.all())
     windows = windows_of(edges, steady_from, float(recording.t[-1]))
-    known = bool(recording.truth.known.all())
-    bounds: list[Bound] = []
+    within = np.full((len(BOUNDS), len(names), len(windows)), np.nan)
+    bound, gramians = np.full((len(kept), len(names)), np.nan), np.full((2, len(names)), np.nan)
     if known and not any(setup.planar for setup in recording.setups):
         bounds = _bounds(recording)
-    steady = recording.t > steady_from
-    mse = [np.mean(bound.position[steady] ** 2, axis=0) for bound in bounds] or [unknown] * 3
-    within = np.full((N, len(windows)), np.nan)
-    if bounds:
-        within = np.array([_mean(bounds[1].position[w.ticks(recording.t)] ** 2) for w in windows]).T
-    gramians = [unknown, unknown]
+        bound = bounds[0].position[kept]
+        ticks = [window.ticks(recording.t) for window in windows]
+        within = np.array([[_mean(of.position[chosen] ** 2) for chosen in ticks] for of in bounds]).swapaxes(1, 2)
     if known:
         seen = analyse_observability(_Geometry(recording))
-        gramians = [values.min(axis=0, initial=np.inf) for values in (seen.min_eigenvalue, seen.local_eigenvalue)]
-    names = tuple(setup.name for setup in recording.setups)
-    bound = bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan)
+        gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    (joint, ancestors, single), (about_map, about_vehicle), t = mse, gramians, recording.t[kept]
-    judged = (steady_from, t, bound, paper_noise, windows, within)
-    return Scene(names, joint, ancestors, single, about_map, about_vehicle, *judged)
+    return Scene(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
 
 
 class _Geometry:
@@ -164,28 +159,21 @@ def _mean(values: Array) -> Array:
 
 
 def _bounds(recording: Recording) -> list[Bound]:
-    """Return the bounds joint over all, over ancestors, and alone; of a record that differs in noise alone at once."""
+    """Return the bounds of `BOUNDS`; of a record that differs from a recent one in noise alone, those of that one."""
     key = _fingerprint(recording)
-    if key in _kept:
-        _kept.move_to_end(key)
-        return _kept[key]
-    _kept[key] = [cramer_rao(recording), cramer_rao_ancestors(recording), cramer_rao(recording, joint=False)]
-    while len(_kept) > MOST_KEPT:
-        _kept.popitem(last=False)
+    if key not in _kept:
+        _kept[key] = [cramer_rao(recording), cramer_rao_ancestors(recording), cramer_rao(recording, joint=False)]
+        for old in list(_kept)[:-MOST_KEPT]:
+            del _kept[old]
     return _kept[key]
 
 
 def _fingerprint(recording: Recording) -> bytes:
     """Return a digest of everything that bounds depend on: truth, visibility, noise, and what is known at the start."""
-    r, digest = recording, sha256()
-    for setup in r.setups:
-        digest.update(repr((setup.noise, setup.landmarks)).encode())
-        for part in (setup.targets, setup.marker, setup.lever_arm):
-            digest.update(np.ascontiguousarray(part).tobytes())
-    for array in (r.truth.rotation, r.truth.position, r.visible, r.landmarks, r.due, r.start_covariance):
-        digest.update(repr((array.shape, r.dt)).encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.digest()
+    r = recording
+    setups = [(s.noise, s.landmarks, s.targets, s.marker, s.lever_arm) for s in r.setups]
+    arrays = (r.truth.rotation, r.truth.position, r.visible, r.landmarks, r.due, r.start_covariance)
+    return sha256(pickle.dumps((r.dt, setups, arrays))).digest()
 
 
 RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory error
@@ -218,58 +206,48 @@ def judge(task: Task) -> list[Sample]:
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
     """Judge one run. Where it failed, everything but its costs is NaN."""
-    if result.failure:
-        measures, series = {}, Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
-    else:
-        measures, series = _measures(scene, recording, result), _series(recording, result)
-    costs = result.bytes_per_second, result.microseconds_per_update
-    return Sample(variant, observer, scene, measures, *costs, result.nees_dof, result.failure, series)
+    series = Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
+    measures = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
+    if not result.failure:
+        kept = kept_ticks(recording)
+        std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
+        measures |= _measures(scene, recording, result)
+        series = Series(result.position_error[kept], std, result.nees[kept])
+    return Sample(variant, observer, scene, measures, result.nees_dof, result.failure, series)
 
 
 def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Array]:
     """Return the figures of a run that did not fail; m and deg and their squares, s, 1/s; NIS summed over time."""
-    steady = result.t > scene.steady_from
-    known = np.where(steady[:, None], result.nis_dof, 0)
-    vehicles = range(len(scene.vehicles))
-    relative = np.array([_relative(recording, result, i) for i in vehicles]).T
     windows = [window.ticks(result.t) for window in scene.windows]
-    return {
-        "position_mse": result.mean(result.position_error**2, steady),
-        "orientation_mse": result.mean(result.orientation_error**2, steady),
-        "anees": result.mean(result.nees, steady) / result.nees_dof,
-        "window_mse": np.array([result.mean(result.position_error**2, ticks) for ticks in windows]).T,
-        "window_anees": np.array([result.mean(result.nees, ticks) for ticks in windows]).T / result.nees_dof,
-        "nis": np.where(known > 0, result.nis, 0.0).sum(axis=0),
-        "nis_dof": known.sum(axis=0).astype(float),
-        "settle_time": np.array([_settling(result, i, SETTLED) for i in vehicles]),
-        "converge_time": np.array([_settling(result, i, CONVERGED) for i in vehicles]),
-        "rate": np.array([_rate(result, i) for i in vehicles]),
-        "diverged": diverged(_last(result.position_error), _last(result.orientation_error)),
-        "ate": np.array([absolute_error(recording.truth.position[:, i], result.position[:, i]) for i in vehicles]),
-        "rpe": relative[0],
-        "rpe_orientation": relative[1],
+    dof = np.where(windows[-1][:, None], result.nis_dof, 0)
+    errors = result.position_error, result.orientation_error
+    figures = {
+        "position_mse": np.array([result.mean(errors[0] ** 2, ticks) for ticks in windows]).T,
+        "orientation_mse": result.mean(errors[1] ** 2, windows[-1]),
+        "anees": np.array([result.mean(result.nees, ticks) for ticks in windows]).T / result.nees_dof,
+        "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
+        "nis_dof": dof.sum(axis=0).astype(float),
+        "diverged": diverged(*map(_last, errors)),
     }
+    single = [_vehicle_measures(recording, result, i) for i in range(len(scene.vehicles))]
+    return figures | {name: np.array([found[name] for found in single]) for name in single[0]}
 
 
-def _relative(recording: Recording, result: Run, i: int) -> tuple[float, float]:
-    """Return the relative trajectory error of one vehicle, m and deg."""
-    delta, truth = max(1, round(RELATIVE_DELTA / recording.dt)), recording.truth
+def _vehicle_measures(recording: Recording, result: Run, i: int) -> dict[str, float]:
+    """Return the figures of one vehicle over the whole run; times and rates are judged where the truth is known."""
+    judged, truth = result.judged[:, i], recording.truth
+    t, position, orientation = (
+        a[judged] for a in (result.t, result.position_error[:, i], result.orientation_error[:, i])
+    )
+    settled, converged, rate = np.nan, np.nan, np.nan
+    if judged.any():
+        settled, converged = (float(settling_time(t, position, orientation, below)) for below in (SETTLED, CONVERGED))
+        rate = fit_exponential_rate(t, position).rate
     poses = truth.rotation[:, i], truth.position[:, i], result.rotation[:, i], result.position[:, i]
-    return relative_error(*poses, delta)
-
-
-def _settling(result: Run, i: int, tolerance: SettlingTolerance) -> float:
-    """Return when one vehicle settles, s, judged where the truth is known."""
-    judged = result.judged[:, i]
-    if not judged.any():
-        return float("nan")
-    errors = result.position_error[judged, i], result.orientation_error[judged, i]
-    return float(settling_time(result.t[judged], *errors, tolerance))
-
-
-def _rate(result: Run, i: int) -> float:
-    judged = result.judged[:, i]
-    return fit_exponential_rate(result.t[judged], result.position_error[judged, i]).rate if judged.any() else np.nan
+    relative = relative_error(*poses, max(1, round(RELATIVE_DELTA / recording.dt)))
+    ate = absolute_error(truth.position[:, i], result.position[:, i])
+    found = {"settle_time": settled, "converge_time": converged, "rate": rate, "ate": ate}
+    return found | {"rpe": relative.position, "rpe_orientation": relative.orientation}
 
 
 def _last(error: Array) -> Array:
@@ -277,9 +255,3 @@ def _last(error: Array) -> Array:
     known = np.isfinite(error)
     last = len(error) - 1 - np.argmax(known[::-1], axis=0)
     return np.asarray(error[last, np.arange(error.shape[1])])
-
-
-def _series(recording: Recording, result: Run) -> Series:
-    kept = kept_ticks(recording)
-    std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
-    return Series(result.position_error[kept], std, result.nees[kept])

@@ -1,21 +1,20 @@
-"""The leaderboard's rows: one observer, one vehicle, one variant, summed up over all seeds.
-
-Standard errors of root mean squares are to first order (delta method).
+"""The leaderboard's rows: one observer, one vehicle, one variant, one stretch of time, summed up over all seeds.
 
 Errors are held against the bound of the same stretch, so that a slow start counts where measurements allow a quick one.
 Standard errors are over the seeds; those of root mean squares to first order (delta method), the bound taken as exact.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.base.format import in_parentheses, number
+from coopenv.bench.observers.convergence import Basin, Draw, basins_of
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample, Window
 from coopenv.estimation.metrics import (
@@ -28,6 +27,61 @@ from coopenv.estimation.metrics import (
     mean_bounds,
 )
 from coopenv.estimation.poses import Array
+
+
+class Measured(NamedTuple):
+    """A figure and its standard error over the seeds; NaN where there is one seed."""
+
+    value: float
+    error: float
+
+
+UNKNOWN = Measured(math.nan, math.nan)
+NOWHERE = Interval(math.nan, math.nan)
+
+
+def mean_root(squares: Array) -> Measured:
+    """Return the mean over vehicles of the root of the mean over seeds, of mean squares (S, N).
+
+    Vehicles of one seed may depend on one another.
+    """
+    value, each = _linearised(squares)
+    return Measured(value, standard_error(each))
+
+
+def ratio(squares: Array, reference: Array) -> Measured:
+    """Return `mean_root(squares)` over `mean_root(reference)`, both (S, N) of the same seeds: errors partly cancel."""
+    (above, each_above), (below, each_below) = _linearised(squares), _linearised(reference)
+    if not below > 0.0:
+        return UNKNOWN
+    value = above / below
+    return Measured(value, value * standard_error(each_above / above - each_below / below) if above else 0.0)
+
+
+def standard_error(values: Array) -> float:
+    """Return the standard error of the mean of (S,) independent values, NaN of a single one."""
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else math.nan
+
+
+def _linearised(squares: Array) -> tuple[float, Array]:
+    """Return the mean root, and (S,) each seed's share in it: r = sqrt(m), dr = dm / (2 r)."""
+    roots = np.sqrt(squares.mean(axis=0))
+    return float(roots.mean()), (squares / np.where(roots > 0, 2.0 * roots, 1.0)).mean(axis=1)
+
+
+class Total(NamedTuple):
+    """One observer in one variant, over all vehicles and seeds; NaN where a run failed."""
+
+    rmse: Measured
+    """Position RMSE, m, its mean over the vehicles."""
+    degradation: Measured
+    """`rmse` over that of the nominal variant; NaN without one."""
+
+
+def total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: Any = slice(None), w: int = -1) -> Total:
+    """Sum up samples of the same seeds over vehicles, in the window `w`; without samples `nominal` nothing degrades."""
+    squares, reference = (np.array([s.measured("position_mse")[vehicles, w] for s in some]) for some in (own, nominal))
+    return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
 
 
 def _column(meaning: str) -> Any:
@@ -92,101 +146,24 @@ class Row:
     gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
 
 
-class Measured(NamedTuple):
-    """A figure and its standard error over the seeds; NaN where there is one seed."""
+def row_of(environment: str, own: Sequence[Sample], nominal: Sequence[Sample], i: int, w: int = -1) -> Row:
+    """Sum up samples of one observer in one variant over seeds, of vehicle `i` in window `w` (-1: the steady state).
 
-    value: float
-    error: float
-
-
-UNKNOWN = Measured(float("nan"), float("nan"))
-
-
-def mean_root(squares: Array) -> Measured:
-    """Return the mean over vehicles of the root of the mean over seeds, of mean squares (S, N).
-
-    Vehicles of one seed may depend on one another.
+    Columns that no `WindowRow` has are of the steady state or the whole run in any window.
     """
-    value, each = _linearised(squares)
-    return Measured(value, standard_error(each))
 
+    def seeds(name: str) -> Array:
+        values = np.array([sample.measured(name)[i] for sample in own], float)
+        return values[:, w] if values.ndim > 1 else values
 
-def ratio(squares: Array, reference: Array) -> Measured:
-    """Return `mean_root(squares)` over `mean_root(reference)`, both (S, N) of the same seeds: errors partly cancel."""
-    (above, each_above), (below, each_below) = _linearised(squares), _linearised(reference)
-    if not below > 0.0:
-        return UNKNOWN
-    value = above / below
-    return Measured(value, value * standard_error(each_above / above - each_below / below) if above else 0.0)
+    def root(name: str) -> float:
+        return float(np.sqrt(np.mean(seeds(name) ** 2)))
 
-
-def standard_error(values: Array) -> float:
-    """Return the standard error of the mean of (S,) independent values, NaN of a single one."""
-    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
-
-
-def _linearised(squares: Array) -> tuple[float, Array]:
-    """Return the mean root, and (S,) each seed's share in it: r = sqrt(m), dr = dm / (2 r)."""
-    roots = np.sqrt(squares.mean(axis=0))
-    return float(roots.mean()), (squares / np.where(roots > 0, 2.0 * roots, 1.0)).mean(axis=1)
-
-
-NOWHERE = Interval(float("nan"), float("nan"))
-
-
-class Total(NamedTuple):
-    """One observer in one variant, over all vehicles and seeds; NaN where a run failed."""
-
-    rmse: Measured
-    """Position RMSE, m, its mean over the vehicles."""
-    degradation: Measured
-    """`rmse` over that of the nominal variant; NaN without one."""
-
-
-def grouped(samples: Sequence[Sample]) -> dict[tuple[str, str], list[Sample]]:
-    """Return samples, which stand by variant and observer, by these."""
-    return {key: list(own) for key, own in groupby(samples, lambda sample: (sample.variant, sample.observer))}
-
-
-def mean_of(rows: Sequence[Row], column: str) -> float:
-    """Return the mean of a column."""
-    return float(np.mean([getattr(row, column) for row in rows]))
-
-
-def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
-    """Sum up samples over seeds, in the order of variants and observers in which they come."""
-    groups = grouped(samples)
-    return [
-        _row(environment, i, own, groups.get((NOMINAL, observer), []))
-        for (_, observer), own in groups.items()
-        for i in range(len(own[0].scene.vehicles))
-    ]
-
-
-def totals_of(samples: Sequence[Sample]) -> dict[tuple[str, str], Total]:
-    """Sum up samples over seeds and vehicles, by variant and observer."""
-    groups = grouped(samples)
-    return {key: _total(own, groups.get((NOMINAL, key[1]), [])) for key, own in groups.items()}
-
-
-def _total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)) -> Total:
-    squares, reference = (np.array([s.measured("position_mse", vehicles) for s in some]) for some in (own, nominal))
-    return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
-
-
-def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Sample]) -> Row:
-    def over_seeds(name: str) -> Array:
-        return np.array([sample.measured(name, i) for sample in own], float)
-
-    def bound(name: str) -> float:
-        return float(np.sqrt(np.mean([getattr(sample.scene, name)[i] for sample in own])))
-
-    position, degradation = _total(own, nominal, slice(i, i + 1))
-    orientation = mean_root(over_seeds("orientation_mse")[:, None])
-    each, dof = np.sqrt(over_seeds("position_mse")), over_seeds("nis_dof").sum()
-    settle, converge = over_seeds("settle_time"), over_seeds("converge_time")
-    joint, family = bound("bound_mse"), bound("bound_ancestors_mse")
-    anees = over_seeds("anees")
+    position = total(own, nominal, slice(i, i + 1), w)
+    orientation = mean_root(seeds("orientation_mse")[:, None])
+    each, anees, dof = np.sqrt(seeds("position_mse")), seeds("anees"), seeds("nis_dof").sum()
+    bounds = [float(np.sqrt(np.mean([sample.scene.bounds[kind, i, w] for sample in own]))) for kind in range(3)]
+    joint, family = ([figure / bound if bound > 0.0 else math.nan for figure in position.rmse] for bound in bounds[:2])
     honest = mean_bounds(own[0].nees_dof, len(own)) if np.isfinite(anees).all() else NOWHERE
     consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
     return Row(
@@ -194,49 +171,210 @@ def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Samp
         variant=own[0].variant,
         observer=own[0].observer,
         vehicle=own[0].scene.vehicles[i],
-        position_rmse_m=position.value,
-        position_rmse_se_m=position.error,
+        position_rmse_m=position.rmse.value,
+        position_rmse_se_m=position.rmse.error,
         orientation_rmse_deg=orientation.value,
         orientation_rmse_se_deg=orientation.error,
-        bound_m=joint,
+        bound_m=bounds[0],
         anees=float(np.mean(anees)),
         anees_se=standard_error(anees),
-        settled_fraction=float(np.mean(np.isfinite(settle))),
-        settle_time_s=_median(settle),
-        bytes_per_s=float(np.mean([sample.bytes_per_s[i] for sample in own])),
-        us_per_update=_median(np.array([sample.us_per_update[i] for sample in own])),
+        settled_fraction=float(np.mean(np.isfinite(seeds("settle_time")))),
+        settle_time_s=_median(seeds("settle_time")),
+        bytes_per_s=float(np.mean(seeds("bytes_per_s"))),
+        us_per_update=_median(seeds("us_per_update")),
         failure=next((sample.failure for sample in own if sample.failure), ""),
-        bound_ancestors_m=family,
-        bound_single_m=bound("bound_single_mse"),
-        ratio_to_bound=position.value / joint,
-        ratio_to_bound_se=position.error / joint,
-        ratio_to_bound_ancestors=position.value / family,
-        ratio_to_bound_ancestors_se=position.error / family,
-        degradation=degradation.value,
-        degradation_se=degradation.error,
+        bound_ancestors_m=bounds[1],
+        bound_single_m=bounds[2],
+        ratio_to_bound=joint[0],
+        ratio_to_bound_se=joint[1],
+        ratio_to_bound_ancestors=family[0],
+        ratio_to_bound_ancestors_se=family[1],
+        degradation=position.degradation.value,
+        degradation_se=position.degradation.error,
         position_rmse_median_m=float(np.quantile(each, 0.5)),
         position_rmse_p90_m=float(np.quantile(each, 0.9)),
-        converged_fraction=float(np.mean(np.isfinite(converge))),
-        convergence_time_s=_median(converge),
-        convergence_rate_per_s=_median(over_seeds("rate")),
-        diverged_fraction=float(np.mean(over_seeds("diverged"))),
-        ate_m=float(np.sqrt(np.mean(over_seeds("ate") ** 2))),
-        rpe_m=float(np.sqrt(np.mean(over_seeds("rpe") ** 2))),
-        rpe_deg=float(np.sqrt(np.mean(over_seeds("rpe_orientation") ** 2))),
-        nis=float(over_seeds("nis").sum() / dof) if dof > 0 else float("nan"),
+        converged_fraction=float(np.mean(np.isfinite(seeds("converge_time")))),
+        convergence_time_s=_median(seeds("converge_time")),
+        convergence_rate_per_s=_median(seeds("rate")),
+        diverged_fraction=float(np.mean(seeds("diverged"))),
+        ate_m=root("ate"),
+        rpe_m=root("rpe"),
+        rpe_deg=root("rpe_orientation"),
+        nis=float(seeds("nis").sum() / dof) if dof > 0 else math.nan,
         anees_low=honest.low,
         anees_high=honest.high,
         nis_low=consistent.low,
         nis_high=consistent.high,
-        gramian_min_eigenvalue=float(np.min([sample.scene.gramian[i] for sample in own])),
-        gramian_local_eigenvalue=float(np.min([sample.scene.gramian_local[i] for sample in own])),
+        gramian_min_eigenvalue=float(np.min([sample.scene.gramians[0, i] for sample in own])),
+        gramian_local_eigenvalue=float(np.min([sample.scene.gramians[1, i] for sample in own])),
     )
 
 
 def _median(values: Array) -> float:
     """Return the median of what is finite, NaN where nothing is."""
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else float("nan")
+    return float(np.median(finite)) if len(finite) else math.nan
+
+
+@dataclass(frozen=True)
+class WindowRow:
+    """One observer, one vehicle, one variant, one stretch of time; NaN where there is no such figure."""
+
+    environment: str
+    variant: str
+    observer: str
+    vehicle: str
+    window: str
+    """For example `5-10 s`, or `steady`."""
+    from_s: float
+    to_s: float
+    position_rmse_m: float
+    position_rmse_se_m: float
+    bound_ancestors_m: float
+    ratio_to_bound_ancestors: float
+    ratio_to_bound_ancestors_se: float
+    anees: float
+    anees_se: float
+
+
+def window_row_of(environment: str, own: Sequence[Sample], i: int, w: int) -> WindowRow:
+    """Sum up samples of one observer in one variant over seeds: vehicle `i` in window `w`."""
+    window = own[0].scene.windows[w]
+    known = vars(row_of(environment, own, (), i, w)) | {
+        "window": window.name,
+        "from_s": window.start,
+        "to_s": window.end,
+    }
+    return WindowRow(**{column.name: known[column.name] for column in fields(WindowRow)})
+
+
+ERRORS = {
+    "position_rmse_m": "position_rmse_se_m",
+    "ratio_to_bound": "ratio_to_bound_se",
+    "ratio_to_bound_ancestors": "ratio_to_bound_ancestors_se",
+    "anees": "anees_se",
+}
+"""Column to that of its standard error."""
+
+
+class Spread(NamedTuple):
+    """A figure over all vehicles: its median, and the worst with its standard error and vehicle."""
+
+    median: float
+    worst: float
+    error: float
+    vehicle: str
+
+
+def spread(rows: Sequence[Row] | Sequence[WindowRow], column: str) -> Spread:
+    """Return the median over vehicles of a column, and its worst: the largest, or of ANEES the farthest from 1."""
+    values = np.array([getattr(row, column) for row in rows], float)
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return Spread(math.nan, math.nan, math.nan, "")
+    off = np.abs(np.log(np.maximum(values[known], 1e-300))) if column == "anees" else values[known]
+    worst = rows[int(known[np.argmax(off)])]
+    error = getattr(worst, ERRORS[column])
+    return Spread(float(np.median(values[known])), float(getattr(worst, column)), float(error), worst.vehicle)
+
+
+BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
+"""Column to its line in tables."""
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """How observers did on the same records, summed up over seeds."""
+
+    environment: str
+    """Name of the environment, dataset or log file."""
+    observers: tuple[str, ...]
+    variants: Mapping[str, str]
+    """Those that were run, each with what it is."""
+    seeds: tuple[int, ...]
+    samples: Sequence[Sample] = field(repr=False)
+    """One observer on one record each, by variant, observer, seed."""
+    draws: Sequence[Draw] = field(default=(), repr=False)
+    """Of initial estimates, by observer, where basins were studied."""
+
+    @cached_property
+    def groups(self) -> dict[tuple[str, str], list[Sample]]:
+        """The samples of all seeds, by variant and observer."""
+        return {key: list(own) for key, own in groupby(self.samples, lambda sample: (sample.variant, sample.observer))}
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """One per variant, observer and vehicle."""
+        return [
+            row_of(self.environment, own, self.groups.get((NOMINAL, observer), []), i)
+            for (_, observer), own in self.groups.items()
+            for i in range(len(self.vehicles))
+        ]
+
+    @cached_property
+    def window_rows(self) -> list[WindowRow]:
+        """One per variant, observer, window and vehicle; the last window is the steady state."""
+        return [
+            window_row_of(self.environment, own, i, w)
+            for own in self.groups.values()
+            for w in range(len(self.windows))
+            for i in range(len(self.vehicles))
+        ]
+
+    @cached_property
+    def totals(self) -> dict[tuple[str, str], Total]:
+        """Over all vehicles, by variant and observer."""
+        return {key: total(own, self.groups.get((NOMINAL, key[1]), [])) for key, own in self.groups.items()}
+
+    @cached_property
+    def basins(self) -> list[Basin]:
+        """The draws summed up, one per observer."""
+        return basins_of(self.environment, self.draws)
+
+    @cached_property
+    def ranked(self) -> list[str]:
+        """The observers by their error in the first variant, those that failed there last."""
+        first = next(iter(self.variants))
+        error = {name: self.totals[first, name].rmse.value for name in self.observers}
+        return sorted(self.observers, key=lambda name: (error[name] != error[name], error[name]))
+
+    @property
+    def title(self) -> str:
+        """What was compared, on one line."""
+        first, last = self.seeds[0], self.seeds[-1]
+        whole = len(self.seeds) > 1 and self.seeds == tuple(range(first, last + 1))
+        seeds = f"{first} to {last}" if whole else ", ".join(map(str, self.seeds))
+        return f"{self.environment}, seed{'s' if len(self.seeds) > 1 else ''} {seeds}"
+
+    def rows_in(self, variant: str, observer: str) -> list[Row]:
+        """Return the rows of one observer in one variant, a vehicle each."""
+        return [row for row in self.rows if (row.variant, row.observer) == (variant, observer)]
+
+    @property
+    def vehicles(self) -> tuple[str, ...]:
+        """Their names."""
+        return self.samples[0].scene.vehicles
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """The stretches of the run that are judged one by one, the steady state last."""
+        return self.samples[0].scene.windows
+
+    def windows_in(self, variant: str, observer: str, window: Window) -> list[WindowRow]:
+        """Return the rows of one observer in one variant and window, a vehicle each."""
+        wanted = (variant, observer, window.name)
+        return [row for row in self.window_rows if (row.variant, row.observer, row.window) == wanted]
+
+    def bounds_in(self, variant: str) -> dict[str, list[float]]:
+        """Return the bounds that are known of each vehicle in a variant, by column."""
+        first = self.rows_in(variant, self.observers[0])
+        found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
+        return {column: values for column, values in found.items() if np.isfinite(values).all()}
+
+    def samples_in(self, variant: str) -> dict[str, list[Sample]]:
+        """Return the samples of one variant of every observer that did not fail, the best first."""
+        own = {name: self.groups[variant, name] for name in self.ranked}
+        return {name: samples for name, samples in own.items() if not any(sample.failure for sample in samples)}
 
 
 EDGES = (5.0, 10.0, 20.0, 35.0)
@@ -262,99 +400,3 @@ def checked_edges(given: Iterable[float] | str) -> tuple[float, ...]:
     if not times or len(edges) == 1 or len(edges) > MOST_EDGES:
         raise CoopenvError(f"--windows {shown(text)}: {EXPECTED}")
     return edges
-
-
-@dataclass(frozen=True)
-class WindowRow:
-    """One observer, one vehicle, one variant, one stretch of time; NaN where there is no such figure."""
-
-    environment: str
-    variant: str
-    observer: str
-    vehicle: str
-    window: str
-    """For example `5-10 s`, or `steady`."""
-    from_s: float
-    to_s: float
-    position_rmse_m: float
-    position_rmse_se_m: float
-    bound_ancestors_m: float
-    ratio_to_bound_ancestors: float
-    ratio_to_bound_ancestors_se: float
-    anees: float
-    anees_se: float
-
-
-ERRORS = {
-    "position_rmse_m": "position_rmse_se_m",
-    "ratio_to_bound_ancestors": "ratio_to_bound_ancestors_se",
-    "anees": "anees_se",
-}
-"""Column to that of its standard error."""
-
-
-class Spread(NamedTuple):
-    """A figure over all vehicles: its median, and the worst with its standard error and vehicle."""
-
-    median: float
-    worst: float
-    error: float
-    vehicle: str
-
-
-def spread(rows: Sequence[WindowRow], column: str) -> Spread:
-    """Return the median over vehicles of a column, and its worst: the largest, or of ANEES the farthest from 1."""
-    values = np.array([getattr(row, column) for row in rows], float)
-    known = np.flatnonzero(np.isfinite(values))
-    if not len(known):
-        return Spread(math.nan, math.nan, math.nan, "")
-    off = np.abs(np.log(np.maximum(values[known], 1e-300))) if column == "anees" else values[known]
-    worst = rows[int(known[np.argmax(off)])]
-    error = getattr(worst, ERRORS[column])
-    return Spread(float(np.median(values[known])), float(getattr(worst, column)), float(error), worst.vehicle)
-
-
-def window_rows(environment: str, samples: Sequence[Sample]) -> list[WindowRow]:
-    """Sum up samples over seeds, in the order of variants and observers in which they come."""
-    return [
-        _window_row(environment, own, i, w)
-        for own in grouped(samples).values()
-        for w in range(len(own[0].scene.windows))
-        for i in range(len(own[0].scene.vehicles))
-    ]
-
-
-def _window_row(environment: str, own: Sequence[Sample], i: int, w: int) -> WindowRow:
-    def over_seeds(name: str) -> Array:
-        return np.array([sample.in_windows(name)[i, w] for sample in own], float)
-
-    window: Window = own[0].scene.windows[w]
-    position, anees = mean_root(over_seeds("window_mse")[:, None]), over_seeds("window_anees")
-    bound = math.sqrt(np.mean([sample.scene.window_bound_mse[i, w] for sample in own]))
-    figures: dict[str, Any] = {
-        "position_rmse_m": position.value,
-        "position_rmse_se_m": position.error,
-        "bound_ancestors_m": bound,
-        "ratio_to_bound_ancestors": position.value / bound if bound > 0.0 else math.nan,
-        "ratio_to_bound_ancestors_se": position.error / bound if bound > 0.0 else math.nan,
-        "anees": float(np.mean(anees)),
-        "anees_se": standard_error(anees),
-    }
-    who = (environment, own[0].variant, own[0].observer, own[0].scene.vehicles[i])
-    return WindowRow(*who, window.name, window.start, window.end, **figures)
-
-
-FAILED = "failed"
-
-_NAMED = 16  # characters of an observer's name on one line
-
-
-def short_name(name: str) -> str:
-    """Return an observer's name, on two lines if it is long."""
-    cut = name.rfind("_", 0, _NAMED) + 1 if len(name) > _NAMED else 0
-    return f"{name[:cut]}\n{name[cut:]}" if cut else name
-
-
-def compact(value: float, error: float) -> str:
-    """Return a number with its standard error in parentheses; without it where so many digits would not fit."""
-    return in_parentheses(value, error) if 1e-3 <= abs(value) < 1e4 else number(value, 2)

@@ -21,7 +21,7 @@ from coopenv.bench.observers.faults import (
     VARIANTS,
     FaultVariant,
     check_recorded,
-    followers,
+    leaders_of,
     variant_of,
     with_world,
 )
@@ -30,7 +30,6 @@ from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.schema import neighbour_sets
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,8 @@ class Source(ABC):
 
     def fault(self, variant: str) -> FaultVariant:
         """Return the faults of a variant."""
-        return next((made for made in self.added if made.name == variant), None) or VARIANTS[variant]
+        known = VARIANTS | {made.name: made for made in self.added}
+        return known.get(variant, FaultVariant(variant))
 
     @property
     def planar(self) -> bool:
@@ -69,9 +69,13 @@ class Source(ABC):
     def recording(self, variant: str, seed: int) -> Recording:
         """Return a record with the faults of a variant."""
 
+    def followed(self) -> bool:
+        """Return whether a vehicle has another one as its neighbour, so that one can lie to another."""
+        return True
+
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""
-        return ""
+        return NO_FOLLOWERS if self.fault(variant).needs_followers and not self.followed() else ""
 
     def check(self) -> None:  # noqa: B027
         """Look at recorded data, so that errors and warnings come before the work."""
@@ -107,9 +111,9 @@ class Simulated(Source):
         fault = self.fault(variant)
         return fault.applied(record(fault.scenario or self.scenario, seed, self.policy), seed)
 
-    def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another; empty where one can."""
-        return _no_followers(self.scenario) if self.fault(variant).needs_followers else ""
+    def followed(self) -> bool:
+        """Return whether a vehicle has another one as its neighbour."""
+        return bool(leaders_of(self.scenario))
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
@@ -167,11 +171,9 @@ class LogFile(Source):
             recording = replace(recording, interference=again.interference)
         return self.fault(variant).applied(recording, seed)
 
-    def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another; empty where one can."""
-        recording = open_recording(self.path)
-        followed = any(followers(recording, i) for i in recording.order)
-        return NO_FOLLOWERS if self.fault(variant).needs_followers and not followed else ""
+    def followed(self) -> bool:
+        """Return whether a vehicle has another one as its neighbour."""
+        return bool(leaders_of(open_recording(self.path)))
 
     def check(self) -> None:
         """Read the file once."""
@@ -197,9 +199,9 @@ class Bags(Source):
             check_recorded(made, recording)
         return self.fault(variant).applied(recording, seed)
 
-    def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another; empty where one can."""
-        return "" if not self.fault(variant).needs_followers else _no_followers(self._backend().scenario)
+    def followed(self) -> bool:
+        """Return whether a vehicle has another one as its neighbour."""
+        return bool(leaders_of(self._backend().scenario))
 
     def check(self) -> None:
         """Read the bag once."""
@@ -207,12 +209,6 @@ class Bags(Source):
 
     def _backend(self) -> Backend:
         return open_backend(self.path, None, self.overrides, topics=self.topics)
-
-
-def _no_followers(scenario: Scenario) -> str:
-    L = len(scenario.landmarks)
-    followed = any(target >= L for targets in neighbour_sets(scenario) for target in targets)
-    return "" if followed else NO_FOLLOWERS
 
 
 def _is_planar(recording: Recording) -> bool:
@@ -244,44 +240,34 @@ def find_source(
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
     kind, added = kind_of(text), tuple(variant_of(text) for text in dict.fromkeys(faults))
-    if kind is SourceKind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
+    bag, name = is_bag(text, topics), Path(text).stem
+    if kind is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
         scenario = load_scenario(text, overrides)
         worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
-        return Simulated(Path(text).stem, scenario, _checked_policy(policy, scenario), added=worlds)
+        if policy is not None:
+            if not scenario.driven:
+                raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
+            load_policy(policy, scenario, 0)
+        return Simulated(name, scenario, policy or "zero", added=worlds)
     if policy is not None:
         raise CoopenvError(f"--policy {policy}: {text} is recorded, its vehicles cannot be driven")
     if faults and kind is SourceKind.DATASET:
         raise CoopenvError(
             f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"
         )
-    return replace(_recorded(text, kind, overrides, data, topics), added=added)
-
-
-def _checked_policy(policy: str | None, scenario: Scenario) -> str:
-    if policy is None:
-        return "zero"
-    if not scenario.driven:
-        raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
-    load_policy(policy, scenario, 0)
-    return policy
-
-
-def _recorded(
-    text: str, kind: SourceKind, overrides: Mapping[str, Any] | None, data: Path | None, topics: Path | None
-) -> Source:
     if data is not None and kind is not SourceKind.DATASET:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
-    if is_bag(text, topics):
-        return Bags(Path(text).stem, Path(text), topics, dict(overrides or {}))
+    if bag:
+        return Bags(name, Path(text), topics, dict(overrides or {}), added=added)
     if topics is not None:
         raise CoopenvError(f"--map {topics}: is for ROS bags, {text} is none")
     if overrides:
         raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
-    if kind is SourceKind.LOG:
-        if not Path(text).is_file():
-            raise CoopenvError(f"no such log file: {text}")
-        return LogFile(Path(text).stem, Path(text))
-    return Robots(text, data)
+    if kind is SourceKind.DATASET:
+        return Robots(text, data)
+    if not Path(text).is_file():
+        raise CoopenvError(f"no such log file: {text}")
+    return LogFile(name, Path(text), added=added)
 
 
 def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
@@ -290,23 +276,15 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
     Raises:
         CoopenvError: there is none of that name, or the source cannot have it.
     """
-    added = tuple(variant.name for variant in source.added)
-    if asked is None:
-        return (*source.usual, *(name for name in added if _can_have(source, name)))
-    names = tuple(dict.fromkeys(name.strip() for name in asked.split(",")))
-    if names == (ALL,):
+    added = [variant.name for variant in source.added]
+    names = [*source.usual] if asked is None else [name.strip() for name in asked.split(",")]
+    if names == [ALL]:
         return tuple(name for name in source.variants if not source.obstacle(name))
-    names = tuple(dict.fromkeys((*names, *added)))
+    names = list(dict.fromkeys([*names, *added]))
     for name in names:
         if name not in source.variants:
             known = ", ".join((*source.variants, ALL))
             raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(source.variants))}; known: {known}")
-        _can_have(source, name)
-    return names
-
-
-def _can_have(source: Source, variant: str) -> bool:
-    """Return that a source can have a variant, or raise a CoopenvError."""
-    if reason := source.obstacle(variant):
-        raise CoopenvError(f"variant '{variant}': {reason}")
-    return True
+        if reason := source.obstacle(name):
+            raise CoopenvError(f"variant '{name}': {reason}")
+    return tuple(names)

@@ -1,10 +1,8 @@
-"""The samples of a comparison of observers, and its tables."""
+"""The tables of a comparison of observers."""
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
 from io import StringIO
 from typing import Any
 
@@ -12,124 +10,49 @@ import numpy as np
 from rich.table import Table
 
 from coopenv.base.format import in_parentheses, jsonable, number, with_error
-from coopenv.bench.observers.basin import Draw
+from coopenv.bench.observers.convergence import Draw, basin_failures, basin_table
 from coopenv.bench.observers.faults import NOMINAL, VARIANTS
-from coopenv.bench.observers.judge import Sample, Window
+from coopenv.bench.observers.judge import Window
 from coopenv.bench.observers.rows import (
+    BOUNDS,
     ERRORS,
-    FAILED,
+    Leaderboard,
     Measured,
     Row,
-    Spread,
-    Total,
     WindowRow,
-    compact,
-    mean_of,
-    rows_of,
-    short_name,
     spread,
     standard_error,
-    totals_of,
-    window_rows,
 )
 from coopenv.bench.observers.sources import Robots
 from coopenv.estimation.metrics import SETTLED
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table
 
-BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
-"""Column to its line in tables."""
-
-
-@dataclass(frozen=True)
-class Leaderboard:
-    """How observers did on the same records, summed up over seeds."""
-
-    environment: str
-    """Name of the environment, dataset or log file."""
-    observers: tuple[str, ...]
-    variants: Mapping[str, str]
-    """Those that were run, each with what it is."""
-    seeds: tuple[int, ...]
-    samples: Sequence[Sample] = field(repr=False)
-    """One observer on one record each, by variant, observer, seed."""
-
-    @cached_property
-    def rows(self) -> list[Row]:
-        """One per variant, observer and vehicle."""
-        return rows_of(self.environment, self.samples)
-
-    @cached_property
-    def window_rows(self) -> list[WindowRow]:
-        """One per variant, observer, window and vehicle; the last window is the steady state."""
-        return window_rows(self.environment, self.samples)
-
-    @cached_property
-    def totals(self) -> dict[tuple[str, str], Total]:
-        """Over all vehicles, by variant and observer."""
-        return totals_of(self.samples)
-
-    @cached_property
-    def ranked(self) -> list[str]:
-        """The observers by their error in the first variant, those that failed there last."""
-        first = next(iter(self.variants))
-        error = {name: self.totals[first, name].rmse.value for name in self.observers}
-        return sorted(self.observers, key=lambda name: (error[name] != error[name], error[name]))
-
-    @property
-    def title(self) -> str:
-        """What was compared, on one line."""
-        first, last = self.seeds[0], self.seeds[-1]
-        whole = len(self.seeds) > 1 and self.seeds == tuple(range(first, last + 1))
-        seeds = f"{first} to {last}" if whole else ", ".join(map(str, self.seeds))
-        return f"{self.environment}, seed{'s' if len(self.seeds) > 1 else ''} {seeds}"
-
-    def rows_in(self, variant: str, observer: str) -> list[Row]:
-        """Return the rows of one observer in one variant, a vehicle each."""
-        return [row for row in self.rows if (row.variant, row.observer) == (variant, observer)]
-
-    @property
-    def windows(self) -> tuple[Window, ...]:
-        """The stretches of the run that are judged one by one, the steady state last."""
-        return self.samples[0].scene.windows
-
-    def windows_in(self, variant: str, observer: str, window: Window) -> list[WindowRow]:
-        """Return the rows of one observer in one variant and window, a vehicle each."""
-        wanted = (variant, observer, window.name)
-        return [row for row in self.window_rows if (row.variant, row.observer, row.window) == wanted]
-
-    def bounds_in(self, variant: str) -> dict[str, list[float]]:
-        """Return the bounds that are known of each vehicle in a variant, by column."""
-        first = self.rows_in(variant, self.observers[0])
-        found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
-        return {column: values for column, values in found.items() if np.isfinite(values).all()}
-
-    def samples_in(self, variant: str) -> dict[str, list[Sample]]:
-        """Return the samples of one variant of every observer that did not fail, the best first."""
-        own = {name: [s for s in self.samples if (s.variant, s.observer) == (variant, name)] for name in self.ranked}
-        return {name: samples for name, samples in own.items() if not any(sample.failure for sample in samples)}
+FAILED = "failed"
 
 
 def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
-    """Return shares in %, costs and NIS with standard errors, and the rows with the largest and smallest figures.
+    """Return shares in %, costs and NIS with standard errors, the worst figures, and rows with an ANEES, lowest first.
 
     Vehicles of one seed may depend on one another: errors are those of the means of each seed.
     """
-    own = [s for s in board.samples if (s.variant, s.observer) == (variant, observer)]
+
+    def each(name: str) -> Array:
+        return np.array([sample.measured(name) for sample in board.groups[variant, observer]], float)
+
+    def measured(values: Array) -> Measured:
+        return Measured(float(values.mean()), standard_error(values))
+
     rows = board.rows_in(variant, observer)
-    stated = sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees)
-    dof = _each(own, "nis_dof").sum(axis=1)
-    nis = _each(own, "nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)
+    dof = each("nis_dof").sum(axis=1)
     return {
-        "settled": _share(np.isfinite(_each(own, "settle_time"))),
-        "diverged": _share(_each(own, "diverged")),
-        "sent": _measured(np.array([s.bytes_per_s for s in own]).mean(axis=1)),
-        "time": _measured(np.array([s.us_per_update for s in own]).mean(axis=1)),
-        "nis": _measured(nis),
-        "worst_ratio": max(rows, key=lambda row: row.ratio_to_bound_ancestors),
-        "low_anees": stated[0] if stated else None,
-        "high_anees": stated[-1] if stated else None,
-        "worst_anees": max(stated, key=_dishonesty) if stated else None,
+        "settled": measured(100.0 * np.isfinite(each("settle_time")).mean(axis=1)),
+        "diverged": measured(100.0 * each("diverged").mean(axis=1)),
+        "sent": measured(each("bytes_per_s").mean(axis=1)),
+        "time": measured(each("us_per_update").mean(axis=1)),
+        "nis": measured(each("nis").sum(axis=1) / np.where(dof > 0, dof, np.nan)),
+        "stated": sorted((row for row in rows if np.isfinite(row.anees)), key=lambda row: row.anees),
+        **{f"worst_{column}": spread(rows, column) for column in ("ratio_to_bound_ancestors", "anees")},
     }
 
 
@@ -144,10 +67,8 @@ def headline(board: Leaderboard) -> list[str]:
         f"Best of {len(board.observers)} in {board.title} ({first}): {names[0]}, "
         f"mean position RMSE {_words(board.totals[first, names[0]].rmse)} m in the steady state"
     ]
-    row = best["worst_ratio"]
-    if np.isfinite(row.ratio_to_bound_ancestors):
-        ratio = Measured(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se)
-        lines[0] += f", {_words(ratio)} times the Cramér-Rao bound at worst ({row.vehicle})"
+    if (ratio := best["worst_ratio_to_bound_ancestors"]).vehicle:
+        lines[0] += f", {_words(Measured(*ratio[1:3]))} times the Cramér-Rao bound at worst ({ratio.vehicle})"
     if len(names) > 1:
         lines[0] += f"; {names[1]} follows with {_words(board.totals[first, names[1]].rmse)} m"
     always = [name for name in names if quality(board, first, name)["settled"].value == 100.0]
@@ -160,99 +81,23 @@ def _words(measured: Measured) -> str:
     return f"{value} ± {error}" if error else value
 
 
-def _dishonesty(row: Row) -> float:
-    return float(abs(np.log(row.anees))) if row.anees > 0 else np.inf
+_NAMED = 16  # characters of an observer's name on one line
 
 
-def _each(samples: list[Sample], name: str) -> Array:
-    """Return (S, N) a measure of every seed and vehicle."""
-    return np.array([sample.measured(name) for sample in samples], float)
+def short_name(name: str) -> str:
+    """Return an observer's name, on two lines if it is long."""
+    cut = name.rfind("_", 0, _NAMED) + 1 if len(name) > _NAMED else 0
+    return f"{name[:cut]}\n{name[cut:]}" if cut else name
 
 
-def _share(values: Array) -> Measured:
-    return _measured(100.0 * np.asarray(values, float).mean(axis=1))
+def compact(value: float, error: float) -> str:
+    """Return a number with its standard error in parentheses; without it where so many digits would not fit."""
+    return in_parentheses(value, error) if 1e-3 <= abs(value) < 1e4 else number(value, 2)
 
 
-def _measured(each: Array) -> Measured:
-    return Measured(float(each.mean()), standard_error(each))
-
-
-MOST_OBSERVERS = 4  # with a column per vehicle
-NAMES, COLUMN = 26, 9  # characters on a line: of observer and window, and of each vehicle
-
-
-def window_tables(board: Leaderboard, variant: str, width: int) -> Iterator[Table | str]:
-    """Yield ratios and consistency of one variant by window; nothing where there is the steady state alone.
-
-    `width`: characters that fit on a line.
-    """
-    if len(board.windows) < 2:
-        return
-    vehicles = len(board.samples[0].scene.vehicles)
-    few = NAMES + COLUMN * vehicles <= width and len(board.observers) <= MOST_OBSERVERS
-    if few and board.bounds_in(variant):
-        yield ""
-        yield by_vehicle(board, variant, "RMSE / bound\n(ancestors)", "ratio_to_bound_ancestors")
-    elif few:
-        yield ""
-        yield by_vehicle(board, variant, "position RMSE\n[m]", "position_rmse_m")
-    if few:
-        yield ""
-        yield by_vehicle(board, variant, "ANEES", "anees")
-    else:
-        yield ""
-        yield summary(board, variant)
-        yield "Ratio to the ancestors' bound; worst ANEES: the farthest from 1. In parentheses the standard error."
-
-
-def by_vehicle(board: Leaderboard, variant: str, heading: str, column: str) -> Table:
-    """Return a column of the window rows with standard errors: a line per observer and window, a column per vehicle."""
-    names = [f"f{i + 1}" for i in range(len(board.samples[0].scene.vehicles))]
-    table = number_table([heading, "window"], names, gap=0)
-    for name in board.ranked:
-        for n, window in enumerate(board.windows):
-            cells = [_cell(row, column) for row in board.windows_in(variant, name, window)]
-            table.add_row(short_name(name) if n == 0 else "", window.name, *_or_failed(board, variant, name, cells))
-    return table
-
-
-def summary(board: Leaderboard, variant: str) -> Table:
-    """Return, per observer and window, the median and the worst vehicle: RMSE, its ratio to the bound, and ANEES."""
-    headings = ["RMSE [m]\nmedian", "\nworst", "ratio\nmedian", "\nworst", "\nof", "ANEES\nmedian", "\nworst", "\nof"]
-    table = number_table(["by window", "window"], headings, gap=0)
-    for name in board.ranked:
-        for n, window in enumerate(board.windows):
-            rows = board.windows_in(variant, name, window)
-            error, ratio, anees = (
-                spread(rows, column) for column in ("position_rmse_m", "ratio_to_bound_ancestors", "anees")
-            )
-            cells = [
-                number(error.median, 2),
-                _worst_window(error),
-                number(ratio.median, 3),
-                _worst_window(ratio),
-                _who(ratio),
-            ]
-            cells += [number(anees.median, 2), _worst_window(anees), _who(anees)]
-            table.add_row(short_name(name) if n == 0 else "", window.name, *_or_failed(board, variant, name, cells))
-    return table
-
-
-def _or_failed(board: Leaderboard, variant: str, name: str, cells: list[str]) -> list[str]:
-    failed = any(row.failure for row in board.rows_in(variant, name))
-    return [FAILED] * len(cells) if failed else cells
-
-
-def _cell(row: WindowRow, column: str) -> str:
-    return compact(getattr(row, column), getattr(row, ERRORS[column]))
-
-
-def _worst_window(found: Spread) -> str:
-    return compact(found.worst, found.error)
-
-
-def _who(found: Spread) -> str:
-    return found.vehicle.replace("vehicle_", "f")
+def mean_of(rows: Sequence[Row], column: str) -> float:
+    """Return the mean of a column."""
+    return float(np.mean([getattr(row, column) for row in rows]))
 
 
 WIDTH = 80
@@ -288,35 +133,70 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
             yield ""
             yield variant_table(board, "RMSE / nominal", "degradation", [v for v in variants if v != NOMINAL])
     yield from failures(board.rows)
+    if board.basins:
+        yield ""
+        yield basin_table(board.basins)
+        yield from basin_failures(board.basins)
+
+
+def _add_observers(
+    table: Table,
+    board: Leaderboard,
+    variant: str,
+    cells: Callable[[list[Any]], list[str]],
+    windows: Sequence[Window | None] = (None,),
+) -> Table:
+    """Add a line per observer, the best first, and window (None: the rows of the leaderboard), and return the table."""
+    for name in board.ranked:
+        own = board.rows_in(variant, name)
+        for n, window in enumerate(windows):
+            found = cells(own if window is None else board.windows_in(variant, name, window))
+            shown = [FAILED] * len(found) if any(row.failure for row in own) else found
+            table.add_row(short_name(name) if n == 0 else "", *([window.name] if window else []), *shown)
+    return table
+
+
+def _cells(rows: Sequence[Row], column: str, few: bool) -> list[str]:
+    """Return a column with its standard errors, of every vehicle or of the worst alone."""
+    shown = rows if few else [max(rows, key=lambda row: float(getattr(row, column)))]
+    return [in_parentheses(getattr(row, column), getattr(row, ERRORS[column])) for row in shown]
+
+
+def _headings(board: Leaderboard) -> list[str]:
+    """Return one heading per vehicle."""
+    return [f"f{i + 1}" for i in range(len(board.vehicles))]
+
+
+def _few(board: Leaderboard) -> bool:
+    return len(board.vehicles) <= MOST_COLUMNS
 
 
 def error_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE in m of one variant per vehicle, and their mean, the bounds first."""
-    bounds, few = board.bounds_in(variant), _few(board)
-    table = number_table(["position RMSE [m]"], _headings(board, "mean"), gap=0)
-    for column, values in bounds.items():
+    few = _few(board)
+    table = number_table(["position RMSE [m]"], [*_headings(board), "mean"] if few else ["mean", "worst"], gap=0)
+    for column, values in board.bounds_in(variant).items():
         average = sum(values) / len(values)
         shown = [*values, average] if few else [average, max(values)]
         table.add_row(BOUNDS[column], *(number(value, 3) for value in shown))
-    for name in board.ranked:
-        own = board.rows_in(variant, name)
-        mean = in_parentheses(*board.totals[variant, name].rmse)
-        cells = [in_parentheses(row.position_rmse_m, row.position_rmse_se_m) for row in (own if few else [_worst(own)])]
-        _add(table, name, own, [*cells, mean] if few else [mean, *cells])
-    return table
+
+    def cells(own: list[Row]) -> list[str]:
+        mean, found = in_parentheses(*board.totals[variant, own[0].observer].rmse), _cells(own, "position_rmse_m", few)
+        return [*found, mean] if few else [mean, *found]
+
+    return _add_observers(table, board, variant, cells)
 
 
 def ratio_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE over the ancestors' bound per vehicle, and the worst one over the joint bound."""
-    few = _few(board)
-    table = number_table(["RMSE / bound\n(ancestors)"], _headings(board, "x joint\nworst"), gap=0)
-    for name in board.ranked:
-        own = board.rows_in(variant, name)
-        joint, shown = _worst(own, "ratio_to_bound"), own if few else [_worst(own, "ratio_to_bound_ancestors")]
-        cells = [] if few else [number(mean_of(own, "ratio_to_bound_ancestors"), 3)]
-        cells += [in_parentheses(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se) for row in shown]
-        _add(table, name, own, [*cells, in_parentheses(joint.ratio_to_bound, joint.ratio_to_bound_se)])
-    return table
+    few, column = _few(board), "ratio_to_bound_ancestors"
+    headings = [*(_headings(board) if few else ["mean", "worst"]), "x joint\nworst"]
+
+    def cells(own: list[Row]) -> list[str]:
+        mean = [] if few else [number(mean_of(own, column), 3)]
+        return [*mean, *_cells(own, column, few), *_cells(own, "ratio_to_bound", False)]
+
+    return _add_observers(number_table(["RMSE / bound\n(ancestors)"], headings, gap=0), board, variant, cells)
 
 
 def honest_line(rows: Sequence[Row]) -> str:
@@ -328,20 +208,74 @@ def honest_line(rows: Sequence[Row]) -> str:
 def quality_table(board: Leaderboard, variant: str) -> Table:
     """Return, of one variant over all vehicles: shares that settle, consistency (1: consistent) and costs."""
     headings = ["settled", "converged", "diverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
-    table = number_table(["observer"], headings, gap=0)
-    for name in board.ranked:
-        own = board.rows_in(variant, name)
-        anees, nis = (
-            [value for row in own if np.isfinite(value := getattr(row, column))] for column in ("anees", "nis")
-        )
+
+    def cells(own: list[Row]) -> list[str]:
+        stated = sorted((row for row in own if np.isfinite(row.anees)), key=lambda row: row.anees)
+        nis = [row.nis for row in own if np.isfinite(row.nis)]
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
-        cells = [f"{100 * mean_of(own, column):.0f}%" for column in shares]
-        top = _worst([row for row in own if np.isfinite(row.anees)], "anees") if anees else None
-        cells += [number(min(anees), 2), compact(top.anees, top.anees_se)] if top else ["-", "-"]
-        cells += [number(float(np.mean(nis)), 2) if nis else "-"]
-        cells += [f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")]
-        _add(table, name, own, cells)
-    return table
+        return [
+            *(f"{100 * mean_of(own, column):.0f}%" for column in shares),
+            *([number(stated[0].anees, 2), compact(stated[-1].anees, stated[-1].anees_se)] if stated else ["-", "-"]),
+            number(float(np.mean(nis)), 2) if nis else "-",
+            *(f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")),
+        ]
+
+    return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
+
+
+MOST_OBSERVERS = 4  # with a column per vehicle
+NAMES, COLUMN = 26, 9  # characters on a line: of observer and window, and of each vehicle
+
+
+def window_tables(board: Leaderboard, variant: str, width: int) -> Iterator[Table | str]:
+    """Yield ratios and consistency of one variant by window; nothing where there is the steady state alone.
+
+    `width`: characters that fit on a line. Vehicles have columns of their own where these fit, and else median and
+    worst vehicle are shown.
+    """
+    if len(board.windows) < 2:
+        return
+    yield ""
+    if NAMES + COLUMN * len(board.vehicles) > width or len(board.observers) > MOST_OBSERVERS:
+        yield summary(board, variant)
+        yield "Ratio to the ancestors' bound; worst ANEES: the farthest from 1. In parentheses the standard error."
+        return
+    bounded = ("RMSE / bound\n(ancestors)", "ratio_to_bound_ancestors")
+    heading, column = bounded if board.bounds_in(variant) else ("position RMSE\n[m]", "position_rmse_m")
+    yield by_vehicle(board, variant, heading, column)
+    yield ""
+    yield by_vehicle(board, variant, "ANEES", "anees")
+
+
+def by_vehicle(board: Leaderboard, variant: str, heading: str, column: str) -> Table:
+    """Return a column of the window rows with standard errors: a line per observer and window, a column per vehicle."""
+
+    def cells(rows: list[WindowRow]) -> list[str]:
+        return [compact(getattr(row, column), getattr(row, ERRORS[column])) for row in rows]
+
+    table = number_table([heading, "window"], _headings(board), gap=0)
+    return _add_observers(table, board, variant, cells, board.windows)
+
+
+def summary(board: Leaderboard, variant: str) -> Table:
+    """Return, per observer and window, the median and the worst vehicle: RMSE, its ratio to the bound, and ANEES."""
+    headings = ["RMSE [m]\nmedian", "\nworst", "ratio\nmedian", "\nworst", "\nof", "ANEES\nmedian", "\nworst", "\nof"]
+
+    def cells(rows: list[WindowRow]) -> list[str]:
+        return [
+            *_spread(rows, "position_rmse_m", 2)[:2],
+            *_spread(rows, "ratio_to_bound_ancestors", 3),
+            *_spread(rows, "anees", 2),
+        ]
+
+    table = number_table(["by window", "window"], headings, gap=0)
+    return _add_observers(table, board, variant, cells, board.windows)
+
+
+def _spread(rows: Sequence[WindowRow], column: str, digits: int) -> list[str]:
+    """Return the median vehicle's figure, the worst one's, and which vehicle that is."""
+    found = spread(rows, column)
+    return [number(found.median, digits), compact(found.worst, found.error), found.vehicle.replace("vehicle_", "f")]
 
 
 def variant_table(board: Leaderboard, heading: str, column: str, variants: Sequence[str]) -> Table:
@@ -364,26 +298,6 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return [f"{observer} ({', '.join(variants)}): failed {why}" for (observer, why), variants in failed.items()]
 
 
-def _few(board: Leaderboard) -> bool:
-    return len(board.samples[0].scene.vehicles) <= MOST_COLUMNS
-
-
-def _headings(board: Leaderboard, last: str) -> list[str]:
-    """Return one heading per vehicle and another one, or those of what sums up many vehicles."""
-    if not _few(board):
-        return ["mean", "worst"] if last == "mean" else ["mean", "worst", last]
-    return [*(f"f{i + 1}" for i in range(len(board.samples[0].scene.vehicles))), last]
-
-
-def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> None:
-    failed = any(row.failure for row in rows)
-    table.add_row(short_name(name), *([FAILED] * len(cells) if failed else cells))
-
-
-def _worst(rows: Sequence[Row], column: str = "position_rmse_m") -> Row:
-    return max(rows, key=lambda row: getattr(row, column))
-
-
 def csv_text(rows: Sequence[Row] | Sequence[Draw] | Sequence[WindowRow]) -> str:
     """Return rows as CSV; figures that do not exist are empty."""
     table = [jsonable(row) for row in rows]
@@ -399,7 +313,7 @@ def latex(board: Leaderboard, variant: str) -> str:
 
     Five vehicles fit a column of 3.5 in.
     """
-    vehicles = [f"f{i + 1}" for i in range(len(board.samples[0].scene.vehicles))]
+    vehicles = _headings(board)
     bounds = [[BOUNDS[c], *(number(v, 3) for v in values)] for c, values in board.bounds_in(variant).items()]
     observers = [[_latex_name(name), *map(_latex_cell, board.rows_in(variant, name))] for name in board.ranked]
     return "\n".join(

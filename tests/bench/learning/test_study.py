@@ -1,13 +1,17 @@
-"""What a study's file says, and which of its trainings are chosen."""
+"""A study's file, the part of it that is chosen, and the judge of its agents."""
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
+from typing import Any
+from weakref import ref
 
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.study import Group, Run, Study, read_study
+from coopenv.bench.learning import Group, Judge, Study, place_of, read_study
+from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
 
 STUDY = """
 settings = "train.toml"
@@ -32,27 +36,27 @@ def study(tmp_path: Path) -> Study:
 
 
 def test_every_agent_has_its_first_run_before_any_has_its_second(study: Study) -> None:
-    runs = list(study.runs)
-    assert [run.seed for run in runs] == [1] * 4 + [7] * 4
-    assert {run.group.name for run in runs[:4]} == {
+    plans = list(study.plans)
+    assert [plan.seed for plan in plans] == [1] * 4 + [7] * 4
+    assert {place_of(plan).parent.name for plan in plans[:4]} == {
         *("open_square_quality", "open_square_plain"),
         *("facade_quality", "facade_plain"),
     }
 
 
 def test_arms_differ_in_what_they_say(study: Study) -> None:
-    plain = study.plan(Run(Group("facade", "plain"), 7))
+    plain = study.plan(Group("facade", "plain"), 7)
     assert (plain.environment, plain.arm, plain.seed) == ("facade", "plain", 7)
     assert plain.all_overrides == {"reward.weights.position_uncertainty": 0.0}
-    quality = study.plan(Run(Group("facade", "quality"), 7))
+    quality = study.plan(Group("facade", "quality"), 7)
     assert (plain.settings.ppo.gamma, quality.settings.ppo.gamma) == (0.9, 0.99)
     assert quality.settings.steps == plain.settings.steps == 1000
 
 
 def test_parts(study: Study) -> None:
-    assert [run.folder for run in study.only(["facade", "7", "plain"]).runs] == [Path("facade_plain/seed_7")]
-    assert len(list(study.only(["quality"]).runs)) == 4
-    assert list(study.only([]).runs) == list(study.runs)
+    assert [place_of(plan) for plan in study.only(["facade", "7", "plain"]).plans] == [Path("facade_plain/seed_7")]
+    assert len(list(study.only(["quality"]).plans)) == 4
+    assert list(study.only([]).plans) == list(study.plans)
     with pytest.raises(
         CoopenvError, match=r"the study has no 'facde' \(did you mean 'facade'\?\); known: 1, 7, facade"
     ):
@@ -75,3 +79,32 @@ def test_mistakes_are_one_line(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(CoopenvError, match=message) as raised:
         read_study(tmp_path / "study.toml")
     assert "\n" not in str(raised.value)
+
+
+AGENTS = ("constant_speed", "route_follower")
+
+
+def test_figures_stay_and_episodes_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven: list[Any] = []
+
+    def watched(*arguments: Any) -> Episodes:
+        episodes = drive(*arguments)
+        driven.append(ref(episodes))
+        return episodes
+
+    monkeypatch.setattr("coopenv.bench.learning.drive", watched)
+    judge = Judge(2)
+
+    def told(environment: str) -> tuple[list[Result], list[Difference]]:
+        return judge.results(environment, AGENTS[0]), judge.against(environment, *AGENTS)
+
+    square = told("open_square")
+    expected = score(driven[0]()), compare_paired(driven[0](), driven[1]())
+    assert repr(square) == repr(expected)  # some figures are no numbers, and equal all the same
+    facade = told("facade")
+    gc.collect()
+    assert [episodes() is None for episodes in driven] == [True, True, False, False]
+    assert (told("open_square"), told("facade")) == (square, facade)
+    assert len(driven) == 4
+    judge.results("facade", AGENTS[0], {"horizon": 5.0})
+    assert len(driven) == 5

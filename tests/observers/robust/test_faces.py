@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.bench.observers.basin import random_start
+from coopenv.bench.observers.convergence import random_start
 from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.bench.observers.basin import random_start
+from coopenv.bench.observers.convergence import random_start
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from coopenv.observers.runner import Run

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.observers.basin import random_start
+from coopenv.bench.observers.convergence import random_start
 from coopenv.bench.observers.faults import DIRECTION, VARIANTS, changed, usual_sender
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors

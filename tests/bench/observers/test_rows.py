@@ -1,4 +1,4 @@
-"""Figures by window: worked out here from the runs themselves, told in every file, and in tables that fit."""
+"""Rows: figures by window worked out from the runs themselves; standard errors against many repetitions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, judge
 from coopenv.bench.observers.judge import Window, windows_of
-from coopenv.bench.observers.rows import EDGES, WindowRow, checked_edges, spread
+from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, spread
 from coopenv.cli import main
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
@@ -102,17 +102,8 @@ def test_seeds_share_one_bound(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_command_writes_and_prints_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [
-        "bench",
-        "observers",
-        "lane:12",
-        "--observers",
-        "mekf_covariance",
-        "--seeds",
-        "2",
-        "--windows",
-        "0.2,0.5,2",
-    ]
+    words = ["bench", "observers", "lane:12", "--observers", "mekf_covariance", "--seeds", "2"]
+    words += ["--windows", "0.2,0.5,2"]
     assert main([*words, "--set", "horizon=1.0", "--jobs", "1", "--out", str(tmp_path / "new")]) == 0
     printed = capsys.readouterr().out
     assert max(len(line) for line in printed.splitlines() if not line.startswith("Files in")) <= 100
@@ -135,3 +126,34 @@ def test_few_vehicles_are_shown_one_by_one(found: coopenv.Comparison) -> None:
     assert len(shown) == 2  # ratios and ANEES
     assert float(shown[0][3].partition("(")[0]) == pytest.approx(rows[0].ratio_to_bound_ancestors, abs=0.06)
     assert float(shown[1][3].partition("(")[0]) == pytest.approx(rows[0].anees, abs=0.06)
+
+
+EXPERIMENTS, SEEDS, VEHICLES = 2000, 40, 3
+
+
+def squares(generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return (E, S, N) mean squares of an observer and of a worse one, which shares most of its errors."""
+    common = generator.gamma(6.0, 1.0, (EXPERIMENTS, SEEDS, 1)) * np.array([1.0, 2.0, 5.0])
+    own, other = (common * generator.gamma(30.0, 1 / 30.0, (EXPERIMENTS, SEEDS, VEHICLES)) for _ in range(2))
+    return own, 4.0 * other
+
+
+def test_standard_errors_are_the_spread_of_repetitions() -> None:
+    one, two = squares(np.random.default_rng(0))
+    roots = [mean_root(s) for s in one]
+    assert np.mean([r.error for r in roots]) == pytest.approx(np.std([r.value for r in roots]), rel=0.06)
+    ratios = [ratio(b, a) for a, b in zip(one, two, strict=True)]
+    assert np.mean([r.value for r in ratios]) == pytest.approx(2.0, rel=0.01)
+    assert np.mean([r.error for r in ratios]) == pytest.approx(np.std([r.value for r in ratios]), rel=0.06)
+    unpaired = np.hypot(roots[0].error / roots[0].value, mean_root(two[0]).error / mean_root(two[0]).value) * 2.0
+    assert ratios[0].error < 0.6 * unpaired  # what both share cancels
+
+
+def test_values() -> None:
+    found = mean_root(np.array([[1.0, 4.0], [9.0, 16.0]]))
+    assert found.value == pytest.approx((np.sqrt(5.0) + np.sqrt(10.0)) / 2)
+    assert mean_root(np.array([[9.0]])).value == 3.0 and np.isnan(mean_root(np.array([[9.0]])).error)
+    same = np.array([[1.0], [2.0]])
+    assert ratio(same, same) == (1.0, 0.0)
+    assert mean_root(np.zeros((3, 2))) == (0.0, 0.0)
+    assert ratio(same, 0.0 * same) is UNKNOWN and ratio(same, np.nan * same) is UNKNOWN

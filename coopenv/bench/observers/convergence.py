@@ -1,41 +1,35 @@
-"""Basins of attraction: from which initial estimates an observer finds the truth.
+"""Convergence: over many seeds of a scenario, and from many initial estimates on one record (basins of attraction).
 
-One record, and many draws of the initial estimates on it: attitude uniform over SO(3), position uniform in a ball.
+Of initial estimates the attitude is uniform over SO(3), the position uniform in a ball.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
-from coopenv.estimation.metrics import CONVERGED, Interval, settling_time, wilson_interval
-from coopenv.estimation.poses import Array
+from coopenv.estimation.metrics import CONVERGED, SETTLED, Interval, settling_time, wilson_interval
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable
 from coopenv.observers.runner import run
 from coopenv.runs.console import number_table
+from coopenv.runs.rollouts import Views, play
+from coopenv.scenario import Scenario
 
 RADIUS = 15.0  # m
 ANGLE_BINS = tuple(range(0, 181, 30))  # deg
 UNIFORM_ANGLE_VARIANCE = (np.pi**2 / 3.0 + 2.0) / 3.0  # rad^2, per axis of the vectors of rotations uniform over SO(3)
-
-
-@dataclass(frozen=True)
-class BasinTask:
-    """Some draws for all observers."""
-
-    source: Source
-    draws: Sequence[int]
-    observers: Mapping[str, str | Factory]
 
 
 @dataclass(frozen=True)
@@ -76,17 +70,6 @@ class Basin:
     """The vehicle that failed in the first of them, when and why; empty where there is none."""
 
 
-def with_start(recording: Recording, rotations: Array, positions: Array, covariance: ArrayLike) -> Recording:
-    """Return the record with other initial estimates.
-
-    Rotations (N, 3, 3) map body to map, positions (N, 3) are in the map, m; the covariance, (6, 6) for all or
-    (N, 6, 6), is in LEFT coordinates, rad and m.
-    """
-    P = np.array(np.broadcast_to(np.asarray(covariance, float), (len(recording.setups), 6, 6)))
-    R, p = np.array(rotations, float), np.array(positions, float)
-    return changed(recording, start_rotation=R, start_position=p, start_covariance=P)
-
-
 def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Recording:
     """Return the record with attitudes uniform over SO(3) and positions uniform in a ball about the true ones.
 
@@ -97,29 +80,31 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
     direction = generator.normal(size=(N, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = radius * generator.random((N, 1)) ** (1 / 3)
-    rotations = np.asarray(Rotation.random(N, generator).as_matrix())
+    rotations = np.array(Rotation.random(N, generator).as_matrix())
     covariance = np.diag(np.repeat([UNIFORM_ANGLE_VARIANCE, radius**2 / 5.0], 3))
-    return with_start(recording, rotations, recording.truth.position[0] + distance * direction, covariance)
+    return changed(
+        recording,
+        start_rotation=rotations,
+        start_position=recording.truth.position[0] + distance * direction,
+        start_covariance=np.tile(covariance, (N, 1, 1)),
+    )
 
 
-def draw_starts(task: BasinTask) -> list[Draw]:
-    """Run every observer from every draw of a task."""
-    recording = task.source.recording(task.source.usual[0], 0)
-    found = []
-    for draw in task.draws:
-        started = random_start(recording, draw)
-        for name, factory in task.observers.items():
-            result = run(factory, started)
-            angle, distance = result.orientation_error, result.position_error
-            times = settling_time(result.t, distance, angle, CONVERGED)
-            converged = CONVERGED.contains(distance[-1], angle[-1])
-            found += [
-                Draw(
-                    *(draw, name, setup.name, float(angle[0, i]), float(distance[0, i]), bool(converged[i])),
-                    *(float(times[i]), float(distance[-1, i]), float(angle[-1, i]), result.failure),
-                )
-                for i, setup in enumerate(recording.setups)
-            ]
+def draw_starts(source: Source, observers: Mapping[str, str | Factory], draw: int) -> list[Draw]:
+    """Run every observer from one draw of the initial estimates."""
+    started, found = random_start(source.recording(source.usual[0], 0), draw), []
+    for name, factory in observers.items():
+        result = run(factory, started)
+        angle, distance = result.orientation_error, result.position_error
+        times = settling_time(result.t, distance, angle, CONVERGED)
+        converged = CONVERGED.contains(distance[-1], angle[-1])
+        found += [
+            Draw(
+                *(draw, name, setup.name, float(angle[0, i]), float(distance[0, i]), bool(converged[i])),
+                *(float(times[i]), float(distance[-1, i]), float(angle[-1, i]), result.failure),
+            )
+            for i, setup in enumerate(started.setups)
+        ]
     return found
 
 
@@ -143,8 +128,7 @@ def study_basin(
     """
     check_source(source)
     sent = {name: portable(name) for name in observers}
-    tasks = [BasinTask(source, (draw,), sent) for draw in range(draws)]
-    found = executor.map(draw_starts, tasks, lambda done: on_progress(done / draws))
+    found = executor.map(partial(draw_starts, source, sent), range(draws), lambda done: on_progress(done / draws))
     return [draw for name in observers for part in found for draw in part if draw.observer == name]
 
 
@@ -210,3 +194,80 @@ def by_angle(draws: Sequence[Draw]) -> list[tuple[int, int]]:
         for weights in (np.ones(len(draws)), np.array([draw.converged for draw in draws], float))
     )
     return list(zip(converged, every, strict=True))
+
+
+@dataclass(frozen=True)
+class SeedStudy:
+    """Results of a scenario's own observer over many seeds, per seed (S) and vehicle (N)."""
+
+    vehicles: list[str]
+    seeds: list[int]
+    steady_from: float
+    """s"""
+    position_rmse_m: np.ndarray
+    """Over t > steady_from."""
+    orientation_rmse_deg: np.ndarray
+    settle_time_s: np.ndarray
+    """After which the errors stay within SETTLED; NaN: never."""
+    final_position_error_m: np.ndarray
+    final_orientation_error_deg: np.ndarray
+
+    def document(self, environment: str) -> dict[str, Any]:
+        """Return what `bench seeds --json` prints: per vehicle, one figure per seed."""
+        figures = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        return {
+            "environment": environment,
+            "seeds": self.seeds,
+            "steady_from_s": self.steady_from,
+            "settled_below": SETTLED._asdict(),
+            "vehicles": [
+                {"vehicle": vehicle, **{name: values[:, i] for name, values in figures.items()}}
+                for i, vehicle in enumerate(self.vehicles)
+            ],
+        }
+
+
+def study_seeds(
+    scenario: Scenario, seeds: range, steady_from: float, on_progress: Callable[[float], None] = lambda share: None
+) -> SeedStudy:
+    """Run one world per seed, all at once, with action zero, and judge every camera tick; `steady_from` in s."""
+    engine, ticks = Engine(scenario, len(seeds), "float64"), scenario.horizon_ticks
+    views = Views(engine, ("position_error", "orientation_error"))
+    for tick in play(engine, seeds, ticks):
+        views.take()
+        if tick % 100 == 0:
+            on_progress(tick / ticks)
+    position, orientation = views["position_error"], views["orientation_error"]
+    t = np.arange(ticks + 1) / scenario.rates.camera
+    steady = t > steady_from
+    return SeedStudy(
+        vehicles=scenario.vehicle_names,
+        seeds=list(seeds),
+        steady_from=steady_from,
+        position_rmse_m=np.sqrt((position[steady] ** 2).mean(axis=0)),
+        orientation_rmse_deg=np.sqrt((orientation[steady] ** 2).mean(axis=0)),
+        settle_time_s=settling_time(t, position, orientation, SETTLED),
+        final_position_error_m=position[-1],
+        final_orientation_error_deg=orientation[-1],
+    )
+
+
+def seed_table(study: SeedStudy) -> Table:
+    """Return one row per vehicle: settled seeds, settling time, steady RMSE as mean, spread and worst."""
+    rmse = ("position RMSE [m]\nmean±std (worst)", "orientation [deg]\nmean±std (worst)")
+    table = number_table(("vehicle",), ("settled\nseeds", "settles at [s]\nmedian (last)", *rmse))
+    for i, vehicle in enumerate(study.vehicles):
+        times = study.settle_time_s[:, i]
+        settled = times[np.isfinite(times)]
+        table.add_row(
+            vehicle,
+            f"{len(settled)}/{len(times)}",
+            f"{np.median(settled):.1f} ({settled.max():.1f})" if len(settled) else "-",
+            _spread(study.position_rmse_m[:, i], 4),
+            _spread(study.orientation_rmse_deg[:, i], 2),
+        )
+    return table
+
+
+def _spread(values: np.ndarray, digits: int) -> str:
+    return f"{values.mean():.{digits}f}±{values.std():.{digits}f} ({values.max():.{digits}f})"
