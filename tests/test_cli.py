@@ -18,7 +18,7 @@ from coopenv.base.installation import environment_id, list_agents
 from coopenv.bench.observers.faults import FAULTS, VARIANTS
 from coopenv.cli import main
 from coopenv.cli.options import parse_value
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory
 from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
 from coopenv.runs import console

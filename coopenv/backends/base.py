@@ -15,8 +15,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown, suggest
-from coopenv.estimation.poses import Array
-from coopenv.estimation.validity import are_numbers, are_rotations
+from coopenv.estimation.poses import Array, are_numbers, are_rotations
 from coopenv.observers.contract import Message, check_message
 from coopenv.observers.recording import ObserverInit, Sensed
 from coopenv.observers.runner import observer_init_of

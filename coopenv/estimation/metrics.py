@@ -18,12 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.observability import Observability, slowest_decay
-from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg, skew
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Observability, Trajectory, slowest_decay
+from coopenv.estimation.poses import Array, Coordinates, covariance_in_map, orientation_error_deg
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
 MIRROR_ANGLE_DEG = 150.0  # an orientation error above it at the end of a run is the mirrored solution, not a slow one
@@ -271,11 +269,9 @@ def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> Interv
     """Return the interval of a probability of which `successes` in `trials` were seen; all of [0, 1] without trials."""
     if trials == 0:
         return Interval(0.0, 1.0)
-    z, share = float(ndtri((1.0 + level) / 2.0)), successes / trials
-    centre = share + z**2 / (2 * trials)
-    spread = z * math.sqrt(share * (1.0 - share) / trials + z**2 / (4 * trials**2))
-    scale = 1.0 + z**2 / trials
-    return Interval(max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale))
+    from scipy.stats import binomtest
+
+    return Interval(*binomtest(successes, trials).proportion_ci(level, "wilson"))
 
 
 def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:
@@ -284,18 +280,9 @@ def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:
 
 
 def position_std(covariance: Array, coordinates: Coordinates, rotation: Array, position: Array) -> Array:
-    """Return sqrt(trace) (...) of the covariance of the position in the map that P (..., 6, 6) states, m.
-
-    To first order pbar - pbarhat is, up to a rotation, rho in LEFT coordinates, rho - S(pbarhat) theta in RIGHT ones,
-    and dp - S(phat) theta in the paper's, whose phat is in the body frame. The estimate's position is in the map, m.
-    """
-    if coordinates is Coordinates.LEFT:
-        variance = np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1)
-    else:
-        if coordinates is Coordinates.RICCATI:
-            position = (np.swapaxes(rotation, -1, -2) @ position[..., None])[..., 0]
-        J = np.concatenate([-skew(position), np.broadcast_to(np.eye(3), (*position.shape, 3))], axis=-1)
-        variance = np.einsum("...ij,...jk,...ik->...", J, covariance, J)
+    """Return sqrt(trace) (...) of the covariance of the position in the map that P (..., 6, 6) states, m."""
+    in_map = covariance_in_map(coordinates, rotation, position, covariance)
+    variance = np.trace(in_map[..., :3, :3], axis1=-2, axis2=-1)
     return np.sqrt(np.where(variance >= 0.0, variance, np.nan))  # not every P that is stated is a covariance
 
 

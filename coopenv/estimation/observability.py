@@ -1,4 +1,4 @@
-"""Uniform observability of (A_i, C*_i) along a run: the condition of the paper's theorem, evaluated.
+"""The record of a run, and uniform observability of (A_i, C*_i) along it: the condition of the paper's theorem.
 
 For vehicle i and the targets j that it sees at a tick, the rows of C*_i = C_i(0, p_i, t) are [-Pi_g S(R_i^T
 pbar_j), Pi_g] over the state (2 lambda, p), with Pi_g = I - g g^T. The projection is even in g, so it does
@@ -30,11 +30,14 @@ isotropic. As in the theorem, neighbours count as known, and lambda and p are ab
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self, get_type_hints
 
 import numpy as np
 
+from coopenv.base.files import replacing_file
+from coopenv.base.sections import read_npz
 from coopenv.estimation.poses import Array, skew
 
 DEFAULT_WINDOW = 1.0
@@ -49,28 +52,72 @@ class ObservabilityInterval(NamedTuple):
     observable: bool
 
 
-class RecordedGeometry(Protocol):
-    """What of a record matters here; a `Trajectory` has it. Shapes and units as there."""
+@dataclass(frozen=True)
+class Trajectory:
+    """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).
 
-    @property
-    def t(self) -> np.ndarray:
-        """(K,) s."""
+    Each array is annotated with the kinds of its dtype and its axes; there are R reward terms.
 
-    @property
-    def position(self) -> np.ndarray:
-        """(K, N, 3) m, map frame."""
+    Frames: `position*` in the map frame; `rotation*` maps body to map; velocities in the body frame;
+    `covariance` is the observer's P over (2 lambda, p), p being the position in the body frame.
+    """
 
-    @property
-    def target_position(self) -> np.ndarray:
-        """(K, T, 3) m, map frame."""
+    t: Annotated[np.ndarray, "f K"]  # s
+    position: Annotated[np.ndarray, "f K N 3"]  # m
+    rotation: Annotated[np.ndarray, "f K N 3 3"]
+    position_estimate: Annotated[np.ndarray, "f K N 3"]  # m
+    rotation_estimate: Annotated[np.ndarray, "f K N 3 3"]
+    position_error: Annotated[np.ndarray, "f K N"]  # m
+    orientation_error: Annotated[np.ndarray, "f K N"]  # deg, geodesic
+    covariance: Annotated[np.ndarray, "f K N 6 6"]  # rad^2, rad m, m^2
+    nees: Annotated[np.ndarray, "f K N"]
+    velocity: Annotated[np.ndarray, "f K N 3"]  # m/s, truth
+    angular_velocity: Annotated[np.ndarray, "f K N 3"]  # rad/s, truth
+    target_position: Annotated[np.ndarray, "f K T 3"]  # m, truth
+    visible: Annotated[np.ndarray, "b K N T"]
+    sight: Annotated[np.ndarray, "iu K N T"]  # uint8, values of `Sight`
+    reward_terms: Annotated[np.ndarray, "f K N R"]  # of the tick: as if each tick were a decision
+    terms: Annotated[np.ndarray, "U R"]  # names of the terms
+    vehicles: Annotated[np.ndarray, "U N"]  # names
+    targets: Annotated[np.ndarray, "U T"]  # names
+    target_moving: Annotated[np.ndarray, "b T"]  # vehicles and moving landmarks
 
-    @property
-    def visible(self) -> np.ndarray:
-        """(K, N, T) bool."""
+    def where_truth_is_known(self) -> Self:
+        """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
+        known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
+        if known.all():
+            return self
+        constant = ("terms", "vehicles", "targets", "target_moving")
+        return replace(self, **{f.name: getattr(self, f.name)[known] for f in fields(self) if f.name not in constant})
 
-    @property
-    def vehicles(self) -> np.ndarray:
-        """(N,) names."""
+    def of_vehicles(self, indices: Sequence[int]) -> Self:
+        """Return the record of some vehicles alone; the others stay among the targets."""
+        if [*indices] == [*range(len(self.vehicles))]:
+            return self
+        of_all = ("t", "target_position", "terms", "targets", "target_moving")
+        chosen = {
+            f.name: getattr(self, f.name)[:, [*indices]] for f in fields(self) if f.name not in (*of_all, "vehicles")
+        }
+        return replace(self, vehicles=self.vehicles[[*indices]], **chosen)
+
+    def save(self, path: Path) -> None:
+        """Write every array into a compressed `.npz` under its field name.
+
+        Raises:
+            OutputError: it cannot be written; an older file is untouched.
+        """
+        with replacing_file(path) as new, new.open("wb") as stream:
+            np.savez_compressed(stream, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file written by `save`.
+
+        Raises:
+            DataError: the file is no such record, an array is missing or of another shape, or it is too large.
+        """
+        hints = get_type_hints(cls, include_extras=True)
+        return cls(**read_npz(path, "trajectory", {name: hint.__metadata__[0] for name, hint in hints.items()}))
 
 
 @dataclass(frozen=True)
@@ -112,7 +159,7 @@ class Observability:
 
 
 def analyse_observability(
-    scene: RecordedGeometry, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+    scene: Trajectory, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
@@ -138,13 +185,14 @@ def analyse_observability(
     )
 
 
-def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows_about_anchor(scene: Trajectory, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 
     A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
     """
     anchor = scene.position.mean(axis=0)
-    t, rate = scene.t, _information_rate(scene, anchor)
+    t, vehicles = scene.t, range(scene.position.shape[1])
+    rate = np.stack([_information_of(scene, i, anchor[i]) for i in vehicles], axis=1)
     step = np.diff(t)[:, None, None, None]
     total = np.concatenate([np.zeros_like(rate[:1]), np.cumsum(0.5 * step * (rate[1:] + rate[:-1]), axis=0)])
     slack = 1e-6 * max(window, np.finfo(float).tiny)
@@ -154,23 +202,15 @@ def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.nd
     return start, (total[end] - total[start]) / length, anchor
 
 
-def _information_rate(scene: RecordedGeometry, anchor: np.ndarray) -> np.ndarray:
-    """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
-    rate = np.empty((*scene.position.shape[:2], 6, 6))
-    for i in range(scene.position.shape[1]):  # one by one: all pairs at once may be gigabytes
-        rate[:, i] = _information_of(scene, i, anchor[i])
-    return rate
-
-
-def _information_of(scene: RecordedGeometry, i: int, anchor: np.ndarray) -> np.ndarray:
-    """Return C*^T C* (K, 6, 6) of one vehicle in map axes, about a point (3,)."""
+def _information_of(scene: Trajectory, i: int, anchor: np.ndarray, q: Array | float = 1.0) -> np.ndarray:
+    """Return C*^T Q C* (K, 6, 6) of one vehicle in map axes, about a point (3,); q (T,) are weights of targets."""
     known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
     place = np.where(known[..., None], scene.target_position, 0.0)
     offset = place - scene.position[:, i, None]  # (K, T, 3)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     bearing = offset / np.where(distance > 0, distance, 1.0)
     seen = scene.visible[:, i] & known & (distance[..., 0] > 0)
-    projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
+    projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * np.where(seen, q, 0.0)[..., None, None]
     lever = skew(place - anchor)  # (K, T, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
     rate = np.empty((len(scene.position), 6, 6))
@@ -211,7 +251,7 @@ class ConvergenceRates(NamedTuple):
 
 
 def convergence_rates(
-    scene: RecordedGeometry, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
+    scene: Trajectory, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
 ) -> ConvergenceRates:
     """Return the rates of the paper's observer along a record.
 
@@ -223,7 +263,7 @@ def convergence_rates(
         P0: that of P(0).
     """
     vehicles = range(len(k))
-    M = np.stack([weighted_information(scene, i, q) for i in vehicles], axis=1)
+    M = np.stack([_information_of(scene, i, np.zeros(3), q) for i in vehicles], axis=1)
     drift, gain = np.diag(np.repeat(V, 3)), np.asarray(k, float)[:, None, None]
     P, identity = np.tile(np.diag(np.repeat(np.array(P0, float), 3)), (len(k), 1, 1)), np.eye(6)
     guaranteed, frozen = np.empty(M.shape[:2]), np.empty(M.shape[:2])
@@ -238,19 +278,6 @@ def convergence_rates(
         guaranteed[n] = np.linalg.eigvalsh((gain - 0.5) * pulled + 0.5 * grown)[:, 0]
         frozen[n] = gain[:, 0, 0] * np.linalg.eigvalsh(pulled)[:, 0]
     return ConvergenceRates(scene.t, guaranteed, np.maximum(frozen, 0.0))
-
-
-def weighted_information(scene: RecordedGeometry, i: int, q: Array) -> Array:
-    """Return M = C*^T Q C* (K, 6, 6) of one vehicle in map axes, about the map's origin; q (T,) are the weights."""
-    known = np.isfinite(scene.target_position).all(axis=-1)
-    place = np.where(known[..., None], scene.target_position, 0.0)
-    offset = place - scene.position[:, i, None]
-    distance = np.linalg.norm(offset, axis=-1, keepdims=True)
-    bearing = offset / np.where(distance > 0, distance, 1.0)
-    weight = np.where(scene.visible[:, i] & known & (distance[..., 0] > 0), q, 0.0)
-    across = np.eye(3) - bearing[..., :, None] * bearing[..., None, :]
-    rows = np.concatenate([-across @ skew(place), across], axis=-1)
-    return np.asarray(np.einsum("kt,ktai,ktaj->kij", weight, rows, rows))
 
 
 def least_mean(t: Array, rates: Array, window: float = WINDOW) -> tuple[float, float]:

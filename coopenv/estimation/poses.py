@@ -1,4 +1,4 @@
-"""Rotations, rigid motions, pose errors and their covariances in NumPy; linear algebra of a few rows by LAPACK.
+"""Rotations, rigid motions, pose errors and their covariances in NumPy, and the validity of arrays from outside.
 
 For single small arrays `A.dot(B)` takes a third of the time of `A @ B`, and LAPACK a part of that of `numpy.linalg`.
 Rigid motions T = (R, p) of SE(3) have tangent vectors xi = (theta, rho) in rad and m. Source: Barfoot, State Estimation
@@ -6,12 +6,16 @@ for Robotics, 2017, chapter 7 (there translations come first).
 """
 
 import math
+from collections.abc import Callable, Mapping
 from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv, dpotrf
 from scipy.spatial.transform import Rotation
+
+from coopenv.base.format import LARGEST
 
 Array = NDArray[np.float64]
 
@@ -119,11 +123,6 @@ def exp_se3(xi: Array) -> tuple[Array, Array]:
     SS = S @ S
     left_jacobian = IDENTITY + b * S + c * SS
     return IDENTITY + a * S + b * SS, (left_jacobian @ rho[..., None])[..., 0]
-
-
-def rigid_exp(w: Array, v: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) and translation (3,) of Exp((w, v)), as `exp_se3` does of one pair, but faster."""
-    return exp_so3(w), exp_translation(w, v)
 
 
 def exp_translation(w: Array, v: Array) -> Array:
@@ -276,37 +275,128 @@ def position_covariance(rotation: Array, position: Array, covariance: Array) -> 
     return covariance_in_map(Coordinates.RICCATI, R, in_map, covariance)[..., :3, :3]
 
 
-def riccati_jacobian(coordinates: Coordinates, rotation: Array, position: Array) -> Array:
-    """Return J (6, 6) with e_riccati = J e to first order, e being an error in the given coordinates.
+def riccati_covariance(coordinates: Coordinates, rotation: Array, position: Array, covariance: Array) -> Array:
+    """Return a covariance (6, 6) in RICCATI coordinates, to first order.
 
     With R = Rhat Exp(theta) and p = phat + Rhat rho (LEFT), R^T p = Rhat^T phat + rho + [Rhat^T phat]x theta + ...,
     and 2 lambda = theta + ...; a RIGHT error (theta, rho) turns both by Rhat^T.
 
     Args:
-        coordinates: of the error e.
+        coordinates: of the error that `covariance` is about.
         rotation: Rhat (3, 3), body to map.
         position: phat (3,), map, m.
+        covariance: P (6, 6).
     """
-    J, R_T = np.eye(6), rotation.T
-    if coordinates is Coordinates.LEFT:
-        J[3:, :3] = skew(R_T @ position)
-    elif coordinates is Coordinates.RIGHT:
-        J[:3, :3] = J[3:, 3:] = R_T
-    return J
-
-
-def riccati_covariance(coordinates: Coordinates, rotation: Array, position: Array, covariance: Array) -> Array:
-    """Return a covariance (6, 6) in RICCATI coordinates, to first order; arguments as in `riccati_jacobian`."""
     if coordinates is Coordinates.RICCATI:
         return covariance
-    J = riccati_jacobian(coordinates, rotation, position)
-    P = J @ covariance @ J.T
-    return np.asarray((P + P.T) / 2)
+    if coordinates is Coordinates.LEFT:
+        return _sheared(skew(rotation.T @ position), covariance)
+    J = np.kron(np.eye(2), rotation.T)
+    return _symmetric(J @ covariance @ J.T)
 
 
 def left_covariance(position: Array, covariance: Array) -> Array:
     """Return a covariance over (2 lambda, p) in LEFT coordinates, to first order; `position` is in the body, m."""
-    J = np.eye(6)
-    J[3:, :3] = -skew(position)
-    P = J @ covariance @ J.T
+    return _sheared(-skew(position), covariance)
+
+
+def _sheared(S: Array, P: Array) -> Array:
+    """Return T P T^T, T = [[I, 0], [S, I]], exactly symmetric."""
+    T = np.eye(6)
+    T[3:, :3] = S
+    return _symmetric(T @ P @ T.T)
+
+
+def _symmetric(P: Array) -> Array:
     return np.asarray((P + P.T) / 2, dtype=np.float64)
+
+
+Values = NDArray[Any]
+Mask = NDArray[np.bool_]
+Fields = Mapping[str, Values]
+
+MAX_BEND = 1e-6
+"""By how much entries of R^T R may differ from those of I, and the squared length of a direction from 1."""
+MOST_LOPSIDED = 1e-6
+"""By how much a covariance and its transpose may differ, relative to it, in Frobenius' norm."""
+MAX_ASYMMETRY = 1e-6
+"""By how much entries of a covariance may differ from its transpose, relative to the standard deviations."""
+
+
+class Rule(NamedTuple):
+    """Condition on every element of an array of a saved state, a recording or a tick."""
+
+    must_be: str  # in words, for errors
+    holds: Callable[[Values, Fields, Any], Mask]
+    """Returns which elements satisfy it, from the array, all arrays by name, and the model (None: there is none)."""
+    axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
+    used: str = ""
+    """Array that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
+    be finite."""
+    of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
+
+    def elements(self, mask: Mask) -> Mask:
+        """Return of which elements a mask of numbers holds."""
+        return everywhere(mask, *range(-self.axes, 0))
+
+    def valid(self, array: Values, fields: Fields, model: Any, knows_truth: bool) -> Mask:
+        """Return which elements satisfy it, do not count, or are not known."""
+        valid = self.holds(array, fields, model)
+        if self.used:
+            used = fields[self.used]
+            if used.ndim < valid.ndim:
+                used = np.arange(valid.shape[-1]) < used[..., None]
+            valid = valid | ((used == 0) & self.elements(np.isfinite(array)))
+        if self.of_truth and not knows_truth:
+            valid = valid | self.elements(np.isnan(array))
+        return valid
+
+
+def are_numbers(values: Values) -> Mask:
+    """Return where values are finite and not beyond any quantity."""
+    return np.asarray(np.abs(values) <= LARGEST)
+
+
+def everywhere(mask: Mask, *axes: int) -> Mask:
+    """Return where a mask holds all along some axes."""
+    return np.asarray(mask.all(axis=axes))
+
+
+def are_unit_vectors(vectors: Values, tolerance: float = MAX_BEND) -> Mask:
+    """Return (...) which vectors (..., 3) have length 1."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.abs(np.square(vectors).sum(axis=-1) - 1.0) <= tolerance)
+
+
+def are_rotations(matrices: Values, tolerance: float = MAX_BEND) -> Mask:
+    """Return (...) which matrices (..., 3, 3) are rotations."""
+    bounded = everywhere(np.abs(matrices) <= 2.0, -1, -2)
+    R = np.where(bounded[..., None, None], matrices, 0.0)
+    bend = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2), initial=0.0)
+    first, second, third = (R[..., :, axis] for axis in range(3))
+    handedness = (np.cross(first, second) * third).sum(axis=-1)
+    return np.asarray(bounded & (bend <= tolerance) & (handedness > 0.0))
+
+
+def are_covariances(matrices: Values, least: float) -> Mask:
+    """Return (...) which matrices (..., n, n) are symmetric, not too large, and definite enough.
+
+    `least` is the smallest eigenvalue that their correlations may have; below 0 for those that are singular or rounded.
+    """
+    P = np.asarray(matrices, dtype=np.float64)
+    bounded = everywhere(np.abs(P) <= LARGEST**2, -1, -2)
+    P = np.where(bounded[..., None, None], P, 0.0)
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    std = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlation = P / (std[..., :, None] * std[..., None, :])
+    skew = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(axis=(-1, -2), initial=0.0)
+    return np.asarray(bounded & (skew <= MAX_ASYMMETRY) & _eigenvalues_exceed(correlation, least))
+
+
+def _eigenvalues_exceed(matrices: Values, least: float) -> Mask:
+    """Return (...) which symmetric matrices have no eigenvalue below one; a Cholesky factor of all is soonest made."""
+    try:
+        np.linalg.cholesky(matrices - least * np.eye(matrices.shape[-1]))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.eigvalsh(matrices)[..., 0] > least)
+    return np.ones(matrices.shape[:-2], dtype=bool)

@@ -6,8 +6,15 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import FLAG, MATRICES, MATRIX, NUMBER, ROW, VECTOR, WHOLE, compiled
-from coopenv.estimation.compiled_algebra import (
+from coopenv.estimation.compiled import (
+    FLAG,
+    MATRICES,
+    MATRIX,
+    NUMBER,
+    ROW,
+    VECTOR,
+    WHOLE,
+    compiled,
     congruent,
     cross_matrix,
     exp_so3,

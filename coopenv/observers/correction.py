@@ -27,8 +27,18 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, NUMBER, VECTOR, WHOLE, compiled
-from coopenv.estimation.compiled_algebra import eliminated, place, product, transformed
+from coopenv.estimation.compiled import (
+    MATRICES,
+    MATRIX,
+    NUMBER,
+    VECTOR,
+    WHOLE,
+    compiled,
+    eliminated,
+    place,
+    product,
+    transformed,
+)
 from coopenv.estimation.poses import Array, solve
 from coopenv.observers.bearing_measurements import (
     RIGHT,

@@ -28,8 +28,7 @@ from math import log
 
 import numpy as np
 
-from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled
-from coopenv.estimation.compiled_algebra import congruent
+from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled, congruent
 from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import (
     BearingMeasurements,

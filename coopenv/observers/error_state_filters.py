@@ -6,8 +6,16 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
-from coopenv.estimation.compiled_algebra import congruent, exp_so3, exp_translation, transformed
+from coopenv.estimation.compiled import (
+    MATRICES,
+    MATRIX,
+    VECTOR,
+    compiled,
+    congruent,
+    exp_so3,
+    exp_translation,
+    transformed,
+)
 from coopenv.estimation.poses import IDENTITY, Array, Coordinates, cholesky, lengths, skew, solve
 from coopenv.observers import bearing_measurements
 from coopenv.observers.bearing_measurements import (

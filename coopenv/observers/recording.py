@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from coopenv.base.errors import CoopenvError, DataError, shown
 from coopenv.base.format import LARGEST
-from coopenv.estimation.poses import Array
-from coopenv.estimation.validity import (
+from coopenv.estimation.poses import (
+    Array,
     Fields,
     Mask,
     Rule,

@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
-from coopenv.estimation.compiled_algebra import eliminated, place, product, transformed
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, eliminated, place, product, transformed
 from coopenv.estimation.poses import Array, cholesky, skew
 from coopenv.observers.bearing_measurements import (
     LEFT,

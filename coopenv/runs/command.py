@@ -15,8 +15,7 @@ from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.estimation.metrics import steady_start
-from coopenv.estimation.observability import Observability, analyse_observability
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.registry import states_covariance
 from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics

@@ -10,8 +10,8 @@ from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.base.files import replace_text, writing
+from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
-from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.interference import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy

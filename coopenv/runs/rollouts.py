@@ -16,9 +16,8 @@ from coopenv.backends.base import EPISODE_OVER, Backend
 from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.base.installation import version
 from coopenv.estimation.metrics import CONVERGED, observability_of, summarise
-from coopenv.estimation.observability import ConvergenceRates, Observability, convergence_rates, least_mean
+from coopenv.estimation.observability import ConvergenceRates, Observability, Trajectory, convergence_rates, least_mean
 from coopenv.estimation.outcomes import Outcome, Sight
-from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import Policy, decide, load_policy, restart
 from coopenv.scenario import Scenario, load_scenario
 

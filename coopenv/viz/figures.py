@@ -25,9 +25,8 @@ from matplotlib.text import Text
 from coopenv.base.errors import CoopenvError, suggest
 from coopenv.base.files import writing
 from coopenv.estimation.metrics import live_ticks, mean_targets_in_view
-from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz import FIGURE_NAMES
 from coopenv.viz import style as house

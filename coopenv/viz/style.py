@@ -19,7 +19,7 @@ from matplotlib.ticker import NullFormatter
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replacing_file
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory
 from coopenv.viz import FORMATS
 
 # Okabe and Ito (2008), without the yellow that vanishes on white.

@@ -9,8 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.poses import Coordinates
-from coopenv.estimation.validity import Rule
+from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import depart, move, referee
 from coopenv.world.model import Precision

@@ -19,7 +19,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import LARGEST
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.validity import (
+from coopenv.estimation.poses import (
     Array,
     Fields,
     Mask,

@@ -8,7 +8,7 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.estimation.outcomes import UNKNOWN
-from coopenv.estimation.validity import Rule
+from coopenv.estimation.poses import Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model

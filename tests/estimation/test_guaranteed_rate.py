@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
 
-from coopenv.estimation.observability import convergence_rates, least_mean, slowest_decay
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory, convergence_rates, least_mean, slowest_decay
 from coopenv.runs.rollouts import rollout
 from coopenv.scenario import load_scenario
 from tests.helpers.synthetic import make_trajectory

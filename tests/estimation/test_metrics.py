@@ -13,8 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import metrics, poses
-from coopenv.estimation.observability import analyse_observability
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory, analyse_observability
 from tests.helpers.synthetic import INITIAL_ERROR, RATE, make_trajectory
 
 unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)

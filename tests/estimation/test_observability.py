@@ -13,9 +13,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.trajectory import Trajectory
 from tests.helpers.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
 
 YAW_RATE = 0.7

@@ -1,4 +1,4 @@
-"""SE(3) against matrix exponentials, covariances between error coordinates, and LAPACK called directly."""
+"""SE(3) against matrix exponentials, covariances between error coordinates, LAPACK called directly, and validity."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation.poses import (
     Coordinates,
     adjoint,
+    are_covariances,
+    are_numbers,
+    are_rotations,
+    are_unit_vectors,
     cholesky,
     exp_se3,
+    exp_so3,
+    exp_translation,
     riccati_covariance,
-    riccati_jacobian,
-    rigid_exp,
     solve,
 )
 
@@ -61,7 +65,7 @@ def test_adjoint_carries_a_motion_to_the_other_side() -> None:
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.sampled_from([1.0, 1e-3, 1e-5, 0.0]))
 def test_one_pair_alone_is_the_same(values: list[float], scale: float) -> None:
     xi = np.array(values) * scale
-    for one, many in zip(rigid_exp(xi[:3], xi[3:]), exp_se3(xi), strict=True):
+    for one, many in zip((exp_so3(xi[:3]), exp_translation(xi[:3], xi[3:])), exp_se3(xi), strict=True):
         np.testing.assert_allclose(one, many, atol=1e-9)
 
 
@@ -75,19 +79,6 @@ def truth(coordinates: Coordinates, e: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if coordinates is Coordinates.LEFT:
         return R_HAT @ turn, P_HAT + R_HAT @ e[3:]
     return turn @ R_HAT, turn @ P_HAT + e[3:]
-
-
-@pytest.mark.parametrize("coordinates", [Coordinates.LEFT, Coordinates.RIGHT])
-def test_jacobian_by_differences(coordinates: Coordinates) -> None:
-    h, columns = 1e-6, []
-    for axis in np.eye(6):
-        ends = []
-        for sign in (1.0, -1.0):
-            R, p = truth(coordinates, sign * h * axis)
-            assert_allclose(coordinates.error(R, p, R_HAT, P_HAT), sign * h * axis, atol=1e-12)
-            ends.append(Coordinates.RICCATI.error(R, p, R_HAT, P_HAT))
-        columns.append((ends[0] - ends[1]) / (2 * h))
-    assert_allclose(riccati_jacobian(coordinates, R_HAT, P_HAT), np.column_stack(columns), atol=1e-8)
 
 
 @pytest.mark.parametrize("coordinates", list(Coordinates))
@@ -126,3 +117,45 @@ def test_what_has_no_answer_is_refused() -> None:
         cholesky(np.diag([1.0, -1.0]))
     with pytest.raises(np.linalg.LinAlgError):
         solve(np.ones((2, 2)), np.ones(2))
+
+
+ROTATIONS = Rotation.random(200, random_state=0).as_matrix()
+
+
+def test_numbers() -> None:
+    assert are_numbers(np.array([0.0, -1e9, 5e-324, 1.1e9, np.nan, np.inf, -np.inf])).tolist() == [1, 1, 1, 0, 0, 0, 0]
+
+
+def test_unit_vectors() -> None:
+    vectors = ROTATIONS[:, 0]
+    assert are_unit_vectors(vectors).all()
+    for wrong in (0.0 * vectors, 1.001 * vectors, np.nan * vectors, 1e300 * vectors, vectors + np.inf):
+        assert not are_unit_vectors(wrong).any()
+
+
+def test_rotations() -> None:
+    assert are_rotations(ROTATIONS).all()
+    assert are_rotations(ROTATIONS.astype(np.float32), 1e-5).all()
+    for wrong in (0.0, 1.001, -1.0, np.nan, 1e300):
+        assert not are_rotations(wrong * ROTATIONS).any()
+    assert not are_rotations(ROTATIONS * [1.0, -1.0, 1.0]).any()  # reflections
+    assert not are_rotations(ROTATIONS + 1e-3 * np.tri(3)).any()
+    assert are_rotations(np.stack([np.eye(3), np.full((3, 3), np.inf)])).tolist() == [True, False]
+
+
+def test_covariances_of_very_different_variances() -> None:
+    L = np.random.default_rng(0).normal(size=(200, 6, 6))
+    P = L @ np.swapaxes(L, -1, -2)
+    scale = np.diag([1e-6, 1.0, 1e-3, 1e6, 1e3, 1.0])
+    P = scale @ P @ scale
+    P = (P + np.swapaxes(P, -1, -2)) / 2
+    assert are_covariances(P, 1e-12).all()
+    flat = P.copy()
+    flat[:, 2], flat[:, :, 2] = 0.0, 0.0
+    assert not are_covariances(flat, 1e-12).any() and are_covariances(flat, -1e-9).all()
+    lopsided = P.copy()
+    lopsided[:, 0, 1] *= 1.1
+    for wrong in (-P, np.nan * P, 1e200 * P, lopsided, np.zeros((2, 6, 6)), np.ones((2, 6, 6))):
+        assert not are_covariances(wrong, 1e-12).any()
+    mixed = np.stack([P[0], -P[1], P[2]])
+    assert are_covariances(mixed, 1e-12).tolist() == [True, False, True]

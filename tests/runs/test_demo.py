@@ -21,7 +21,7 @@ from coopenv.cars.fake.fleet import fakes, free_port
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from coopenv.cli.svea import STOPPED
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory
 from coopenv.runs.demo import FLEETS, Demo
 from tests.helpers.cars import write_fleet
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until

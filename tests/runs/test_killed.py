@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from coopenv.backends.mcap import read_recording
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import result_names
 from tests.helpers.processes import COOPENV, start
 

@@ -17,9 +17,8 @@ import coopenv
 from coopenv.base.errors import CoopenvError, DeviceError
 from coopenv.base.format import json_text
 from coopenv.estimation.metrics import CONVERGED, settling_time
-from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics

@@ -16,9 +16,8 @@ from scipy.stats import chi2
 
 from coopenv.base.errors import OutputError
 from coopenv.estimation.metrics import summarise
-from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FIGURE_NAMES, error_figures, style
 from coopenv.viz.error_figures import error_figure, observability_figure, unwrapped
 from coopenv.viz.figures import save_figures, topology_figure

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import proj3d
 
 import coopenv
-from coopenv.estimation.trajectory import Trajectory
+from coopenv.estimation.observability import Trajectory
 from coopenv.viz import style
 from coopenv.viz.trajectories import clipped, trajectory_figure_2d, trajectory_figure_3d
 from tests.helpers.drawn import texts, xdata, ydata

@@ -7,7 +7,7 @@ from itertools import islice
 import numpy as np
 
 from coopenv.cars.readings import CarPose, Detections, Twist
-from coopenv.estimation.poses import Array, exp_so3, log_so3, rigid_exp
+from coopenv.estimation.poses import Array, exp_so3, exp_translation, log_so3
 
 MOST_SAMPLES = 512
 """Samples that wait for a tick: five seconds of an IMU."""
@@ -79,7 +79,7 @@ class Odometer:
     def _go(self, R: Array, p: Array, duration: int) -> tuple[Array, Array]:
         v, w = self._now
         seconds = duration * 1e-9
-        turn, step = rigid_exp(w * seconds, v * seconds)
+        turn, step = exp_so3(w * seconds), exp_translation(w * seconds, v * seconds)
         return R.dot(turn), p + R.dot(step)
 
 
