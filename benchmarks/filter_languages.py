@@ -9,7 +9,9 @@ import time
 import numpy as np
 
 from coopenv.estimation.poses import Array, exp_so3, lengths, orthonormalise, right_jacobian, skew, solve
-from coopenv.observers import bearing_measurements, correction
+from coopenv.observers import bearing_measurements
+from coopenv.observers.bearing_measurements import Frame
+from coopenv.observers.correction import Stacked
 from coopenv.observers.error_state_filters import Mekf
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
@@ -53,7 +55,7 @@ def linearise(
     return (B @ bearings[..., None])[..., 0], H, G @ C @ G.transpose(0, 2, 1) + variance * np.eye(2), G
 
 
-def stacked(R: Array, p: Array, frame: correction.Frame) -> correction.Stacked:
+def stacked(R: Array, p: Array, frame: Frame) -> Stacked:
     """Return residual (2m,), H (2m, 6) and N (2m, 2m) at a pose."""
     residual, H, N, _ = linearise(R, p, False, *frame)
     m, dense = np.arange(len(N)), np.zeros((len(N), 2, len(N), 2))
@@ -75,7 +77,7 @@ def recentring(dx: Array) -> Array:
     return G
 
 
-def updated(kind: int, R: Array, p: Array, P: Array, frame: correction.Frame) -> tuple[Array, Array, Array, float]:
+def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
     """Return what `correction.updated` does of a left error."""
     residual, H, N = stacked(R, p, frame)
     _, dx, nis = gain(P, H, N, residual)

@@ -25,7 +25,7 @@ from coopenv.base.errors import CoopenvError, check_memory, error_text, training
 from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
-from coopenv.observers.interference import Interference, interference_of
+from coopenv.observers.mailbox import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario

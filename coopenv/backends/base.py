@@ -16,8 +16,8 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.estimation.poses import Array, are_numbers, are_rotations
-from coopenv.observers.contract import Message, check_message
-from coopenv.observers.recording import ObserverInit, Sensed
+from coopenv.observers.contract import Message, ObserverInit, check_message
+from coopenv.observers.recording import Sensed
 from coopenv.observers.runner import observer_init_of
 from coopenv.scenario import Scenario
 from coopenv.world.dynamics import ACCELERATION, PAN, SPEED, STEERING

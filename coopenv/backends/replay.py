@@ -12,7 +12,8 @@ import warp as wp
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.backends.feed import RECORDED, Feed
 from coopenv.base.errors import CoopenvError, DataError
-from coopenv.observers.recording import ObserverInit, Recording, Sensed, check_recording, is_due
+from coopenv.observers.contract import ObserverInit
+from coopenv.observers.recording import Recording, Sensed, check_recording, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import override, parse_scenario

@@ -13,7 +13,8 @@ from coopenv.backends.feed import recall_truth
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array
-from coopenv.observers.recording import Sensed, Truth, is_due, sealed
+from coopenv.observers.contract import sealed
+from coopenv.observers.recording import Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario

@@ -20,9 +20,9 @@ from coopenv.backends.base import (
 from coopenv.backends.feed import RECORDED, Feed, unknown_truth
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import exp_se3
-from coopenv.observers.contract import Message
+from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
-from coopenv.observers.recording import MEASURED, ObserverInit, Sensed, check_tick, is_due
+from coopenv.observers.recording import MEASURED, Sensed, check_tick, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.world.embedded import HOST

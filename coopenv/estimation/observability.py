@@ -53,7 +53,18 @@ class ObservabilityInterval(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class RecordedGeometry:
+    """Where vehicles and targets were, and what was seen; axes as in `Trajectory`."""
+
+    t: Annotated[np.ndarray, "f K"]  # s
+    position: Annotated[np.ndarray, "f K N 3"]  # m, map frame
+    target_position: Annotated[np.ndarray, "f K T 3"]  # m, truth
+    visible: Annotated[np.ndarray, "b K N T"]
+    vehicles: Annotated[np.ndarray, "U N"]  # names
+
+
+@dataclass(frozen=True)
+class Trajectory(RecordedGeometry):
     """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).
 
     Each array is annotated with the kinds of its dtype and its axes; there are R reward terms.
@@ -62,8 +73,6 @@ class Trajectory:
     `covariance` is the observer's P over (2 lambda, p), p being the position in the body frame.
     """
 
-    t: Annotated[np.ndarray, "f K"]  # s
-    position: Annotated[np.ndarray, "f K N 3"]  # m
     rotation: Annotated[np.ndarray, "f K N 3 3"]
     position_estimate: Annotated[np.ndarray, "f K N 3"]  # m
     rotation_estimate: Annotated[np.ndarray, "f K N 3 3"]
@@ -73,12 +82,9 @@ class Trajectory:
     nees: Annotated[np.ndarray, "f K N"]
     velocity: Annotated[np.ndarray, "f K N 3"]  # m/s, truth
     angular_velocity: Annotated[np.ndarray, "f K N 3"]  # rad/s, truth
-    target_position: Annotated[np.ndarray, "f K T 3"]  # m, truth
-    visible: Annotated[np.ndarray, "b K N T"]
     sight: Annotated[np.ndarray, "iu K N T"]  # uint8, values of `Sight`
     reward_terms: Annotated[np.ndarray, "f K N R"]  # of the tick: as if each tick were a decision
     terms: Annotated[np.ndarray, "U R"]  # names of the terms
-    vehicles: Annotated[np.ndarray, "U N"]  # names
     targets: Annotated[np.ndarray, "U T"]  # names
     target_moving: Annotated[np.ndarray, "b T"]  # vehicles and moving landmarks
 
@@ -159,7 +165,7 @@ class Observability:
 
 
 def analyse_observability(
-    scene: Trajectory, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+    scene: RecordedGeometry, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
@@ -185,7 +191,7 @@ def analyse_observability(
     )
 
 
-def _windows_about_anchor(scene: Trajectory, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 
     A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
@@ -202,7 +208,7 @@ def _windows_about_anchor(scene: Trajectory, window: float) -> tuple[np.ndarray,
     return start, (total[end] - total[start]) / length, anchor
 
 
-def _information_of(scene: Trajectory, i: int, anchor: np.ndarray, q: Array | float = 1.0) -> np.ndarray:
+def _information_of(scene: RecordedGeometry, i: int, anchor: np.ndarray, q: Array | float = 1.0) -> np.ndarray:
     """Return C*^T Q C* (K, 6, 6) of one vehicle in map axes, about a point (3,); q (T,) are weights of targets."""
     known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
     place = np.where(known[..., None], scene.target_position, 0.0)
@@ -251,7 +257,7 @@ class ConvergenceRates(NamedTuple):
 
 
 def convergence_rates(
-    scene: Trajectory, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
+    scene: RecordedGeometry, k: Sequence[float], q: Array, V: tuple[float, float], P0: tuple[float, float]
 ) -> ConvergenceRates:
     """Return the rates of the paper's observer along a record.
 

@@ -1,9 +1,10 @@
 """Bearings of a frame as measurements: residuals, Jacobians, validity, and pose errors that odometry propagates."""
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Self
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from coopenv.estimation.compiled import (
@@ -25,10 +26,15 @@ from coopenv.estimation.compiled import (
     right_jacobian,
     transformed,
 )
-from coopenv.estimation.poses import Array
-from coopenv.observers.contract import Message, Tick
+from coopenv.estimation.poses import IDENTITY, Array, Coordinates, skew
+from coopenv.observers.contract import Estimate, Message, Tick
 
 LEFT, RIGHT, INVARIANT = 0, 1, 2
+
+
+FRAME = types.Tuple((VECTOR, MATRIX, MATRIX, MATRICES, NUMBER))
+"""Lever arm (3,), bearings (m, 3), points (m, 3), their covariances (m, 3, 3), and a bearing's variance."""
+Frame = tuple[Array, Array, Array, Array, float]
 
 
 @compiled(MATRIX, VECTOR)
@@ -107,20 +113,50 @@ def corrected(kind: int, R: Array, p: Array, dx: Array, P: Array) -> tuple[Array
     return R, p, congruent(recentring(kind, dx), P)
 
 
-class PoseWithError(Protocol):
-    """A pose, and the kind of its error."""
+class PoseEstimate(NamedTuple):
+    """A pose with the covariance of its error."""
 
-    @property
-    def R(self) -> Array:  # noqa: N802
-        """(3, 3) body to map."""
+    kind: int  # of the error: LEFT, RIGHT, or INVARIANT (xi, which is also the left error to first order)
+    R: Array  # (3, 3) body to map
+    p: Array  # (3,) map frame, m
+    P: Array  # (6, 6)
 
-    @property
-    def p(self) -> Array:
-        """(3,) map frame, m."""
+    @classmethod
+    def start(cls, kind: int, R: Array, p: Array, P: Array) -> Self:
+        """Return the estimate of a pose with a covariance in LEFT coordinates."""
+        R, p, P = (np.array(values, float) for values in (R, p, P))
+        return cls(kind, R, p, congruent(from_left(R, p), P) if kind == RIGHT else P)
 
-    @property
-    def kind(self) -> int:
-        """LEFT, RIGHT or INVARIANT."""
+    def predicted(self, tick: Tick) -> Self:
+        """Return the estimate after the tick's odometry."""
+        rotation, translation = increment(tick)
+        return type(self)(self.kind, *predicted(*self, rotation, translation, tick.noise.odometry(tick.dt)))
+
+    def moved(self, dx: Array, P: Array) -> Self:
+        """Return the estimate moved by an error dx."""
+        return type(self)(self.kind, *moved(self.kind, self.R, self.p, dx), P)
+
+    def corrected(self, dx: Array, P: Array) -> Self:
+        """Return the estimate moved by an error dx, of which P is the covariance about this one."""
+        return type(self)(self.kind, *corrected(self.kind, self.R, self.p, dx, P))
+
+    def point_covariance(self, marker: Array) -> Array:
+        """Return the covariance (3, 3) in map axes of a point of the body."""
+        if self.kind == RIGHT:
+            J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
+        else:
+            J = np.concatenate([self.R.dot(skew(-marker)), self.R], axis=1)
+        return np.asarray(J.dot(self.P).dot(J.T))
+
+    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
+        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
+        coordinates = Coordinates.RIGHT if self.kind == RIGHT else Coordinates.LEFT
+        return Estimate(self.R, self.p, self.P, coordinates, nis, nis_dof)
+
+
+def increment(tick: Tick) -> tuple[Array, Array]:
+    """Return the tick's odometry, in the types that compiled functions take."""
+    return np.asarray(tick.rotation, float), np.asarray(tick.translation, float)
 
 
 class BearingMeasurements(NamedTuple):
@@ -214,11 +250,14 @@ def put_derivative(row: Array, u: Array, about: Array, factor: float) -> None:
         row[k + 3] = -u[k] * factor
 
 
-def linearised(pose: PoseWithError, tick: Tick, measured: BearingMeasurements) -> LinearisedBearings:
+def frame_of(tick: Tick, measured: BearingMeasurements) -> Frame:
+    """Return the arguments of compiled functions for a frame."""
+    return np.asarray(tick.lever_arm, float), *measured[:3], tick.noise.bearing_std**2
+
+
+def linearised(pose: PoseEstimate, tick: Tick, measured: BearingMeasurements) -> LinearisedBearings:
     """Linearise bearings at a pose; the points' covariances are noise, as if independent of the pose."""
-    variance = tick.noise.bearing_std**2
-    lever_arm = np.asarray(tick.lever_arm, float)
-    return LinearisedBearings(*linearise(pose.R, pose.p, pose.kind == RIGHT, lever_arm, *measured[:3], variance))
+    return LinearisedBearings(*linearise(pose.R, pose.p, pose.kind == RIGHT, *frame_of(tick, measured)))
 
 
 @compiled(MATRIX, VECTOR, FLAG, VECTOR, MATRIX, MATRIX, MATRICES, NUMBER)
@@ -251,16 +290,15 @@ def linearise(
     return residual, H, N, G
 
 
-def ahead(pose: PoseWithError, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
+def ahead(pose: PoseEstimate, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
     """Return (m,) whether the points are ahead along the bearings, and not behind."""
-    of: NDArray[np.bool_] = _ahead(
-        pose.R, pose.p, np.asarray(tick.lever_arm, float), measured.bearings, measured.positions
-    )
+    of: NDArray[np.bool_] = _ahead(pose.R, pose.p, frame_of(tick, measured))
     return of
 
 
-@compiled(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX)
-def _ahead(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> NDArray[np.bool_]:
+@compiled(MATRIX, VECTOR, FRAME)
+def _ahead(R: Array, p: Array, frame: Frame) -> NDArray[np.bool_]:
+    lever_arm, bearings, positions, _, _ = frame
     result = np.empty(len(bearings), np.bool_)
     for n in range(len(bearings)):
         d = transformed(R.T, positions[n] - p) - lever_arm

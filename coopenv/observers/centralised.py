@@ -12,10 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, exp_so3, orthonormalise, skew
-from coopenv.observers.bearing_measurements import BearingMeasurements, LinearisedBearings, linearised
+from coopenv.observers import bearing_measurements
+from coopenv.observers.bearing_measurements import (
+    LEFT,
+    BearingMeasurements,
+    LinearisedBearings,
+    PoseEstimate,
+    increment,
+    linearised,
+    transition,
+)
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import InnovationGate, Stacked, halfway
-from coopenv.observers.error_state_filters import LeftError
 
 Masks = dict[int, NDArray[np.bool_]]
 """Of the targets of vehicles that saw any."""
@@ -29,9 +37,9 @@ class Centralised:
 
     joint = True
 
-    def __init__(self, setups: Sequence[Setup], gated: bool = True) -> None:
-        """Take the setups of all; without `gated` every bearing is used."""
-        self.gated, self.gates = gated, [InnovationGate() for _ in setups]
+    def __init__(self, setups: Sequence[Setup]) -> None:
+        """Take the setups of all."""
+        self.gates = [InnovationGate() for _ in setups]
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
 
@@ -60,7 +68,7 @@ class Centralised:
         bearings = [tick.bearings[tick.valid] for tick in ticks]
         self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
         return [
-            LeftError(R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
+            PoseEstimate(LEFT, R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
             for i, (R, p) in enumerate(self.poses)
         ]
 
@@ -68,7 +76,7 @@ class Centralised:
         """Carry every pose and the joint covariance through one tick of odometry."""
         F = np.zeros_like(self.P)
         for i, (tick, (R, p)) in enumerate(zip(ticks, self.poses, strict=True)):
-            F[self.block(i), self.block(i)] = LeftError.transition(tick.rotation, tick.translation)
+            F[self.block(i), self.block(i)] = transition(*increment(tick))
             self.poses[i] = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
         noise = np.concatenate([tick.noise.odometry(tick.dt) for tick in ticks])
         self.P = F.dot(self.P).dot(F.T) + np.diag(noise)
@@ -77,14 +85,12 @@ class Centralised:
         """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
         linear = {i: self.linearise(i, ticks[i], mask) for i, mask in seen.items()}
-        if self.gated:
-            kept = {
-                i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
-                for i, (of, in_front) in linear.items()
-            }
-            linear = {i: (of.only(kept[i]), in_front) for i, (of, in_front) in linear.items()}
-            seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
-        first = _stacked([of for of, _ in linear.values()])
+        kept = {
+            i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
+            for i, (of, in_front) in linear.items()
+        }
+        seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
+        first = _stacked([of.only(kept[i]) for i, (of, _) in linear.items()])
         if not len(first[0]):
             return
 
@@ -104,7 +110,7 @@ class Centralised:
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
         known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
-        own = linearised(LeftError(R, p, self.P), tick, known)
+        own = linearised(PoseEstimate(LEFT, R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
         for n, target in enumerate(targets):
@@ -133,10 +139,10 @@ def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, 
 
 
 def recentring(dx: Array) -> Array:
-    """Return (6N, 6N) what `LeftError.recentring` returns, of every pose."""
+    """Return (6N, 6N) what `bearing_measurements.recentring` returns, of every pose."""
     G = np.zeros((len(dx), len(dx)))
     for n in range(0, len(dx), 6):
-        G[n : n + 6, n : n + 6] = LeftError.recentring(dx[n : n + 6])
+        G[n : n + 6, n : n + 6] = bearing_measurements.recentring(LEFT, dx[n : n + 6])
     return G
 
 

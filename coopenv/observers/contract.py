@@ -108,6 +108,19 @@ class Setup:
 
 
 @dataclass(frozen=True)
+class ObserverInit:
+    """The setups of all observers, and the properties of the radio."""
+
+    setups: tuple[Setup, ...]
+    order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
+    dt: float  # s
+    period: int  # ticks between messages
+    staleness: float  # s
+    flight: int  # ticks that a message may be under way
+    start_covariance: Array  # (N, 6, 6) LEFT coordinates
+
+
+@dataclass(frozen=True)
 class Message:
     """A broadcast; an observer sets the fields that it sends, and `size_bytes` counts them.
 
@@ -230,6 +243,12 @@ class JointObserver(Protocol):
 
 
 Factory = Any  # builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them
+
+
+def sealed(view: NDArray[Any]) -> NDArray[Any]:
+    """Return a read-only view."""
+    view.setflags(write=False)
+    return view
 
 
 MOST_NEGATIVE = 1e-9  # how far below zero an eigenvalue of P may lie, relative to the largest one

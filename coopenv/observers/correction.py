@@ -22,6 +22,7 @@ While the gate is open, a faulty message is fused.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import types
@@ -30,7 +31,6 @@ from numpy.typing import NDArray
 from coopenv.estimation.compiled import (
     MATRICES,
     MATRIX,
-    NUMBER,
     VECTOR,
     WHOLE,
     compiled,
@@ -41,8 +41,9 @@ from coopenv.estimation.compiled import (
 )
 from coopenv.estimation.poses import Array, solve
 from coopenv.observers.bearing_measurements import (
+    FRAME,
     RIGHT,
-    BearingMeasurements,
+    Frame,
     corrected,
     dense,
     linearise,
@@ -50,7 +51,6 @@ from coopenv.observers.bearing_measurements import (
     normalised,
     recentring,
 )
-from coopenv.observers.contract import Tick
 
 CLOSE = 1e-3  # rad: largest turn of a line of sight by the last step
 MOST = 8  # steps, and halvings of a step
@@ -85,12 +85,6 @@ def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
     after: Array = A.dot(np.ascontiguousarray(P)).dot(A.T) + K.dot(np.ascontiguousarray(N)).dot(K.T)
     after = (after + after.T) / 2
     return after
-
-
-def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
-    """Return (dx, P+, r^T S^-1 r) of a Kalman update with measurement covariance N, in Joseph's form."""
-    K, dx, nis = gain(P, H, N, residual)
-    return dx, joseph(P, K, H, N), nis
 
 
 def turn_of_sight(dx: Array, distance: float) -> float:
@@ -197,48 +191,68 @@ def judged(
     return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
 
 
-FRAME = types.Tuple((VECTOR, MATRIX, MATRIX, MATRICES, NUMBER))
-"""Lever arm (3,), bearings (m, 3), points (m, 3), their covariances (m, 3, 3), and a bearing's variance."""
-Frame = tuple[Array, Array, Array, Array, float]
+PLACES = types.Array(types.int64, 1, "A", readonly=True)
 
 
-def frame_of(tick: Tick, measured: BearingMeasurements) -> Frame:
-    """Return the arguments of compiled functions for a frame."""
-    return (
-        np.asarray(tick.lever_arm, float),
-        measured.bearings,
-        measured.positions,
-        measured.covariances,
-        tick.noise.bearing_std**2,
-    )
+@compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
+def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
+    """Return (2m, 6 + 6k) the derivative of m bearings by the own error and those of k neighbours.
+
+    Args:
+        H: (m, 2, 6) by the error about where it is linearised.
+        G: (m, 2, 3) by the points, map axes.
+        recentring: (6, 6) of the own error.
+        turns: (k, 3, 3) the neighbours' orientations.
+        places: (m,) the neighbour of each bearing, -1: none.
+    """
+    whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
+    for n in range(len(H)):
+        place(whole, 2 * n, 0, product(H[n], recentring))
+        k = places[n]
+        if k >= 0:
+            place(whole, 2 * n, 6 * k + 9, product(G[n], turns[k]))
+    return whole
 
 
-@compiled(WHOLE, MATRIX, VECTOR, FRAME)
-def stacked(kind: int, R: Array, p: Array, frame: Frame) -> tuple[Array, Array, Array]:
-    """Return residual (2m,), H (2m, 6) and N (2m, 2m) at a pose."""
-    residual, H, N, _ = linearise(R, p, kind == RIGHT, *frame)
-    return residual.ravel(), H.reshape(-1, 6), dense(N)
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
+def halfway_gain(
+    kind: int, R: Array, p: Array, P: Array, frame: Frame, turns: Array, places: Any
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return (K (n, 2m), H, N, dx (n,), r^T S^-1 r at the prediction) of the correction of a prediction.
+
+    H (2m, n) and N (2m, 2m) are those half way, where the poses of neighbours stay as they are.
+
+    Args:
+        kind: of the own error.
+        R: (3, 3) the own orientation.
+        p: (3,) the own position.
+        P: (n, n) = (6 + 6k, 6 + 6k) covariance of the own error and those of k neighbours.
+        frame: the bearings.
+        turns: see `joint_jacobian`.
+        places: see `joint_jacobian`.
+    """
+    residual, H, N, G = linearise(R, p, kind == RIGHT, *frame)
+    whole = joint_jacobian(H, G, np.eye(6), turns, places)
+    _, dx, nis = gain(P, whole, dense(N), residual.ravel())
+    at = 0.5 * dx
+    at[6:] = 0.0
+    R, p = moved(kind, R, p, at[:6])
+    residual, H, N, G = linearise(R, p, kind == RIGHT, *frame)
+    whole = joint_jacobian(H, G, recentring(kind, at[:6]), turns, places)
+    noise = dense(N)
+    K, dx, _ = gain(P, whole, noise, residual.ravel() + transformed(whole, at))
+    return K, whole, noise, dx, nis
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
-def halfway_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
-    """Return (K (6, 2m), H, N, dx (6,), r^T S^-1 r at the prediction) of the correction of a prediction.
-
-    H (2m, 6) and N (2m, 2m) are those half way; P (6, 6) is the prediction's covariance, over the error of that kind.
-    """
-    residual, H, N = stacked(kind, R, p, frame)
-    _, dx, nis = gain(P, H, N, residual)
-    at = 0.5 * dx
-    R, p = moved(kind, R, p, at)
-    residual, H, N = stacked(kind, R, p, frame)
-    H = product(H, recentring(kind, at))
-    K, dx, _ = gain(P, H, N, residual + transformed(H, at))
-    return K, H, N, dx, nis
+def own_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
+    """Return what `halfway_gain` does without neighbours."""
+    return halfway_gain(kind, R, p, P, frame, np.zeros((0, 3, 3)), np.full(len(frame[1]), -1))
 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
     """Return R (3, 3), p (3,) in m, P (6, 6) and r^T S^-1 r of the correction of a prediction of covariance P."""
-    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame)
+    K, H, N, dx, nis = own_gain(kind, R, p, P, frame)
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
     return R, p, P, nis

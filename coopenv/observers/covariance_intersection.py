@@ -23,7 +23,6 @@ a single leader would have a dependent part, and the filter would be mekf_covari
 messages as long as a vehicle's own information does not return to it. In a circle of vehicles this is an assumption.
 """
 
-from dataclasses import replace
 from math import log
 
 import numpy as np
@@ -31,14 +30,18 @@ import numpy as np
 from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled, congruent
 from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import (
+    FRAME,
     BearingMeasurements,
+    Frame,
     LinearisedBearings,
+    PoseEstimate,
     corrected,
+    frame_of,
     linearised,
     recentring,
 )
 from coopenv.observers.contract import Tick
-from coopenv.observers.correction import FRAME, Frame, frame_of, halfway_gain, joseph, updated
+from coopenv.observers.correction import joseph, own_gain, updated
 from coopenv.observers.error_state_filters import Mekf
 
 LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w; 1 leaves the measurement out
@@ -117,8 +120,8 @@ class CovarianceIntersection(Mekf):
         w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
         if w < 1.0:
             inflated = one._replace(covariances=one.covariances / (1.0 - w))
-            R, p, P, _ = updated(state.kind, state.R, state.p, state.P / w, frame_of(tick, inflated))
-            self.state = self.state_type(R, p, P)
+            *pose, _ = updated(*state[:3], state.P / w, frame_of(tick, inflated))
+            self.state = PoseEstimate(self.kind, *pose)
 
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])
@@ -167,7 +170,7 @@ def updated_parts(
     kind: int, R: Array, p: Array, P: Array, P_i: Array, frame: Frame
 ) -> tuple[Array, Array, Array, Array, float]:
     """Return pose, P, P_i and r^T S^-1 r of a correction of a prediction of covariance P."""
-    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame)
+    K, H, N, dx, nis = own_gain(kind, R, p, P, frame)
     P_i = congruent(recentring(kind, dx), joseph(P_i, K, H, frame[4] * np.eye(len(H))))
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
     return R, p, P, P_i, nis
@@ -186,7 +189,7 @@ class SplitCovarianceIntersection(CovarianceIntersection):
 
     def predict(self, tick: Tick) -> None:
         """Append the increment to the pose and to both parts."""
-        self.independent = replace(self.state, P=self.independent).predicted(tick).P
+        self.independent = self.state._replace(P=self.independent).predicted(tick).P
         super().predict(tick)
 
     def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
@@ -194,12 +197,11 @@ class SplitCovarianceIntersection(CovarianceIntersection):
         P, P_i, linear = self.state.P, self.independent, linearised(self.state, tick, one)
         w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
         if w < 1.0:
-            self.state = replace(self.state, P=(P - P_i) / w + P_i)
+            self.state = self.state._replace(P=(P - P_i) / w + P_i)
             self.fuse(tick, one._replace(covariances=one.covariances / (1.0 - w)))
 
     def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
-        state, frame = self.state, frame_of(tick, measured)
-        R, p, P, self.independent, nis = updated_parts(state.kind, state.R, state.p, state.P, self.independent, frame)
-        self.state = self.state_type(R, p, P)
+        *pose, self.independent, nis = updated_parts(*self.state, self.independent, frame_of(tick, measured))
+        self.state = PoseEstimate(self.kind, *pose)
         return float(nis)

@@ -1,106 +1,40 @@
 """Error-state Kalman filters on SE(3): multiplicative, invariant, iterated and unscented."""
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from coopenv.estimation.compiled import (
-    MATRICES,
-    MATRIX,
-    VECTOR,
-    compiled,
-    congruent,
-    exp_so3,
-    exp_translation,
-    transformed,
-)
-from coopenv.estimation.poses import IDENTITY, Array, Coordinates, cholesky, lengths, skew, solve
-from coopenv.observers import bearing_measurements
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
+from coopenv.estimation.poses import Array, cholesky, lengths, solve
 from coopenv.observers.bearing_measurements import (
+    FRAME,
     INVARIANT,
+    LEFT,
     RIGHT,
     BearingMeasurements,
+    Frame,
     LinearisedBearings,
+    PoseEstimate,
     across,
     ahead,
     dense,
-    from_left,
+    frame_of,
     linearised,
+    recentring,
     usable_bearings,
 )
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import (
-    FRAME,
-    Frame,
-    InnovationGate,
-    Stacked,
-    frame_of,
-    iterated,
-    turn_of_sight,
-    updated,
-)
+from coopenv.observers.correction import InnovationGate, Stacked, iterated, turn_of_sight, updated
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.riccati.kernels import RICCATI
-
-
-@dataclass(frozen=True)
-class LeftError:
-    """A pose with a covariance over its left error."""
-
-    R: Array
-    p: Array  # map frame
-    P: Array
-    kind: ClassVar[int] = bearing_measurements.LEFT
-
-    @classmethod
-    def start(cls, R: Array, p: Array, P: Array) -> Self:
-        """Return the state of a pose with a covariance in LEFT coordinates."""
-        return cls(np.array(R, float), np.array(p, float), np.array(P, float))
-
-    @staticmethod
-    def transition(rotation: Array, translation: Array) -> Array:
-        """Return F (6, 6) of the error over an odometry increment (dR, dp)."""
-        F: Array = bearing_measurements.transition(np.asarray(rotation, float), np.asarray(translation, float))
-        return F
-
-    def predicted(self, tick: Tick) -> Self:
-        """Return the state after the tick's odometry."""
-        rotation, translation = np.asarray(tick.rotation, float), np.asarray(tick.translation, float)
-        step = (rotation, translation, tick.noise.odometry(tick.dt))
-        return type(self)(*bearing_measurements.predicted(self.kind, self.R, self.p, self.P, *step))
-
-    def moved(self, dx: Array, P: Array) -> Self:
-        """Return the state moved by an error dx."""
-        return type(self)(*bearing_measurements.moved(self.kind, self.R, self.p, dx), P)
-
-    @classmethod
-    def recentring(cls, dx: Array) -> Array:
-        """Return G (6, 6): about the state moved by dx, an error of dx + d about this one is G d to first order."""
-        G: Array = bearing_measurements.recentring(cls.kind, dx)
-        return G
-
-    def corrected(self, dx: Array, P: Array) -> Self:
-        """Return the state moved by an error dx, of which P is the covariance about this state."""
-        return type(self)(*bearing_measurements.corrected(self.kind, self.R, self.p, dx, P))
-
-    def point_covariance(self, marker: Array) -> Array:
-        """Return the covariance (3, 3) in map axes of a point of the body."""
-        J = np.empty((3, 6))
-        J[:, :3] = self.R.dot(skew(-marker))
-        J[:, 3:] = self.R
-        return np.asarray(J.dot(self.P).dot(J.T))
-
-    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
-        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
-        return Estimate(self.R, self.p, self.P, Coordinates.LEFT, nis, nis_dof)
 
 
 class PoseObserver:
     """Base of observers that estimate one pose with a covariance and broadcast the position of their marker."""
 
-    state_type: ClassVar[type[LeftError]] = LeftError
+    kind: ClassVar[int] = LEFT  # of the error
     sends_covariance = True
 
     def __init__(self, setup: Setup) -> None:
@@ -108,7 +42,7 @@ class PoseObserver:
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        self.state = self.state_type.start(*initial_pose, initial_covariance)
+        self.state = PoseEstimate.start(self.kind, *initial_pose, initial_covariance)
 
     def message(self) -> Message:
         """Return the marker's position, and its covariance if this observer sends it."""
@@ -123,11 +57,11 @@ class Mekf(PoseObserver):
     """
 
     sends_covariance = False
+    gated = True  # else every bearing is used
 
-    def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Take a setup; without `gated` every bearing is used."""
+    def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self.gated, self.gate = gated, InnovationGate()
+        self.gate = InnovationGate()
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
@@ -170,9 +104,8 @@ class Mekf(PoseObserver):
 
     def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
-        before = self.state
-        R, p, P, nis = updated(before.kind, before.R, before.p, before.P, frame_of(tick, measured))
-        self.state = self.state_type(R, p, P)
+        *pose, nis = updated(*self.state, frame_of(tick, measured))
+        self.state = PoseEstimate(self.kind, *pose)
         return float(nis)
 
 
@@ -191,50 +124,20 @@ class MekfCovarianceUngated(MekfCovariance):
     It is `mekf_covariance` without a gate and without cheirality.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        super().__init__(setup, gated=False)
-
-
-@dataclass(frozen=True)
-class InvariantError(LeftError):
-    """A pose with a covariance over xi, which is also that over the left error to first order."""
-
-    kind: ClassVar[int] = INVARIANT
+    gated = False
 
 
 class LeftInvariant(Mekf):
     """Invariant filter, left error; sends covariances."""
 
-    state_type: ClassVar[type[LeftError]] = InvariantError
+    kind = INVARIANT
     sends_covariance = True
-
-
-@dataclass(frozen=True)
-class RightError(LeftError):
-    """A pose with a covariance over its right error."""
-
-    kind: ClassVar[int] = RIGHT
-
-    @classmethod
-    def start(cls, R: Array, p: Array, P: Array) -> Self:
-        """Return the state of a pose with a covariance in LEFT coordinates."""
-        left = LeftError.start(R, p, P)
-        return cls(left.R, left.p, congruent(from_left(left.R, left.p), left.P))
-
-    def point_covariance(self, marker: Array) -> Array:
-        """Return the covariance (3, 3) in map axes of a point of the body."""
-        J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
-        return np.asarray(J.dot(self.P).dot(J.T))
-
-    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
-        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
-        return Estimate(self.R, self.p, self.P, Coordinates.RIGHT, nis, nis_dof)
 
 
 class RightInvariant(Mekf):
     """Invariant filter, right error; sends covariances."""
 
-    state_type: ClassVar[type[LeftError]] = RightError
+    kind = RIGHT
     sends_covariance = True
 
 
@@ -247,7 +150,7 @@ class IteratedEkf(MekfCovariance):
 
         def look(at: Array) -> Stacked:
             residual, H, N = linearised(before.moved(at, before.P), tick, measured).stacked()
-            return residual, H.dot(before.recentring(at)), N
+            return residual, H.dot(recentring(before.kind, at)), N
 
         dx, P, nis = iterated(before.P, look(np.zeros(6)), look, lambda dx: turn_of_sight(dx, distance))
         self.state = before.corrected(dx, P)
@@ -276,7 +179,7 @@ MEAN_WEIGHT = 2.0  # weight of the mean in covariances: 3 - alpha^2. In means it
 class Ukf(Mekf):
     """Unscented (sigma-point) filter; sends covariances."""
 
-    state_type: ClassVar[type[LeftError]] = InvariantError
+    kind = INVARIANT
     sends_covariance = True
 
     def take(self, tick: Tick, measured: BearingMeasurements) -> None:

@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 
 from coopenv.estimation.poses import Array, adjoint
-from coopenv.observers.bearing_measurements import ahead, linearised, usable_bearings
+from coopenv.observers.bearing_measurements import LEFT, PoseEstimate, ahead, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
-from coopenv.observers.error_state_filters import LeftError, PoseObserver
+from coopenv.observers.error_state_filters import PoseObserver
 
 LAG = 1.0  # s
 KEY_PERIOD = 0.1  # s between key frames
@@ -42,10 +42,9 @@ class FactorGraph(PoseObserver):
     Between key frames it adds odometry.
     """
 
-    def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Store the setup; without `gated` every bearing is used."""
+    def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self.gated, self.gate = gated, InnovationGate()
+        self.gate = InnovationGate()
         self.lever_arm, self.noise = setup.lever_arm, setup.noise
         self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
         self.to_body = adjoint(np.eye(3), setup.lever_arm)
@@ -74,7 +73,7 @@ class FactorGraph(PoseObserver):
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.stamps: dict[int, float] = {}
         self.key_time = self.time
-        self.increment = LeftError(np.eye(3), np.zeros(3), np.zeros((6, 6)))
+        self.increment = PoseEstimate(LEFT, np.eye(3), np.zeros(3), np.zeros((6, 6)))
         self.residuals: dict[int, Residuals] = {}
 
     def camera(self) -> gtsam.Pose3:
@@ -103,10 +102,9 @@ class FactorGraph(PoseObserver):
         measured, R, p = usable_bearings(tick), self.state.R, self.state.p
         if measured is None:
             return
-        if self.gated:
-            linear = linearised(self.state, tick, measured)
-            S, in_front = linear.spread(self.state.P), ahead(self.state, tick, measured)
-            measured = measured.only(self.gate.passed(tick.time, linear.residual, S, in_front))
+        linear = linearised(self.state, tick, measured)
+        S, in_front = linear.spread(self.state.P), ahead(self.state, tick, measured)
+        measured = measured.only(self.gate.passed(tick.time, linear.residual, S, in_front))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
@@ -127,7 +125,7 @@ class FactorGraph(PoseObserver):
             self.restart()
             return
         R, P = pose.rotation().matrix(), self.to_body @ covariance @ self.to_body.T
-        self.state = LeftError(R, pose.translation() - R @ self.lever_arm, (P + P.T) / 2)
+        self.state = PoseEstimate(LEFT, R, pose.translation() - R @ self.lever_arm, (P + P.T) / 2)
         self.clear()
 
     def add_odometry(self) -> None:

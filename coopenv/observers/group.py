@@ -20,12 +20,12 @@ from coopenv.observers.contract import (
     JointObserver,
     Message,
     Observer,
+    ObserverInit,
     check_estimate,
     check_message,
 )
-from coopenv.observers.interference import Interference
-from coopenv.observers.mailbox import Mailbox
-from coopenv.observers.recording import ObserverInit, Sensed
+from coopenv.observers.mailbox import Interference, Mailbox
+from coopenv.observers.recording import Sensed
 
 
 class ObserverError(CoopenvError):

@@ -22,26 +22,13 @@ from coopenv.estimation.poses import (
     are_unit_vectors,
     everywhere,
 )
-from coopenv.observers.contract import Received, Setup, Tick
+from coopenv.observers.contract import ObserverInit, Received, Setup, Tick, sealed
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
 if TYPE_CHECKING:
-    from coopenv.observers.interference import Interference
+    from coopenv.observers.mailbox import Interference
     from coopenv.scenario import Scenario
-
-
-@dataclass(frozen=True)
-class ObserverInit:
-    """The setups of all observers, and the properties of the radio."""
-
-    setups: tuple[Setup, ...]
-    order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
-    dt: float  # s
-    period: int  # ticks between messages
-    staleness: float  # s
-    flight: int  # ticks that a message may be under way
-    start_covariance: Array  # (N, 6, 6) LEFT coordinates
 
 
 @dataclass(frozen=True)
@@ -110,12 +97,6 @@ class Sensed:
             noise=setup.noise,
             due=self.due,
         )
-
-
-def sealed(view: NDArray[Any]) -> NDArray[Any]:
-    """Return a read-only view."""
-    view.setflags(write=False)
-    return view
 
 
 @dataclass(frozen=True)

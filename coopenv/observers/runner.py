@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
-from coopenv.observers.contract import Factory, Gains, SensorNoise, Setup
+from coopenv.observers.contract import Factory, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedEstimate
-from coopenv.observers.recording import ObserverInit, Recording, Truth
+from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
 

@@ -24,26 +24,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import types
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, eliminated, place, product, transformed
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, eliminated, place, product
 from coopenv.estimation.poses import Array, cholesky, skew
 from coopenv.observers.bearing_measurements import (
+    FRAME,
     LEFT,
     BearingMeasurements,
+    Frame,
     LinearisedBearings,
+    PoseEstimate,
     corrected,
-    dense,
-    linearise,
-    moved,
+    frame_of,
+    increment,
     recentring,
+    transition,
 )
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import FRAME, Frame, frame_of, gain, joseph
-from coopenv.observers.error_state_filters import LeftError, Mekf
+from coopenv.observers.correction import PLACES, halfway_gain, joseph
+from coopenv.observers.error_state_filters import Mekf
 
 IDENTITY = np.eye(6)
-PLACES = types.Array(types.int64, 1, "A", readonly=True)
 MOST_LOST = 60  # lost messages in a row that a received factor may stand for
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
 """Factors on cross-covariances that make the joint covariance positive definite, if the received ones do not."""
@@ -64,9 +65,8 @@ class ConsiderFilter(Mekf):
 
     sends_covariance = True
 
-    def __init__(self, setup: Setup, gated: bool = True) -> None:
-        """Take a setup; without `gated` every bearing is used."""
-        super().__init__(setup, gated)
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
         self.to_marker = np.eye(6)  # own left error to that of the marker's pose
         self.to_marker[3:, :3] = -skew(setup.marker)
         self.from_marker = np.eye(6)
@@ -89,7 +89,7 @@ class ConsiderFilter(Mekf):
 
     def predict(self, tick: Tick) -> None:
         """Append the increment."""
-        self.propagate_cross_covariances(LeftError.transition(tick.rotation, tick.translation))
+        self.propagate_cross_covariances(transition(*increment(tick)))
         super().predict(tick)
 
     def propagate_cross_covariances(self, A: Array, others: Sequence[int] | None = None) -> None:
@@ -145,7 +145,7 @@ class ConsiderFilter(Mekf):
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
         exact = frame_of(tick, measured._replace(covariances=np.zeros((len(targets), 3, 3))))
         R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
-        self.state = LeftError(R, p, P)
+        self.state = PoseEstimate(LEFT, R, p, P)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)
@@ -172,26 +172,6 @@ class ConsiderFilter(Mekf):
         return shrunk
 
 
-@compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
-def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
-    """Return (2m, 6 + 6k) the derivative of m bearings by the own error and those of k neighbours.
-
-    Args:
-        H: (m, 2, 6) by the error about where it is linearised.
-        G: (m, 2, 3) by the points, map axes.
-        recentring: (6, 6) of the own error.
-        turns: (k, 3, 3) the neighbours' orientations.
-        places: (m,) the neighbour of each bearing, -1: none.
-    """
-    whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
-    for n in range(len(H)):
-        place(whole, 2 * n, 0, product(H[n], recentring))
-        k = places[n]
-        if k >= 0:
-            place(whole, 2 * n, 6 * k + 9, product(G[n], turns[k]))
-    return whole
-
-
 @compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
 def considered(
     R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
@@ -203,24 +183,16 @@ def considered(
         p: (3,) the own position.
         joint: (6 + 6k, 6 + 6k) covariance of the own error and those of k neighbours.
         frame: the bearings; points have no covariances.
-        turns: see `joint_jacobian`.
-        places: see `joint_jacobian`.
+        turns: (k, 3, 3) the neighbours' orientations.
+        places: (m,) the neighbour of each bearing, -1: none.
 
     Returns:
         Orientation, position, covariance (6, 6), the factor (6, 6) of the other cross-covariances, those with the
         neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
     """
-    residual, H, N, G = linearise(R, p, False, *frame)
-    whole = joint_jacobian(H, G, np.eye(6), turns, places)
-    _, dx, nis = gain(joint, whole, dense(N), residual.ravel())
-    at = 0.5 * dx
-    at[6:] = 0.0
-    R_there, p_there = moved(LEFT, R, p, at[:6])
-    residual, H, N, G = linearise(R_there, p_there, False, *frame)
-    whole = joint_jacobian(H, G, recentring(LEFT, at[:6]), turns, places)
-    K, dx, _ = gain(joint, whole, dense(N), residual.ravel() + transformed(whole, at))
+    K, whole, N, dx, nis = halfway_gain(LEFT, R, p, joint, frame, turns, places)
     K[6:] = 0.0
-    after = joseph(joint, K, whole, dense(N))
+    after = joseph(joint, K, whole, N)
     R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
     recentred = recentring(LEFT, dx[:6])
     carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T

@@ -14,9 +14,17 @@ from math import inf, sqrt
 import numpy as np
 
 from coopenv.estimation.poses import Array, solve
-from coopenv.observers.bearing_measurements import BearingMeasurements, ahead, linearised, normalised, usable_bearings
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.error_state_filters import LeftError, PoseObserver
+from coopenv.observers.bearing_measurements import (
+    LEFT,
+    BearingMeasurements,
+    PoseEstimate,
+    ahead,
+    linearised,
+    normalised,
+    usable_bearings,
+)
+from coopenv.observers.contract import Estimate, Message, Tick
+from coopenv.observers.error_state_filters import PoseObserver
 from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
@@ -67,13 +75,13 @@ class PerspectivePoints(PoseObserver):
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: BearingMeasurements) -> LeftError | None:
+    def chosen(self, tick: Tick, data: BearingMeasurements) -> PoseEstimate | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array(list(combinations(range(len(data.bearings)), 3))[:MOST_TRIPLES])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
-            start = LeftError(R, camera - R @ tick.lever_arm, self.state.P)
+            start = PoseEstimate(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
             agrees = misfits(start, tick, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue
@@ -83,7 +91,7 @@ class PerspectivePoints(PoseObserver):
         return best
 
 
-def misfits(pose: LeftError, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
+def misfits(pose: PoseEstimate, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
@@ -94,7 +102,7 @@ def misfits(pose: LeftError, tick: Tick, data: BearingMeasurements, P: Array | N
     return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
 
 
-def refined(start: LeftError, tick: Tick, data: BearingMeasurements) -> LeftError | None:
+def refined(start: PoseEstimate, tick: Tick, data: BearingMeasurements) -> PoseEstimate | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
@@ -118,7 +126,7 @@ def refined(start: LeftError, tick: Tick, data: BearingMeasurements) -> LeftErro
     return None
 
 
-def distance(pose: LeftError, predicted: LeftError) -> float:
+def distance(pose: PoseEstimate, predicted: PoseEstimate) -> float:
     """Return the squared Mahalanobis distance of two poses whose errors are independent.
 
     The rotation counts by twice the vector part of its quaternion.
@@ -129,15 +137,8 @@ def distance(pose: LeftError, predicted: LeftError) -> float:
     return float(e.dot(solve(pose.P + predicted.P, e)))
 
 
-class DeadReckoning:
+class DeadReckoning(PoseObserver):
     """Adds up odometry and sends nothing."""
-
-    def __init__(self, setup: Setup) -> None:
-        """Nothing to set up."""
-
-    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
-        """Start at a pose."""
-        self.state = LeftError.start(*initial_pose, initial_covariance)
 
     def update(self, tick: Tick) -> Estimate:
         """Append the increment."""

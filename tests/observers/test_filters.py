@@ -11,21 +11,34 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
-from coopenv.observers.bearing_measurements import BearingMeasurements, from_left, linearise
-from coopenv.observers.correction import kalman
+from coopenv.observers.bearing_measurements import (
+    LEFT,
+    RIGHT,
+    BearingMeasurements,
+    PoseEstimate,
+    from_left,
+    linearise,
+    transition,
+)
+from coopenv.observers.correction import gain, joseph
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
-from coopenv.observers.error_state_filters import LeftError, RightError
 from coopenv.observers.registry import find
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.oracles.batch import small_record, solve
 
-STATES = {Coordinates.LEFT: LeftError, Coordinates.RIGHT: RightError}
+STATES = {Coordinates.LEFT: LEFT, Coordinates.RIGHT: RIGHT}
 
 
 def spd(rng: np.random.Generator, n: int) -> np.ndarray:
     A = rng.normal(size=(n, n))
     return A @ A.T + 0.3 * np.eye(n)
+
+
+def kalman(P: np.ndarray, H: np.ndarray, N: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """The error, the covariance and the normalised innovation squared of an update."""
+    K, dx, nis = gain(P, H, N, residual)
+    return dx, joseph(P, K, H, N), nis
 
 
 def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +75,7 @@ def derivative(f, n: int = 6, h: float = 1e-6) -> np.ndarray:
 
 @pytest.mark.parametrize("coordinates", STATES)
 def test_moving_by_an_error_makes_that_error(coordinates: Coordinates) -> None:
-    state = STATES[coordinates](*pose(0), np.eye(6))
+    state = PoseEstimate(STATES[coordinates], *pose(0), np.eye(6))
     e = np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0])
     moved = state.moved(e, state.P)
     assert_allclose(coordinates.error(moved.R, moved.p, state.R, state.p), e, atol=1e-12)
@@ -71,7 +84,7 @@ def test_moving_by_an_error_makes_that_error(coordinates: Coordinates) -> None:
 @pytest.mark.parametrize("coordinates", STATES)
 def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates: Coordinates) -> None:
     """The residual falls by H dx when the estimate moves by dx, to first order at a noise-free bearing."""
-    state, c = STATES[coordinates](*pose(1), np.eye(6)), np.array([0.2, 0.1, -0.3])
+    state, c = PoseEstimate(STATES[coordinates], *pose(1), np.eye(6)), np.array([0.2, 0.1, -0.3])
     z = np.random.default_rng(2).uniform(-8, 8, (4, 3))
     d = (z - state.p) @ state.R - c
     bearings = d / np.linalg.norm(d, axis=1, keepdims=True)
@@ -90,7 +103,7 @@ def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates
 @pytest.mark.parametrize("coordinates", STATES)
 def test_prediction_carries_the_covariance_by_numerical_derivatives(coordinates: Coordinates) -> None:
     P, t = spd(np.random.default_rng(3), 6), tick(4, QUIET)
-    state = STATES[coordinates](*pose(5), P)
+    state = PoseEstimate(STATES[coordinates], *pose(5), P)
     after = state.predicted(t)
 
     def error(dx: np.ndarray) -> np.ndarray:
@@ -105,8 +118,8 @@ def test_prediction_carries_the_covariance_by_numerical_derivatives(coordinates:
 def test_odometry_noise_is_the_same_in_both_coordinates() -> None:
     """From P = 0, the right covariance is the left one carried over by the numerical derivative between the errors."""
     t = tick(6, SensorNoise(0.3, 0.2, 0.1, 0.0))
-    left = LeftError(*pose(7), np.zeros((6, 6))).predicted(t)
-    right = RightError(*pose(7), np.zeros((6, 6))).predicted(t)
+    left = PoseEstimate(LEFT, *pose(7), np.zeros((6, 6))).predicted(t)
+    right = PoseEstimate(RIGHT, *pose(7), np.zeros((6, 6))).predicted(t)
 
     def convert(dx: np.ndarray) -> np.ndarray:
         moved = left.moved(dx, left.P)
@@ -115,14 +128,14 @@ def test_odometry_noise_is_the_same_in_both_coordinates() -> None:
     T = derivative(convert)
     assert_allclose(np.diag(left.P), np.repeat([(0.2 * 0.1) ** 2, (0.3 * 0.1) ** 2], 3), rtol=1e-12)
     assert_allclose(right.P, T @ left.P @ T.T, atol=1e-9)
-    started = RightError.start(left.R, left.p, spd(np.random.default_rng(0), 6))
+    started = PoseEstimate.start(RIGHT, left.R, left.p, spd(np.random.default_rng(0), 6))
     assert_allclose(started.P, T @ spd(np.random.default_rng(0), 6) @ T.T, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", STATES)
 def test_covariance_of_the_marker(coordinates: Coordinates) -> None:
     P, m = spd(np.random.default_rng(8), 6), np.array([0.3, -0.4, 0.8])
-    state = STATES[coordinates](*pose(9), P)
+    state = PoseEstimate(STATES[coordinates], *pose(9), P)
     J = derivative(lambda dx: (lambda s: s.p + s.R @ m)(state.moved(dx, P)))
     assert_allclose(state.point_covariance(m), J @ P @ J.T, atol=1e-7)
 
@@ -142,13 +155,13 @@ def test_filter_of_a_vehicle_on_a_line_is_the_scalar_kalman_filter() -> None:
     sigma, sv, dt, distance = 0.01, 0.3, 0.1, 5.0
     noise = SensorNoise(sv, 0.0, dt, sigma)
     R, P = np.eye(3), np.diag([1e-18] * 3 + [0.04, 1e-18, 1e-18])
-    state = LeftError(R, np.zeros(3), P)
+    state = PoseEstimate(LEFT, R, np.zeros(3), P)
     x, variance = 0.0, 0.04
     for measured in (0.0, 0.0, 0.0):
         state = state.predicted(
             Tick(**{**vars(tick(0, noise)), "rotation": np.eye(3), "translation": np.zeros(3), "dt": dt})
         )
-        state = LeftError(state.R, state.p, np.diag([1e-18] * 3 + [state.P[3, 3], 1e-18, 1e-18]))
+        state = PoseEstimate(LEFT, state.R, state.p, np.diag([1e-18] * 3 + [state.P[3, 3], 1e-18, 1e-18]))
         b, z = np.array([[measured, 1.0, 0.0]]), np.array([[0.0, distance, 0.0]])
         residual, H, N, _ = linearise(state.R, state.p, False, np.zeros(3), b, z, np.zeros((1, 3, 3)), sigma**2)
         dx, P, _ = kalman(state.P, H[0], N[0], residual[0])
@@ -206,7 +219,7 @@ def test_centralised_filter_is_at_the_most_probable_trajectory_of_all() -> None:
 
 
 def test_transition_of_a_standstill_is_the_identity() -> None:
-    assert_allclose(LeftError.transition(np.eye(3), np.zeros(3)), np.eye(6))
+    assert_allclose(transition(np.eye(3), np.zeros(3)), np.eye(6))
 
 
 def test_covariance_intersection_covers_every_correlation() -> None:

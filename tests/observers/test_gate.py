@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from coopenv.observers import Recording, Setup, run
+from coopenv.observers import Recording, run
 from coopenv.observers.correction import LARGEST, InnovationGate
 from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
@@ -96,8 +96,7 @@ def test_the_row_without_a_gate_believes_it() -> None:
     assert ungated.position_error[20, 0] > 2.0 * gated.position_error[20, 0]
 
     class Open(MekfCovariance):
-        def __init__(self, setup: Setup) -> None:
-            super().__init__(setup, gated=False)
+        gated = False
 
     assert (run(Open, made).position == ungated.position).all()
 

@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from coopenv.observers import run
-from coopenv.observers.correction import kalman
 from coopenv.observers.covariance_intersection import best_split_weight
-from tests.observers.test_filters import spd
+from tests.observers.test_filters import kalman, spd
 from tests.oracles.batch import small_record
 
 

@@ -76,7 +76,7 @@ def without_landmarks(recording: Recording, start: float, duration: float) -> Re
 
 def with_lie(recording: Recording, fault: Fault) -> Recording:
     """Let vehicles broadcast another pose, as `[faults.lie]` of a scenario does; default: the usual sender."""
-    from coopenv.observers.interference import Interference
+    from coopenv.observers.mailbox import Interference
 
     names, period = [setup.name for setup in recording.setups], recording.period
     K, N = recording.ticks, len(names)

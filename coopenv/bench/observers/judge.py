@@ -21,7 +21,7 @@ from coopenv.estimation.metrics import (
     relative_error,
     settling_time,
 )
-from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.observability import RecordedGeometry, analyse_observability
 from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
@@ -130,22 +130,19 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         ticks = [window.ticks(recording.t) for window in windows]
         within = np.array([[_mean(of.position[chosen] ** 2) for chosen in ticks] for of in bounds]).swapaxes(1, 2)
     if known:
-        seen = analyse_observability(_Geometry(recording))
+        seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
     return Scene(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
 
 
-class _Geometry:
-    """A record as `analyse_observability` reads it."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.t, self.visible, truth = recording.t, recording.visible, recording.truth
-        self.position, self.rotation = truth.position, truth.rotation
-        marker = np.array([setup.marker for setup in recording.setups])
-        seen = truth.position + (truth.rotation @ marker[..., None])[..., 0]  # the points of vehicles that cameras see
-        self.target_position = np.concatenate([recording.landmarks, seen], axis=1)
-        self.vehicles = np.array([setup.name for setup in recording.setups])
+def _geometry(recording: Recording) -> RecordedGeometry:
+    """Return a record as `analyse_observability` reads it."""
+    truth, marker = recording.truth, np.array([setup.marker for setup in recording.setups])
+    seen = truth.position + (truth.rotation @ marker[..., None])[..., 0]  # the points of vehicles that cameras see
+    targets = np.concatenate([recording.landmarks, seen], axis=1)
+    names = np.array([setup.name for setup in recording.setups])
+    return RecordedGeometry(recording.t, truth.position, targets, recording.visible, names)
 
 
 def kept_ticks(recording: Recording) -> np.ndarray:

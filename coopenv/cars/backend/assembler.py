@@ -23,7 +23,8 @@ from coopenv.cars.profile import VELOCITY, Role
 from coopenv.cars.readings import Calibration, CarPose, Detections, RobustReport, Sample, Twist, read
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.poses import Array
-from coopenv.observers.recording import Sensed, Truth, is_due, sealed
+from coopenv.observers.contract import sealed
+from coopenv.observers.recording import Sensed, Truth, is_due
 
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9

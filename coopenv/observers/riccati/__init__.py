@@ -1,1 +1,1 @@
-"""The Riccati observer of the paper: equations, kernels, plug-in, derivatives."""
+"""The Riccati observer of the paper: kernels with its equations, plug-in, derivatives."""

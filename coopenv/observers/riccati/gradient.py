@@ -18,7 +18,7 @@ import warp as wp
 
 from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning, world_keys
 from coopenv.estimation.linalg import block3, cholesky6, exp_so3, increment, join6, orthonormalise
-from coopenv.observers.riccati.equations import accumulate_information, correct_kalman, predict_covariance, predict_pose
+from coopenv.observers.riccati.kernels import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world import launch

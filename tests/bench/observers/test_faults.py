@@ -37,7 +37,7 @@ from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.contract import Setup
 from coopenv.observers.error_state_filters import MekfCovariance
-from coopenv.observers.interference import Interference, altered
+from coopenv.observers.mailbox import Interference, altered
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 

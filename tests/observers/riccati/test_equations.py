@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
-from coopenv.observers.riccati import equations
+from coopenv.observers.riccati import kernels as equations
 from tests.helpers.warp_calls import Calls
 from tests.oracles.continuous import skew
 

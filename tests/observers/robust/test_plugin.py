@@ -10,8 +10,8 @@ from coopenv.bench.observers.convergence import random_start
 from coopenv.bench.observers.faults import DIRECTION, VARIANTS, changed, usual_sender
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
-from coopenv.observers.interference import altered
 from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.mailbox import altered
 from coopenv.observers.registry import find
 from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, small_errors
