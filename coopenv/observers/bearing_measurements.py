@@ -129,8 +129,8 @@ class PoseEstimate(NamedTuple):
 
     def predicted(self, tick: Tick) -> Self:
         """Return the estimate after the tick's odometry."""
-        rotation, translation = increment(tick)
-        return type(self)(self.kind, *predicted(*self, rotation, translation, tick.noise.odometry(tick.dt)))
+        step = (*increment(tick), tick.noise.odometry(tick.dt))
+        return type(self)(self.kind, *predicted(self.kind, self.R, self.p, self.P, *step))
 
     def moved(self, dx: Array, P: Array) -> Self:
         """Return the estimate moved by an error dx."""

@@ -1,4 +1,4 @@
-"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry (`PlanarMotion` has its state).
+"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry (`PlanarFilter` has its state).
 
 Its state is
 
@@ -14,18 +14,12 @@ share of 0 is another kind), G is that of g over the time in which a turn is com
 integrals of v and v |w|. A robot that is to drive straight does so. A step of the commanded rate takes effect a jitter
 sooner or later, which leaves an error in the heading. All of this noise is as large as the innovations say
 (`NoiseLevel`). With no spread in the last nine numbers and a fixed level it is the textbook filter.
-
-The logarithm l of a factor on the noise's standard deviation follows the gradient of the innovations' likelihood. With
-a share s of the innovation's variance that is due to motion and r the normalised innovation squared,
-
-    d log p / dl = s (r - 1) / 2,    E[(d log p / dl)^2] = s^2 / 2
-
-(in a steady state the covariance grows with the deviation of the noise, not with its square). r is bounded, so that an
-outlier has little effect; old information fades, so that the level adapts to another floor.
 """
 
 import math
+from collections.abc import Callable
 from copy import copy
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -52,6 +46,7 @@ from coopenv.observers.planar.model import (
     TURN_SCALE,
     TURNING,
     CommandHistory,
+    NoiseLevel,
     OdometryStep,
     PlanarPose,
     Tuning,
@@ -59,40 +54,15 @@ from coopenv.observers.planar.model import (
     Y,
     growth,
     left_out,
-    picked,
     unsure,
     wrapped,
 )
 
-MEMORY = 150.0  # bearings, over which what was learnt fades
-LARGEST_RATIO = 9.0
-HIGHEST = math.log(4.0)
-
-
-class NoiseLevel:
-    """The factor of one robot, 1 at the start; `std` is that of its logarithm before anything was seen, 0: fixed."""
-
-    def __init__(self, std: float) -> None:
-        self.factor = 1.0  # on variances
-        self._log = 0.0
-        self._prior = 1 / std**2 if std > 0 else math.inf
-        self._information = 0.0
-
-    def learn(self, ratio: float, share: float) -> None:
-        """Take a normalised innovation squared, and the share of its variance that is due to motion."""
-        if self._prior == math.inf:
-            return
-        self._information = (1 - 1 / MEMORY) * self._information + share**2 / 2
-        slope = share * (min(ratio, LARGEST_RATIO) - 1) / 2 - self._prior * self._log / MEMORY
-        step = slope / (self._information + self._prior)
-        self._log = min(max(self._log + step, 0.0), HIGHEST)
-        self.factor = math.exp(2 * self._log)
-
-
 MAX_LEAD_S = 0.6
+MISREAD = 0.02  # share of outliers among bearings
 
 
-class PlanarMotion:
+class PlanarFilter:
     """One robot's estimate, which starts at a pose (x m, y m, heading rad) with a covariance (3, 3)."""
 
     def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
@@ -183,30 +153,29 @@ class PlanarMotion:
         along, across = (self._off**2 - before**2).tolist()
         return shrunk, (along, across)
 
-
-MISREAD = 0.02  # share of outliers among bearings
-
-
-class PlanarFilter(PlanarMotion):
-    """One robot's estimate, corrected by bearings."""
-
     def landmark(self, bearing: float, x: float, y: float) -> float:
         """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
         h, direction, bent = self._line(x, y, self.covariance[:2, :2])
         return self._correct(*self._to(bearing, h, direction), self.tuning.bearing_std**2 + bent, self.covariance)
 
-    def robot(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with a bearing in rad to a robot at its reported pose; return the same."""
-        h, direction, bent = self._line_to(other)
-        theirs = np.array([-h[X], -h[Y], 0.0])
-        return self._fuse(*self._to(bearing, h, direction), bent, theirs, other)
-
-    def seen(self, bearing: float, other: PlanarPose) -> float:
-        """Correct with a received bearing in rad from a robot at its reported pose to this one; return the same."""
-        h, direction, bent = self._line_to(other)
-        theirs = np.array([-h[X], -h[Y], -1.0])
-        back = direction + math.pi  # from them to us; its derivatives are those of the line from us to them
-        return self._fuse(h, wrapped(bearing - (back - float(other.pose[2]))), bent, theirs, other)
+    def robot(self, bearing: float, other: PlanarPose, seen: bool = False) -> float:
+        """Correct with a bearing in rad to a robot at its reported pose, or `seen` by it; return the same."""
+        k = self.tuning
+        h, innovation, theirs, bent = self._between(bearing, other, seen)
+        noise = k.bearing_std**2 + bent
+        if k.fusion == "plain":
+            return self._correct(h, innovation, noise + theirs, self.covariance)
+        p, arm = self.covariance, k.arm_m**2
+        ph = p @ h
+        own, gain = float(h @ ph), float(ph[X] ** 2 + ph[Y] ** 2 + arm * ph[HEADING] ** 2)
+        cost = float(p[X, X] + p[Y, Y] + arm * p[HEADING, HEADING])
+        ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
+        ratio = innovation**2 / (own + theirs + noise)
+        self._weigh(ratio, own + theirs + noise)
+        if ours_by == 0.0 or ratio > k.others_gate:  # no gain of information, or an inconsistent message
+            return ratio
+        grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # calibrations are independent
+        return self._correct(h, innovation, noise + theirs * theirs_by, p * np.outer(grown, grown))
 
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose (3,) and its covariance (3, 3); the calibration stays."""
@@ -225,10 +194,6 @@ class PlanarFilter(PlanarMotion):
         self.covariance[range(3, STATES), range(3, STATES)] = std**2
         self.level = NoiseLevel(k.level_std)
 
-    def broadcast_pose(self) -> PlanarPose:
-        """Return the pose to broadcast: its heading is that of the camera, without the bearing bias."""
-        return picked(self.state, self.covariance)
-
     def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
         """Return derivatives and direction of the line from here to a point, and the variance that they leave out."""
         dx, dy = x - float(self.state[X]), y - float(self.state[Y])
@@ -239,9 +204,18 @@ class PlanarFilter(PlanarMotion):
             return h, math.atan2(dy, dx), 0.0
         return h, math.atan2(dy, dx), left_out(dx, dy, square, covariance)
 
-    def _line_to(self, other: PlanarPose) -> tuple[Array, float, float]:
+    def _between(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[Array, float, float, float]:
+        """Return derivatives and innovation of a bearing to or from a robot, and variances.
+
+        These are the one due to its reported pose, and the one that the linearisation leaves out.
+        """
         x, y = other.pose[:2].tolist()
-        return self._line(x, y, self.covariance[:2, :2] + other.covariance[:2, :2])
+        h, direction, bent = self._line(x, y, self.covariance[:2, :2] + other.covariance[:2, :2])
+        by_theirs = np.array([-h[X], -h[Y], -float(seen)])
+        theirs = float(by_theirs @ other.covariance @ by_theirs)
+        if seen:  # from them to us; its derivatives are those of the line from us to them
+            return h, wrapped(bearing - (direction + math.pi - float(other.pose[2]))), theirs, bent
+        return *self._to(bearing, h, direction), theirs, bent
 
     def _to(self, bearing: float, h: Array, direction: float) -> tuple[Array, float]:
         """Return derivatives and innovation of a bearing of this robot's camera."""
@@ -250,32 +224,10 @@ class PlanarFilter(PlanarMotion):
 
     def misfit(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[float, float]:
         """Return the normalised innovation squared of such a bearing and its variance, rad^2; nothing is corrected."""
-        h, direction, bent = self._line_to(other)
-        theirs = np.array([-h[X], -h[Y], -float(seen)])
-        if seen:
-            innovation = wrapped(bearing - (direction + math.pi - float(other.pose[2])))
-        else:
-            h, innovation = self._to(bearing, h, direction)
-        known = float(theirs @ other.covariance @ theirs) + self.tuning.bearing_std**2 + bent
+        h, innovation, theirs, bent = self._between(bearing, other, seen)
+        known = theirs + self.tuning.bearing_std**2 + bent
         variance = float(h @ self.covariance @ h) + known
         return innovation**2 / variance, variance
-
-    def _fuse(self, h: Array, innovation: float, bent: float, by_theirs: Array, other: PlanarPose) -> float:
-        k = self.tuning
-        theirs, noise = float(by_theirs @ other.covariance @ by_theirs), k.bearing_std**2 + bent
-        if k.fusion == "plain":
-            return self._correct(h, innovation, noise + theirs, self.covariance)
-        p, arm = self.covariance, k.arm_m**2
-        ph = p @ h
-        own, gain = float(h @ ph), float(ph[X] ** 2 + ph[Y] ** 2 + arm * ph[HEADING] ** 2)
-        cost = float(p[X, X] + p[Y, Y] + arm * p[HEADING, HEADING])
-        ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
-        ratio = innovation**2 / (own + theirs + noise)
-        self._weigh(ratio, own + theirs + noise)
-        if ours_by == 0.0 or ratio > k.others_gate:  # no gain of information, or an inconsistent message
-            return ratio
-        grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # calibrations are independent
-        return self._correct(h, innovation, noise + theirs * theirs_by, p * np.outer(grown, grown))
 
     def _correct(self, h: Array, innovation: float, noise: float, prior: Array) -> float:
         k = self.tuning
@@ -301,3 +253,171 @@ class PlanarFilter(PlanarMotion):
         """Store the likelihood of a bearing; with a small probability it is an outlier."""
         fits = math.exp(-ratio / 2) / math.sqrt(2 * math.pi * variance)
         self.evidence = math.log((1 - MISREAD) * fits + MISREAD / (2 * math.pi))
+
+
+WIDEST = 0.5  # rad, of the heading of one filter
+MOST = 15
+PARTS = ((-1.0575, 0.2252), (0.0, 0.5496), (1.0575, 0.2252))  # offset in standard deviations, weight
+NARROWED = 0.6716  # standard deviation of a part
+LEAST_WEIGHT = 1e-3
+LEAST_SHARE = 5e-3  # of a kind of robot; the drifting one with no drift to be seen comes to less
+SAME = 1.0  # squared distance of two poses, normalised, up to which they are merged
+TEMPERED = 0.3  # power of a robot's likelihood: its errors last over many of its messages
+
+
+class Mixture:
+    """One robot's estimate as a weighted sum of filters, mostly of one; it has the methods of one filter.
+
+    Bearings and paths are linear in a heading that is known to half a radian, and in none that is not. A filter less
+    sure than that is split along its heading into three, each with the wheels that lead there (a Gaussian is nearly the
+    sum of three narrower ones; the numbers are those of least squares between the densities). Bearings then decide
+    between them by their likelihood; filters that have become unlikely are dropped, and filters with nearly the same
+    pose are merged: Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans.
+    Automatic Control 17(4), 1972.
+
+    Another filter is for the few robots whose heading drifts while their commands are to drive straight. It is dropped
+    as soon as it is unlikely.
+    """
+
+    def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
+        self.tuning = tuning
+        kinds = [tuning]
+        share = tuning.drifting[1]
+        if share > 0:
+            kinds.append(replace(tuning, std=(*tuning.std[:-1], tuning.drifting[0])))
+        self.filters = [PlanarFilter(kind, pose, covariance) for kind in kinds]
+        self._weights = np.array([1 - share, share][: len(kinds)])
+        self._known: tuple[Array, Array] | None = None  # mean and covariance, once they were asked for
+        self._share()
+
+    @property
+    def state(self) -> Array:
+        """Mean of the state."""
+        return self.filters[0].state if len(self.filters) == 1 else self._moments()[0]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the state, with what the filters differ in."""
+        return self.filters[0].covariance if len(self.filters) == 1 else self._moments()[1]
+
+    def advance(self, dt: float, turn: float, path: float) -> OdometryStep:
+        """Move all filters on; return the step of the likeliest one."""
+        self._known = None
+        self.filters[0].command(dt, turn, path)
+        self._share()
+        steps = [one.move(dt) for one in self.filters]
+        return steps[int(np.argmax(self._weights))]
+
+    def landmark(self, bearing: float, x: float, y: float) -> float:
+        """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
+        return self._take(lambda one: one.landmark(bearing, x, y), 1.0)
+
+    def robot(self, bearing: float, other: PlanarPose, seen: bool = False) -> float:
+        """Correct with a bearing in rad to a robot at its reported pose, or `seen` by it; return the same."""
+        return self._take(lambda one: one.robot(bearing, other, seen), TEMPERED)
+
+    def misfit(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[float, float]:
+        """Return the normalised innovation squared of a bearing to or from a robot, and its variance, rad^2."""
+        return self.filters[int(np.argmax(self._weights))].misfit(bearing, other, seen)
+
+    def set_pose(self, pose: Array, covariance: Array) -> None:
+        """Set the pose (3,) and its covariance (3, 3); the calibration stays."""
+        if len(self.filters) > 1:
+            mean, joint = self._moments()
+            one = self.filters[int(np.argmax(self._weights))]
+            one.state, one.covariance = mean, joint
+            self._keep([one], np.ones(1))
+        self._known = None
+        self.filters[0].set_pose(pose, covariance)
+
+    def reset_calibration(self) -> None:
+        """Reset the covariance of the calibration; its values are clipped to two initial standard deviations."""
+        self._known = None
+        for one in self.filters:
+            one.reset_calibration()
+
+    def _take(self, correct: Callable[[PlanarFilter], float], power: float) -> float:
+        if len(self.filters) == 1:
+            return correct(self.filters[0])
+        ratios = np.array([correct(one) for one in self.filters])
+        logs = np.log(self._weights) + power * np.array([one.evidence for one in self.filters])
+        likely = self._weights @ np.exp(-(ratios - ratios.min()) / 2)
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        best = self.filters[int(np.argmax(weights))].tuning
+        least = np.array([LEAST_WEIGHT if one.tuning is best else LEAST_SHARE for one in self.filters])
+        kept = np.flatnonzero(weights > least)
+        self._keep([self.filters[k] for k in kept], weights[kept])
+        self._merge()
+        return float(ratios.min() - 2 * math.log(likely))
+
+    def _keep(self, filters: list[PlanarFilter], weights: Array) -> None:
+        self.filters, self._weights = filters, weights / weights.sum()
+        self._share()
+
+    def _share(self) -> None:
+        """Share the command history and the noise level of the likeliest filter, which alone adapts it."""
+        self._known = None
+        best = self.filters[int(np.argmax(self._weights))]
+        for one in self.filters:
+            one.learns = one is best
+            one.level, one.history = best.level, self.filters[0].history
+
+    def split(self) -> None:
+        """Split the likeliest filter that is not sure of its heading, if there is one."""
+        wide = [k for k, one in enumerate(self.filters) if one.covariance[HEADING, HEADING] > WIDEST**2]
+        if not wide or len(self.filters) + 2 > MOST:
+            return
+        k = max(wide, key=lambda k: float(self._weights[k]))
+        one, weight = self.filters[k], float(self._weights[k])
+        variance = float(one.covariance[HEADING, HEADING])
+        slope = one.covariance[:, HEADING] / variance
+        narrow = one.covariance - (1 - NARROWED**2) * variance * np.outer(slope, slope)
+        parts = []
+        for offset, _ in PARTS:
+            part = one.copy()
+            part.state = one.state + offset * math.sqrt(variance) * slope
+            part.covariance = narrow.copy()
+            parts.append(part)
+        filters = [other for other in self.filters if other is not one] + parts
+        weights = [*np.delete(self._weights, k).tolist(), *(weight * share for _, share in PARTS)]
+        self._keep(filters, np.array(weights))
+
+    def _merge(self) -> None:
+        """Merge the first two filters with nearly the same pose."""
+        for i, one in enumerate(self.filters):
+            for j in range(i):
+                other = self.filters[j]
+                off = one.state[:3] - other.state[:3]
+                turns = wrapped(float(off[HEADING])) - float(off[HEADING])
+                off[HEADING] += turns
+                if one.tuning is not other.tuning or abs(off[HEADING]) > WIDEST:
+                    continue
+                joint = one.covariance[:3, :3] + other.covariance[:3, :3]
+                if float(off @ np.linalg.solve(joint, off)) < SAME:
+                    one.state[HEADING] += turns
+                    self._join(i, j)
+                    return
+
+    def _join(self, i: int, j: int) -> None:
+        pair = [i, j]
+        weights = self._weights[pair] / self._weights[pair].sum()
+        kept = self.filters[pair[int(np.argmax(weights))]]
+        kept.state, kept.covariance = _moments(weights, [self.filters[k] for k in pair])
+        self._weights[j] += self._weights[i]
+        self.filters[j] = kept
+        self._keep([one for k, one in enumerate(self.filters) if k != i], np.delete(self._weights, i))
+
+    def _moments(self) -> tuple[Array, Array]:
+        if self._known is None:
+            self._known = _moments(self._weights, self.filters)
+        return self._known
+
+
+def _moments(weights: Array, filters: list[PlanarFilter]) -> tuple[Array, Array]:
+    """Return the mean and the covariance of a weighted sum of Gaussians."""
+    states = np.array([one.state for one in filters])
+    mean = weights.dot(states)
+    off = states - mean
+    within = weights.dot(np.array([one.covariance.ravel() for one in filters]))
+    return mean, within.reshape(STATES, STATES) + (off.T * weights).dot(off)

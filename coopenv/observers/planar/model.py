@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,10 @@ def picked(state: Array, covariance: Array) -> PlanarPose:
 NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
-def wrapped(angle: float) -> float:
+Angle = TypeVar("Angle", float, Array)
+
+
+def wrapped(angle: Angle) -> Angle:
     """Return an angle in [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
@@ -226,3 +229,39 @@ def growth(own: float, gain: float, cost: float, theirs: float, noise: float, de
     left = ours_by * cost - ours_by**2 * gain / (ours_by * own + noise + theirs * theirs_by)
     best = int(np.argmin(left))
     return (float(ours_by[best]), float(theirs_by[best])) if left[best] < cost else (0.0, 0.0)
+
+
+MEMORY = 150.0  # bearings, over which what was learnt fades
+LARGEST_RATIO = 9.0
+HIGHEST = math.log(4.0)
+
+
+class NoiseLevel:
+    """The factor on the motion noise of one robot, 1 at the start.
+
+    `std` is that of its logarithm before anything was seen, 0: fixed.
+
+    The logarithm l of a factor on the noise's standard deviation follows the gradient of the innovations' likelihood.
+    With a share s of the innovation's variance that is due to motion and r the normalised innovation squared,
+
+        d log p / dl = s (r - 1) / 2,    E[(d log p / dl)^2] = s^2 / 2
+
+    (in a steady state the covariance grows with the deviation of the noise, not with its square). r is bounded, so that
+    an outlier has little effect; old information fades, so that the level adapts to another floor.
+    """
+
+    def __init__(self, std: float) -> None:
+        self.factor = 1.0  # on variances
+        self._log = 0.0
+        self._prior = 1 / std**2 if std > 0 else math.inf
+        self._information = 0.0
+
+    def learn(self, ratio: float, share: float) -> None:
+        """Take a normalised innovation squared, and the share of its variance that is due to motion."""
+        if self._prior == math.inf:
+            return
+        self._information = (1 - 1 / MEMORY) * self._information + share**2 / 2
+        slope = share * (min(ratio, LARGEST_RATIO) - 1) / 2 - self._prior * self._log / MEMORY
+        step = slope / (self._information + self._prior)
+        self._log = min(max(self._log + step, 0.0), HIGHEST)
+        self.factor = math.exp(2 * self._log)

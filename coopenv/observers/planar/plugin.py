@@ -13,9 +13,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.filter import PlanarFilter
+from coopenv.observers.planar.filter import Mixture, PlanarFilter
 from coopenv.observers.planar.fusion import LOWER, RobotMonitors, Sightings, received_position, sightings_of
-from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.model import (
     BIAS,
     CALIBRATING,
@@ -27,8 +26,9 @@ from coopenv.observers.planar.model import (
     Tuning,
     X,
     Y,
+    picked,
 )
-from coopenv.observers.planar.search import LossTest, PoseInformation, SightingHistory, find_pose
+from coopenv.observers.planar.search import LossTest, PoseInformation, Sighting, SightingHistory, find_pose
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m
@@ -108,18 +108,16 @@ class PlanarEkf:
                 self._see_landmark(tick, target, bearing, float(position[0]), float(position[1]))
             elif (reported := received_position(tick.messages[target])) is not None:
                 if not self._sightings:
-                    self._before = self.filter.broadcast_pose()
+                    self._before = picked(self.filter.state, self.filter.covariance)
                 self._sightings.append((target, bearing))
                 self._see_robot(tick, target, bearing, reported)
 
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self.filter.landmark(bearing, x, y)
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, reported: PlanarPose) -> None:
-        self.filter.robot(bearing, reported)
-
-    def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
-        self.filter.seen(bearing, by)
+    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool = False) -> None:
+        """Correct by a bearing to a robot at its reported pose, or `seen` by it."""
+        self.filter.robot(bearing, there, seen)
 
     def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
         """Test the reports of other senders by the sightings of one; this filter has no such test."""
@@ -135,7 +133,7 @@ class PlanarEkf:
                 self._test_sightings(tick, target, sightings)
                 for seen, bearing in sightings.seen:
                     if seen == self._me:
-                        self._be_seen(tick, target, bearing, sightings.by)
+                        self._see_robot(tick, target, bearing, sightings.by, seen=True)
 
     def _estimate(self) -> Estimate:
         x, y, heading = self.filter.state[:3].tolist()
@@ -254,24 +252,16 @@ class PlanarRobust(PlanarEkf):
         if not self.lost:
             self._test.take(tick.time, self.filter.landmark(bearing, x, y))
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, reported: PlanarPose) -> None:
-        if self._accepts(tick, target, bearing, reported, seen=False):
-            self._remember(tick.time, target, bearing, True, reported)
-            if not self.lost:
-                self._test.take_of_robot(tick.time, self.filter.robot(bearing, reported))
-
-    def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
-        if self._accepts(tick, target, bearing, by, seen=True):
-            self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
-            if not self.lost:
-                self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
-
-    def _accepts(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool) -> bool:
-        """Test a sender by a bearing to or from it; return whether it is not excluded."""
+    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool = False) -> None:
+        """Test the sender by the bearing; correct if it is not excluded."""
         if not self.lost:
             ratio, variance = self.filter.misfit(bearing, there, seen)
             self._monitors.of(target).test_innovation(ratio, variance, self._test.localised(tick.time))
-        return self._monitors.accepts(target, tick.time)
+        if self._monitors.accepts(target, tick.time):
+            angle = float(there.pose[2]) + bearing + math.pi if seen else bearing
+            self._remember(tick.time, target, angle, not seen, there)
+            if not self.lost:
+                self._test.take_of_robot(tick.time, self.filter.robot(bearing, there, seen))
 
     def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
         self._monitors.test_sightings(tick, by, sightings)
@@ -290,7 +280,7 @@ class PlanarRobust(PlanarEkf):
         noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
         point = (float(there.pose[0]), float(there.pose[1]))
         variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
-        self._history.add(time, target, angle, own, point, variance, noise)
+        self._history.add(Sighting(time, target, angle, own, point, variance, noise))
 
     def _unclear(self) -> bool:
         variance = np.diag(self.filter.covariance)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar.model import OdometryStep
+from coopenv.observers.planar.model import OdometryStep, wrapped
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
 WINDOW = 10  # bearings
@@ -86,8 +86,6 @@ class Sighting:
     point: tuple[float, float]  # m, map
     variance: float  # m^2, of the point along an axis
     angle_variance: float  # rad^2
-    trail: tuple[float, ...]
-    """(5,) where the odometry was: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +106,13 @@ class SightingHistory:
 
     def __init__(self) -> None:
         self._trail = np.zeros(5)
-        self._seen: deque[Sighting] = deque(maxlen=MOST)
+        """Where the odometry is: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
+        self._seen: deque[tuple[Sighting, Array]] = deque(maxlen=MOST)
+        """With the trail at that time."""
 
     def forget(self, before: float) -> None:
         """Forget the sightings before a time in s."""
-        while self._seen and self._seen[0].time < before:
+        while self._seen and self._seen[0][0].time < before:
             self._seen.popleft()
 
     def move(self, step: OdometryStep) -> None:
@@ -121,25 +121,15 @@ class SightingHistory:
         moved = step.driven * np.cos(middle), step.driven * np.sin(middle)
         self._trail += (*moved, step.turned, step.turn_variance, step.path_variance)
 
-    def add(
-        self,
-        time: float,
-        target: int,
-        angle: float,
-        own: bool,
-        point: tuple[float, float],
-        variance: float,
-        angle_variance: float,
-    ) -> None:
-        """Add a sighting; arguments as in `Sighting`."""
-        trail = tuple(self._trail.tolist())
-        self._seen.append(Sighting(time, target, angle, own, point, variance, angle_variance, trail))
+    def add(self, sighting: Sighting) -> None:
+        """Add a sighting."""
+        self._seen.append((sighting, self._trail.copy()))
 
     def lines(self, now: float, span: float, scale_variance: float) -> SightingLines:
         """Return the sightings of the last `span` in s; `scale_variance` is that of the odometry's scale of turns."""
         x, y, heading, turn_sum, path_sum = self._trail
-        kept = [s for s in self._seen if now - s.time <= span]
-        trail = np.array([s.trail for s in kept], dtype=float).reshape(-1, 5)
+        recent = [(s, at) for s, at in self._seen if now - s.time <= span]
+        kept, trail = [s for s, _ in recent], np.array([at for _, at in recent]).reshape(-1, 5)
         c, sn = np.cos(heading), np.sin(heading)
         away, turned = trail[:, :2] - (x, y), trail[:, 2] - heading
         offset = np.column_stack([c * away[:, 0] + sn * away[:, 1], c * away[:, 1] - sn * away[:, 0]])
@@ -201,7 +191,7 @@ def find_pose(lines: SightingLines, before: PoseInformation) -> SearchResult:
     cost = _cost(lines, poses, before)
     first = int(np.argmin(cost))
     apart = poses - poses[first]
-    other = (np.hypot(apart[:, 0], apart[:, 1]) > APART[0]) | (np.abs(_wrapped(apart[:, 2])) > APART[1])
+    other = (np.hypot(apart[:, 0], apart[:, 1]) > APART[0]) | (np.abs(wrapped(apart[:, 2])) > APART[1])
     squares = _squares(lines, poses[first : first + 1])[0]
     agree = squares < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
@@ -220,7 +210,7 @@ def find_pose(lines: SightingLines, before: PoseInformation) -> SearchResult:
 
 def _positions(lines: SightingLines, headings: Array, before: PoseInformation) -> Array:
     """Return (n, 2) where the lines meet for headings (n,), m."""
-    off = _wrapped(headings - before.pose[2])
+    off = wrapped(headings - before.pose[2])
     expected = before.information[:2, :2] @ before.pose[:2] - off[:, None] * before.information[:2, 2]
     direction = lines.angle + lines.own * headings[:, None]
     normal = np.stack([-np.sin(direction), np.cos(direction)], axis=-1)  # (n, m, 2)
@@ -249,7 +239,7 @@ def _residuals(lines: SightingLines, poses: Array) -> tuple[Array, Array, Array]
     away = lines.point - poses[:, None, :2] - _turned(lines.offset, poses[:, 2:])
     square = np.maximum((away**2).sum(axis=-1), NEAREST_M**2)
     direction = lines.angle + lines.own * poses[:, 2:]
-    residual = _wrapped(np.arctan2(away[..., 1], away[..., 0]) - direction)
+    residual = wrapped(np.arctan2(away[..., 1], away[..., 0]) - direction)
     return residual, lines.angle_variance + lines.variance / square, away
 
 
@@ -261,7 +251,7 @@ def _squares(lines: SightingLines, poses: Array) -> Array:
 def _off(poses: Array, before: PoseInformation) -> Array:
     """Return (n, 3) the differences of poses from the prior."""
     off: Array = poses - before.pose
-    off[:, 2] = _wrapped(off[:, 2])
+    off[:, 2] = wrapped(off[:, 2])
     return off
 
 
@@ -286,9 +276,5 @@ def _refined(lines: SightingLines, poses: Array, before: PoseInformation) -> tup
         information = np.einsum("nm,nmi,nmj->nij", weight, h, h)
         slope = np.einsum("nm,nm,nmi->ni", weight, residual, h) + _off(poses, before) @ before.information
         poses -= np.linalg.solve(information + before.information, slope[..., None])[..., 0]
-    poses[:, 2] = _wrapped(poses[:, 2])
+    poses[:, 2] = wrapped(poses[:, 2])
     return poses, information
-
-
-def _wrapped(angle: Array) -> Array:
-    return (angle + np.pi) % (2 * np.pi) - np.pi

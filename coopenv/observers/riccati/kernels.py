@@ -8,7 +8,7 @@ Dead reckoning is the lower reference: odometry alone, with the covariance that 
 over e = (2 lambda, p - phat), positions in the body frame. An error (theta, rho) in LEFT coordinates is
 (theta, rho + S(phat) theta) there.
 
-The observer is integrated by splitting into exact sub-flows: a rotation by the odometry, P <- F P F^T + h V, and the bearings'
+Integrated by splitting into exact sub-flows: a rotation by the odometry, P <- F P F^T + h V, and the bearings'
 correction P^-1 <- P^-1 + h C^T Q C with the matching motion of the estimate for any gain k. P stays symmetric
 positive definite for every step and gain by construction.
 

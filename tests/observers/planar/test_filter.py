@@ -138,7 +138,7 @@ def test_bearing_derivatives_agree_with_differences(seen):
     own.tuning = replace(CALIBRATING, fusion="plain")
     measured = bearing(before) + innovation
     if seen:
-        own.seen(measured, PlanarPose(there, np.zeros((3, 3))))
+        own.robot(measured, PlanarPose(there, np.zeros((3, 3))), seen=True)
     else:
         own.robot(measured, PlanarPose(there, np.zeros((3, 3))))
     square = float(np.sum((there[:2] - before[[X, Y]]) ** 2))

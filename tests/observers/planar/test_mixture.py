@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopenv.observers.planar.mixture import Mixture
+from coopenv.observers.planar.filter import Mixture
 from coopenv.observers.planar.model import CALIBRATING, DRIFT, HEADING, TURN_SCALE, X, Y
 
 ONE_KIND = replace(CALIBRATING, drifting=(0.0, 0.0))

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
-from coopenv.observers.riccati import kernels as equations
+from coopenv.observers.riccati import kernels
 from tests.helpers.warp_calls import Calls
 from tests.oracles.continuous import skew
 
@@ -33,7 +33,7 @@ def joined(A: Any, B: Any, D: Any):
 @wp.func
 def predicted(E: Any, P: Any, v1: Any, v2: Any):
     A, B, D = blocks(P)
-    A, B, D = equations.predict_covariance(E, A, B, D, v1, v2)
+    A, B, D = kernels.predict_covariance(E, A, B, D, v1, v2)
     return joined(A, B, D)
 
 
@@ -41,7 +41,7 @@ def predicted(E: Any, P: Any, v1: Any, v2: Any):
 def information(a: Any, b: Any, e: Any, q: Any):
     r = type(e)()
     o = wp.matrix(dtype=e.dtype, shape=(3, 3))
-    M11, M12, M22, r1, r2 = equations.accumulate_information(a, b, e, q, o, o, o, r, r)
+    M11, M12, M22, r1, r2 = kernels.accumulate_information(a, b, e, q, o, o, o, r, r)
     return joined(M11, M12, M22), r1, r2
 
 
@@ -51,7 +51,7 @@ def kalman(h: Any, P: Any, M: Any, r1: Any, r2: Any):
     M11, M12, M22 = blocks(M)
     A, B, D = blocks(P)
     L11, L21, L22, _I11, _I22 = linalg.cholesky6(A, B, D)
-    dx1, dx2, A, B, D = equations.correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
+    dx1, dx2, A, B, D = kernels.correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
     return dx1, dx2, joined(A, B, D)
 
 
@@ -61,14 +61,14 @@ def modal(k: Any, h: Any, P: Any, M: Any, r1: Any, r2: Any):
     M11, M12, M22 = blocks(M)
     A, B, D = blocks(P)
     L11, L21, L22, _I11, _I22 = linalg.cholesky6(A, B, D)
-    T, spectrum = equations.correction_modes(M11, M12, M22, L11, L21, L22)
-    dx1, dx2 = equations.correct_modes(k, h, T, spectrum, r1, r2)
-    return dx1, dx2, equations.covariance_modes(h, T, spectrum)
+    T, spectrum = kernels.correction_modes(M11, M12, M22, L11, L21, L22)
+    dx1, dx2 = kernels.correct_modes(k, h, T, spectrum, r1, r2)
+    return dx1, dx2, kernels.covariance_modes(h, T, spectrum)
 
 
 call = Calls(
     __name__,
-    {equations.gain_factor: "1 1 1 > 1", kalman: "1 66 66 3 3 > 3 3 66", modal: "1 1 66 66 3 3 > 3 3 66"},
+    {kernels.gain_factor: "1 1 1 > 1", kalman: "1 66 66 3 3 > 3 3 66", modal: "1 1 66 66 3 3 > 3 3 66"},
     {predicted: "33 66 1 1 > 66", information: "3 3 3 1 > 66 3 3"},
 )
 GAINS = (0.51, 0.6, 1.0, 2.5, 5.0, 80.0, 1000.0)
@@ -155,7 +155,7 @@ def test_gain_factor_to_all_orders(dtype: str, tolerance: float) -> None:
     growth = np.concatenate([np.logspace(-36, 6, 127), around])
     h = 1.0 / 64.0
     for k in GAINS:
-        values = call(equations.gain_factor, dtype, np.full(len(growth), k), growth / h, np.full(len(growth), h))
+        values = call(kernels.gain_factor, dtype, np.full(len(growth), k), growth / h, np.full(len(growth), h))
         m = (growth / h).astype(dtype).astype(float)
         held = float(np.dtype(dtype).type(k))
         assert_allclose(values, [exact_gain(held, x, h) for x in m], rtol=tolerance)
