@@ -19,7 +19,7 @@ from coopenv.backends.base import (
 )
 from coopenv.backends.feed import RECORDED, Feed, unknown_truth
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.poses import exp_se3
+from coopenv.estimation.poses import exp_so3, exp_translation
 from coopenv.observers.contract import Message, ObserverInit
 from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.recording import MEASURED, Sensed, check_tick, is_due
@@ -160,8 +160,9 @@ class TickWorld(SensingWorld):
         arrays["visible"] = tick.visible.copy()
         arrays.update({name: _or_zeros(getattr(tick, name), N) for name in ("odometry_age", "bearing_age")})
         missing = _or_zeros(tick.missing, N).astype(bool)
-        twist = np.concatenate([last.angular_velocity, last.velocity], axis=-1)[missing]
-        arrays["rotation"][missing], arrays["translation"][missing] = exp_se3(twist * tick.dt)
+        for i in np.flatnonzero(missing):
+            turn, step = last.angular_velocity[i] * tick.dt, last.velocity[i] * tick.dt
+            arrays["rotation"][i], arrays["translation"][i] = exp_so3(turn), exp_translation(turn, step)
         for name in ("velocity", "angular_velocity"):
             arrays[name][missing] = getattr(last, name)[missing]
         arrays["odometry_age"][missing] = np.asarray(last.odometry_age)[missing] + tick.dt

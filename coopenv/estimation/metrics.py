@@ -89,7 +89,7 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return the normalised estimation error squared e^T P^-1 e of errors (..., n).
 
     For a consistent observer it is chi-square distributed with n degrees of freedom. The error must be in the
-    coordinates of P (see `error_coordinates`); mixing them is the usual mistake. NaN where P is not positive
+    coordinates of P (see `Coordinates.error`); mixing them is the usual mistake. NaN where P is not positive
     definite, as for an observer that declares no covariance.
     """
     e, P = np.asarray(error, float), np.asarray(covariance, float)

@@ -112,19 +112,6 @@ def orthonormalise(R: Array) -> Array:
     return result
 
 
-def exp_se3(xi: Array) -> tuple[Array, Array]:
-    """Return the rotations (..., 3, 3) and translations (..., 3) of Exp(xi) for xi (..., 6)."""
-    theta, rho = xi[..., :3], xi[..., 3:]
-    square = np.maximum((theta * theta).sum(-1)[..., None, None], 1e-30)
-    angle = np.sqrt(square)
-    a, b = np.sin(angle) / angle, 2.0 * (np.sin(angle / 2.0) / angle) ** 2
-    c = (1.0 - a) / square  # digits that it loses at small angles do not count beside the identity
-    S = skew(theta)
-    SS = S @ S
-    left_jacobian = IDENTITY + b * S + c * SS
-    return IDENTITY + a * S + b * SS, (left_jacobian @ rho[..., None])[..., 0]
-
-
 def exp_translation(w: Array, v: Array) -> Array:
     """Return the translation (3,) of Exp((w, v)).
 
@@ -201,20 +188,6 @@ def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
     return np.asarray(np.degrees(np.stack([roll, pitch, yaw], axis=-1)))
 
 
-def error_coordinates(
-    position: np.ndarray, rotation: np.ndarray, position_estimate: np.ndarray, rotation_estimate: np.ndarray
-) -> np.ndarray:
-    """Return the observer's error (2 lambda, p - phat) as (..., 6), in rad and m.
-
-    lambda is the vector part of the unit quaternion of Rtilde; p = R^T pbar and phat = Rhat^T pbarhat are the
-    positions in the true and in the estimated body frame. These are the coordinates of the observer's P.
-    """
-    twice_lambda = 2 * quaternion_wxyz(error_rotation(rotation, rotation_estimate))[..., 1:]
-    p = np.einsum("...ji,...j->...i", np.asarray(rotation, float), np.asarray(position, float))
-    p_hat = np.einsum("...ji,...j->...i", np.asarray(rotation_estimate, float), np.asarray(position_estimate, float))
-    return np.concatenate([twice_lambda, p - p_hat], axis=-1)
-
-
 class Coordinates(Enum):
     """The error e that a covariance is about; truth (R, p), estimate (Rhat, phat), positions in the map frame."""
 
@@ -225,10 +198,11 @@ class Coordinates(Enum):
 
     def error(self, rotation: Array, position: Array, rotation_estimate: Array, position_estimate: Array) -> Array:
         """Return e (..., 6) in rad and m, of truth against estimate over any leading axes."""
-        if self is Coordinates.RICCATI:
-            return error_coordinates(position, rotation, position_estimate, rotation_estimate)
-        R, R_hat = np.asarray(rotation), np.asarray(rotation_estimate)
+        R, R_hat = np.asarray(rotation, float), np.asarray(rotation_estimate, float)
         R_hat_T = np.swapaxes(R_hat, -1, -2)
+        if self is Coordinates.RICCATI:
+            body = np.einsum("...ji,...j->...i", R, position) - np.einsum("...ji,...j->...i", R_hat, position_estimate)
+            return np.concatenate([2 * quaternion_wxyz(error_rotation(R, R_hat))[..., 1:], body], axis=-1)
         if self is Coordinates.LEFT:
             tilde = error_rotation(R, R_hat)
             rho = (R_hat_T @ (position - position_estimate)[..., None])[..., 0]

@@ -23,30 +23,28 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
-from coopenv.observers.contract import SensorNoise
 from coopenv.observers.recording import Recording
 
-SIZES = {"scale": 1, "bias": 3, "mounting": 3, "place": 3, "clock": 1}
-"""Errors of a vehicle: relative, rad/s, rad, m, s; body axes."""
+ERRORS = 11
+"""Errors of a vehicle: scale of the odometry (relative), bias of the gyro (3, rad/s), orientation (3, rad) and place
+(3, m) of the camera in body axes, offset of the clock (s)."""
 
 
 @dataclass(frozen=True)
 class ErrorStates:
     """Which errors the vehicles of a record have, beside those of their poses."""
 
-    places: dict[str, slice]
-    """Name to place among a vehicle's errors, of those that any vehicle has."""
+    kept: list[int]  # (e,) of `ERRORS`, those that any vehicle has
     variance: Array  # (N, e) at the start
     walk: Array  # (N, e) by which it grows, 1/s
 
     @property
     def count(self) -> int:
         """How many a vehicle has."""
-        return int(self.variance.shape[1])
+        return len(self.kept)
 
     def over_step(self, turned: Array, step: Array, dt: float) -> Array:
         """Return (..., 6, e) what the pose's left error gets over a tick from the errors, to first order.
@@ -56,12 +54,10 @@ class ErrorStates:
             step: (..., 3) displacement, body at the start, m.
             dt: s.
         """
-        made = np.zeros((*step.shape[:-1], 6, self.count))
-        if "scale" in self.places:
-            made[..., 3:, self.places["scale"]] = -turned @ step[..., None]
-        if "bias" in self.places:
-            made[..., :3, self.places["bias"]] = -dt * np.eye(3)
-        return made
+        made = np.zeros((*step.shape[:-1], 6, ERRORS))
+        made[..., 3:, :1] = -turned @ step[..., None]
+        made[..., :3, 1:4] = -dt * np.eye(3)
+        return made[..., self.kept]
 
     def in_bearings(self, u: Array, across: Array) -> Array:
         """Return (K, 3, e) what a bearing gets from its own vehicle's errors, its clock apart.
@@ -70,50 +66,26 @@ class ErrorStates:
             u: (K, 3) unit bearings, body frame.
             across: (K, 3, 3) the derivative of a bearing by the line to the target.
         """
-        made = np.zeros((len(u), 3, self.count))
-        if "mounting" in self.places:
-            made[..., self.places["mounting"]] = skew(u)
-        if "place" in self.places:
-            made[..., self.places["place"]] = -across
-        return made
+        made = np.zeros((len(u), 3, ERRORS))
+        made[..., 4:7], made[..., 7:10] = skew(u), -across
+        return made[..., self.kept]
 
     def of_clock(self, motion: Array) -> Array:
         """Return (K, 3, e) what a bearing gets from a clock that is off, given its derivative by time (K, 3)."""
-        made = np.zeros((len(motion), 3, self.count))
-        if "clock" in self.places:
-            made[..., self.places["clock"]] = motion[..., None]
-        return made
+        made = np.zeros((len(motion), 3, ERRORS))
+        made[..., 10] = motion
+        return made[..., self.kept]
 
 
 def error_states(recording: Recording) -> ErrorStates:
     """Return the declared errors of the vehicles of a record."""
-    noises = [setup.noise for setup in recording.setups]
-    variance, walk = (np.array([_stacked(noise, walks) for noise in noises]) ** 2 for walks in (False, True))
-    ends = np.cumsum([0, *SIZES.values()]).tolist()
-    there = {
-        name: range(first, last)
-        for name, first, last in zip(SIZES, ends[:-1], ends[1:], strict=True)
-        if (variance[:, first:last] + walk[:, first:last]).any()
-    }
-    kept: list[int] = [column for columns in there.values() for column in columns]
-    places = {
-        name: slice(kept.index(columns[0]), kept.index(columns[0]) + len(columns)) for name, columns in there.items()
-    }
-    return ErrorStates(places, variance[:, kept], walk[:, kept])
-
-
-def _stacked(noise: SensorNoise, walks: bool) -> list[float]:
-    """Return the standard deviations of all errors, or of their walks."""
-    nothing: Sequence[float] = (0.0,) * 3
-    if walks:
-        return [noise.odometry_scale_walk, *noise.gyro_bias_walk, *nothing, *nothing, 0.0]
-    mounting, place = (noise.camera_orientation,) * 3, (noise.camera_position,) * 3
-    return [noise.odometry_scale, *noise.gyro_bias, *mounting, *place, noise.clock_offset]
-
-
-def motion_of_points(points: Array, dt: float, ticks: NDArray[np.int64]) -> Array:
-    """Return (k, 3) the velocities at some ticks of a point that moves over all (K, 3), m/s."""
-    return np.asarray((points[np.maximum(ticks, 1)] - points[np.maximum(ticks, 1) - 1]) / dt)
+    std, walk = np.zeros((2, len(recording.setups), ERRORS))
+    for i, noise in enumerate(setup.noise for setup in recording.setups):
+        camera = [noise.camera_orientation] * 3 + [noise.camera_position] * 3
+        std[i] = [noise.odometry_scale, *noise.gyro_bias, *camera, noise.clock_offset]
+        walk[i, :4] = [noise.odometry_scale_walk, *noise.gyro_bias_walk]
+    kept = np.flatnonzero((std + walk).any(axis=0)).tolist()
+    return ErrorStates(kept, std[:, kept] ** 2, walk[:, kept] ** 2)
 
 
 BLOCK = 10_000_000
@@ -185,8 +157,11 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
     w = 6 + errors.count
     part = (w * np.asarray(groups)[..., None] + np.arange(w)).reshape(len(groups), -1)
     members, used = np.asarray(groups), sorted({i for group in groups for i in group})
-    start, Q = _starts(recording, errors), _growths(recording, errors)
+    pairs = zip(recording.start_covariance, errors.variance, strict=True)
+    start = [block_diag(P, np.diag(variance)) for P, variance in pairs]
     P = np.array([block_diag(*(start[i] for i in group)) for group in groups])
+    dt, walks = recording.dt, zip(recording.setups, errors.walk, strict=True)
+    Q = np.array([np.diag(np.concatenate([setup.noise.odometry(dt), dt * walk])) for setup, walk in walks])
     own = np.arange(part.shape[1]).reshape(-1, w)
     rows, columns = own[:, :, None], own[:, None, :]
     blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
@@ -212,18 +187,6 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
             poses = P[:, rows, columns][..., :6, :6]
             blocks[k : ticks.start + last] = blocks[k - 1] + parts * (poses - blocks[k - 1])
     return blocks
-
-
-def _starts(recording: Recording, errors: ErrorStates) -> list[Array]:
-    """Return the covariance (w, w) of every vehicle's errors at the start."""
-    pairs = zip(recording.start_covariance, errors.variance, strict=True)
-    return [np.asarray(block_diag(P, np.diag(variance))) for P, variance in pairs]
-
-
-def _growths(recording: Recording, errors: ErrorStates) -> Array:
-    """Return (N, w, w) by what the covariance of every vehicle's errors grows in a tick."""
-    dt, pairs = recording.dt, zip(recording.setups, errors.walk, strict=True)
-    return np.array([np.diag(np.concatenate([setup.noise.odometry(dt), dt * walk])) for setup, walk in pairs])
 
 
 def _together(E: Array, M: Array, Q: Array) -> tuple[Array, Array, Array]:
@@ -285,11 +248,6 @@ def steps(recording: Recording, ticks: range, errors: ErrorStates | None = None)
     return made
 
 
-def transitions(recording: Recording) -> Array:
-    """Return F (K, 6N, 6N) of the stacked left errors over the true motion into each tick; F[0] is the identity."""
-    return np.array([block_diag(*each) for each in steps(recording, range(recording.ticks))])
-
-
 def information(
     recording: Recording,
     joint: bool = True,
@@ -331,7 +289,8 @@ def information(
                 Hi = np.concatenate([Hi, errors.in_bearings(u, across)], axis=-1)
             if errors is not None and not known:  # a report is dated by the sender's clock
                 there = recording.truth.position[:, j] + recording.truth.rotation[:, j] @ marker
-                v = motion_of_points(there, recording.dt, np.array(ticks))
+                at = np.maximum(ticks, 1)
+                v = (there[at] - there[at - 1]) / recording.dt  # m/s
                 moved = errors.of_clock((across @ Rt @ v[..., None])[..., 0])
                 Hi[..., 6:] -= moved
             Hi_t = np.swapaxes(Hi, -1, -2) @ weight

@@ -355,17 +355,13 @@ def check_recording(recording: Recording, where: str) -> None:
         _check_arrays(recording)
         _check_scenario(recording)
         _check_drawn(recording)
-    except _RecordingError as error:
+    except DataError as error:
         raise DataError(f"{where}: {error}") from None
-
-
-class _RecordingError(Exception):
-    """What is wrong with a recording."""
 
 
 def _require(condition: Any, message: str) -> None:
     if not condition:
-        raise _RecordingError(message)
+        raise DataError(message)
 
 
 def _between(name: str, value: Any, low: float, high: float) -> None:
@@ -428,7 +424,7 @@ def _check_arrays(r: Recording) -> None:
     names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
     values = {name: _value_of(r, name) for name in names}
     for problem in _misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
-        raise _RecordingError(problem)
+        raise DataError(problem)
     about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}
     for name, valid, problem in _invalid(values, about, ticks=True):
         _require_all(r, name, valid, problem)
@@ -441,7 +437,7 @@ def _require_all(r: Recording, name: str, valid: Mask, problem: str) -> None:
     if not valid.all():
         tick, *row = np.argwhere(~valid)[0].tolist() if ARRAYS[name].axes[0] == "K" else (None, *np.argwhere(~valid)[0])
         whose = "".join(f" of {r.setups[i].name}" for i in row)
-        raise _RecordingError(f"{name}{whose}{'' if tick is None else f', tick {tick}'}: {problem}")
+        raise DataError(f"{name}{whose}{'' if tick is None else f', tick {tick}'}: {problem}")
 
 
 def _check_drawn(r: Recording) -> None:

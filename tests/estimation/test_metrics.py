@@ -76,7 +76,7 @@ def test_error_coordinates_to_first_order() -> None:
     )
     R_hat = R @ Rotation.from_rotvec(theta).as_matrix().T  # Rtilde = Exp(theta)
     position_estimate = R_hat @ (R.T @ position - delta)
-    error = poses.error_coordinates(position, R, position_estimate, R_hat)
+    error = poses.Coordinates.RICCATI.error(R, position, R_hat, position_estimate)
     assert_allclose(error, np.concatenate([theta, delta]), atol=1e-12)
 
 
@@ -86,7 +86,7 @@ def test_synthetic_errors_and_nees_are_recovered() -> None:
     assert_allclose(distance, run.position_error, rtol=1e-10)
     angle = poses.orientation_error_deg(run.rotation, run.rotation_estimate)
     assert_allclose(angle, run.orientation_error, rtol=1e-9)
-    error = poses.error_coordinates(run.position, run.rotation, run.position_estimate, run.rotation_estimate)
+    error = poses.Coordinates.RICCATI.error(run.rotation, run.position, run.rotation_estimate, run.position_estimate)
     assert_allclose(metrics.nees(error, run.covariance), run.nees, rtol=1e-8)
 
 

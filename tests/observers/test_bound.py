@@ -7,14 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
-from coopenv.observers import Coordinates, SensorNoise
+from coopenv.observers import Coordinates, Recording, SensorNoise
 from coopenv.observers import bound as bound_module
-from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, transitions
+from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, steps
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.oracles.batch import small_errors, small_record, solve
+
+
+def transitions(made: Recording) -> np.ndarray:
+    return np.array([block_diag(*each) for each in steps(made, range(made.ticks))])
 
 
 def test_joint_bound_is_the_batch_solution_s_covariance() -> None:
@@ -59,8 +65,6 @@ def test_transition_carries_small_errors() -> None:
     made = record(small_errors({"horizon": 0.1}), 0)
     R, p = made.truth.rotation[:, 1], made.truth.position[:, 1]
     e = 1e-5 * np.arange(1.0, 7.0)
-    from scipy.spatial.transform import Rotation
-
     wrong_R, wrong_p = R[0] @ Rotation.from_rotvec(-e[:3]).as_matrix(), p[0] - R[0] @ e[3:]
     F = transitions(made)
     for k in range(1, made.ticks):

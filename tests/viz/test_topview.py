@@ -20,7 +20,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.poses import error_coordinates, position_covariance
+from coopenv.estimation.poses import Coordinates, position_covariance
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.camera_image import Lens, camera_image
@@ -192,7 +192,7 @@ def test_position_covariance_agrees_with_monte_carlo() -> None:
     position = np.einsum("kij,kj->ki", R, p_hat + e[:, 3:])
 
     p_bar = np.broadcast_to(R_hat @ p_hat, position.shape)
-    again = error_coordinates(position, R, p_bar, np.broadcast_to(R_hat, R.shape))
+    again = Coordinates.RICCATI.error(R, position, np.broadcast_to(R_hat, R.shape), p_bar)
     np.testing.assert_allclose(again, e, atol=1e-9)  # these are the coordinates of P
 
     sampled = np.cov(position.T)

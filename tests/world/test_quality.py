@@ -77,7 +77,7 @@ def test_error_coordinates_and_nees(angle: float | None) -> None:
     P = covariances(np.random.default_rng(2))
     e1, e2, value = call(judged, "float64", P, R, position, R_hat, p_hat)
     estimate = np.einsum("nij,nj->ni", R_hat, p_hat)
-    expected = poses.error_coordinates(position, R, estimate, R_hat)
+    expected = poses.Coordinates.RICCATI.error(R, position, R_hat, estimate)
     assert_allclose(np.concatenate([e1, e2], axis=1), expected, atol=1e-13)
     assert_allclose(value, metrics.nees(expected, P), rtol=1e-8)
 
