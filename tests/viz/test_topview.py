@@ -98,13 +98,13 @@ def test_vehicles_move_over_a_ground_that_stays(start: Any) -> None:
     assert 0.005 < changed.mean() < 0.5
     below_the_table = HEIGHT - int(TABLE_TOP) + ROW * 6
     assert not changed[below_the_table:, int(PANEL) :].any()
-    axes = start._pictures.view._axes.get_window_extent()
+    axes = start.engine.top_view._axes.get_window_extent()
     assert not changed[:, : int(axes.x0) - 1].any()
     assert not changed[HEIGHT - int(axes.y0) + 1 :].any()
     x, y = start.engine.view("position")[0, 3 + 4, :2].tolist()
-    assert_colour(at(second, start._pictures.view, x - 0.4, y + 0.3), ORANGE)
+    assert_colour(at(second, start.engine.top_view, x - 0.4, y + 0.3), ORANGE)
     assert x == pytest.approx(-27.0, abs=1e-3)
-    assert_colour(at(first, start._pictures.view, x - 3.4, y + 0.3), ORANGE)
+    assert_colour(at(first, start.engine.top_view, x - 3.4, y + 0.3), ORANGE)
 
 
 def test_equal_states_give_equal_pictures_whatever_was_drawn_before(start: Any) -> None:
@@ -215,7 +215,7 @@ def test_ellipse_is_the_3_sigma_contour() -> None:
 
 def test_estimates_outside_change_no_limits_and_are_pointed_at(start: Any) -> None:
     inside = start.render()
-    axes = start._pictures.view._axes
+    axes = start.engine.top_view._axes
     before = (*axes.get_xlim(), *axes.get_ylim())
     engine = start.engine
     engine.view("estimate_rotation")[0, 0] = np.eye(3)
