@@ -1,12 +1,8 @@
-"""Files from outside: TOML in typed sections and arrays in `.npz`, checked, each with an error of one line."""
+"""TOML files from outside in typed sections, checked, each with an error of one line."""
 
 import ast
 import inspect
-import math
 import tomllib
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
@@ -15,10 +11,9 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.base.errors import CoopenvError, DataError, error_text, shortened, shown, suggest
+from coopenv.base.errors import CoopenvError, shortened, shown, suggest
 
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
@@ -186,66 +181,3 @@ def _models_in(annotation: Any) -> list[Any]:
     if isinstance(annotation, type):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
-
-
-MOST_UNPACKED = 2**31
-"""Bytes that an `.npz` file may unpack to."""
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-
-def read_npz(
-    path: Path, what: str, table: Mapping[str, str], lengths: Mapping[str, Sequence[int]] | None = None
-) -> dict[str, np.ndarray]:
-    """Read arrays of an untrusted `.npz` file; sizes, kinds and shapes are checked before memory is allocated.
-
-    Args:
-        path: of the file.
-        what: it is, as errors call it.
-        table: by name of an array the kinds of its dtype and its axes, for example "f K N 3". Axes of the same letter
-            have the same length.
-        lengths: by letter which lengths are possible; None: any.
-
-    Raises:
-        DataError: there is no such file, it unpacks to more than `MOST_UNPACKED`, or an array is missing or other than
-            in the table.
-    """
-    possible = dict(lengths or {})
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
-            if sum(part.file_size for part in archive.infolist()) > MOST_UNPACKED:
-                raise DataError(f"{path}: unpacks to more than {MOST_UNPACKED >> 30} GiB")
-            if missing := [name for name in table if name not in members]:
-                raise DataError(f"{path}: not a {what}, missing: {', '.join(missing)}")
-            found = {}
-            for name, rule in table.items():
-                with archive.open(members[name]) as stream:
-                    shape, _, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
-                if not _fits(shape, dtype, rule, possible):
-                    kinds, *axes = rule.split()
-                    wanted = ", ".join(" or ".join(map(str, possible.get(axis, (axis,)))) for axis in axes)
-                    raise DataError(f"{path}: {name}: {dtype} {shape} is not of kind {kinds} and shape ({wanted})")
-                if math.prod(shape) * dtype.itemsize > members[name].file_size:
-                    raise EOFError
-                with archive.open(members[name]) as stream:
-                    found[name] = np.lib.format.read_array(stream, allow_pickle=False)
-            return found
-    except CoopenvError:
-        raise
-    except (zipfile.BadZipFile, EOFError, zlib.error):
-        raise DataError(f"{path}: not a readable {what}: it is cut off, damaged, or of another kind") from None
-    except Exception as error:  # any error of NumPy and zipfile for malformed files
-        raise DataError(
-            f"{path}: not a readable {what} ({getattr(error, 'strerror', None) or error_text(error)})"
-        ) from None
-
-
-def _fits(shape: tuple[int, ...], dtype: np.dtype, rule: str, possible: dict[str, Sequence[int]]) -> bool:
-    """Return whether an array is as its rule says; lengths of letters that are met first are kept in `possible`."""
-    kinds, *axes = rule.split()
-    if dtype.kind not in kinds or len(shape) != len(axes):
-        return False
-    return all(
-        length == int(axis) if axis.isdigit() else length in possible.setdefault(axis, (length,))
-        for length, axis in zip(shape, axes, strict=True)
-    )

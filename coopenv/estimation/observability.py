@@ -37,7 +37,7 @@ from typing import Annotated, NamedTuple, Self, get_type_hints
 import numpy as np
 
 from coopenv.base.files import replacing_file
-from coopenv.base.sections import read_npz
+from coopenv.base.npz import read_npz
 from coopenv.estimation.poses import Array, skew
 
 DEFAULT_WINDOW = 1.0

@@ -16,7 +16,8 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import jsonable
-from coopenv.base.sections import Section, read_npz, validated
+from coopenv.base.npz import read_npz
+from coopenv.base.sections import Section, validated
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.estimation.poses import position_covariance
 from coopenv.observers.registry import states_covariance
