@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import markup, mirror, notebooks, pages, tables  # noqa: E402
+from sitegen import markup, mirror, notebooks, pages, reference, tables  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -53,12 +53,12 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Let links into the repository lead to pages of the site, and offer a tutorial as a notebook."""
+    """Fill in the tables of the reference, let links lead to pages of the site, and offer a tutorial as a notebook."""
     uri = page.file.src_uri
     if page.file.generated_by:
         return markdown
     try:
-        text = mirror.relinked(markdown, f"docs/{uri}", uri)
+        text = mirror.relinked(reference.filled(markdown), f"docs/{uri}", uri)
     except ValueError as error:
         raise PluginError(f"{uri}: {error}") from None
     if notebooks.is_tutorial(uri):

@@ -1,4 +1,4 @@
-"""Tables of the reference, made from docstrings: `python -m sitegen.reference` writes them into docs/reference."""
+"""Tables of the reference, made from docstrings when the site is built."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -15,7 +15,6 @@ from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.runs.page import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
-from sitegen.mirror import ROOT
 
 TOPIC_ROWS = {
     Role.DETECTIONS: ("car", "60", "blocks of the Pixy, pixels; also frames without blocks"),
@@ -126,17 +125,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "topics": topics,
     "training": lambda: _reference(Settings),
 }
-PAGES = ("bag_map.md", "deployment.md", "observation.md", "topics.md", "training.md")
-"""Files in docs/reference that hold them."""
-_PLACE = re.compile(r"(<!-- (\w+): written by [^>]* -->\n\n).*?(?=\n\n<!-- end -->)", re.DOTALL)
+_PLACE = re.compile(r"<!-- table: (\w+) -->\n.*?(?=\n\n|\Z)", re.DOTALL)
 
 
 def filled(text: str) -> str:
-    """Return a page with its tables as they are now, each between two comments."""
-    return _PLACE.sub(lambda place: place[1] + TABLES[place[2]](), text)
-
-
-if __name__ == "__main__":
-    for name in PAGES:
-        path = ROOT / "docs" / "reference" / name
-        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")
+    """Return a page with its tables, each instead of the paragraph behind a comment that names it."""
+    return _PLACE.sub(lambda place: TABLES[place[1]](), text)
