@@ -94,9 +94,10 @@ def fake(
 
     faults = [fake_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)
-    complain = partial(print, file=sys.stderr, flush=True)
     with closing(open_transport(load_deployment(deployment, connect))) as transport:
-        made = make(transport, seed=seed, faults=faults, complain=complain)
+        made = make(transport, seed=seed)
+        for each in faults:
+            made.add_fault(each)
         gc.freeze()  # what is there stays, and need not be looked through again and again
         interrupts.note(f"{car} is gone")
         print(f"{car}: fake ready", flush=True)
@@ -139,27 +140,20 @@ def gate(
     Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
-    from coopenv.cars.gate.core import Gate
-    from coopenv.cars.gate.process import CLOCK, GateConnection, GateSettings, run
+    from coopenv.cars.gate.process import CLOCK, gate_deployment, prepare_gate, run
+    from coopenv.cars.transport.zenoh import open_transport
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
-    given = GateSettings.of(car, deployment).changed(
-        connect=connect and (connect,),
-        keys=keys,
-        station=station,
-        limits={**bounds, "steering_rate": max_steering_rate, "reverse": reverse},
-    )
-    given.check_place(off_board)
-    signer, verifier = given.identities()
-    if verifier is None:
+    fleet = gate_deployment(car, deployment, connect, off_board)
+    attach = prepare_gate(fleet, car, station, keys, {**bounds, "steering_rate": max_steering_rate, "reverse": reverse})
+    if keys is None and fleet.keys is None:
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
-    with closing(given.open()) as transport:
-        decides = Gate(car, given.limits, CLOCK, verifier, given.station, given.profile)
-        link = GateConnection(decides, car, transport, signer, given.profile)
+    with closing(open_transport(fleet)) as transport:
+        link = attach(transport, CLOCK)
         interrupts.note(f"{car} is in neutral")
         if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
-        print(f"{car}: gate ready at {', '.join(given.connect)}", flush=True)
+        print(f"{car}: gate ready at {', '.join(fleet.network.connect)}", flush=True)
         run(link)
 
 
@@ -175,13 +169,13 @@ def health(
 
     On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
     """
-    from coopenv.cars.gate.process import GateSettings
+    from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import Role
+    from coopenv.cars.transport.zenoh import open_transport
 
-    given = GateSettings.of(car, deployment).changed({}, connect=connect and (connect,))
-    given.check_place(off_board)
-    topic = given.profile.topic_of(given.car, Role.GATE)
-    with closing(given.open()) as transport:
+    fleet = gate_deployment(car, deployment, connect, off_board)
+    topic = fleet.profile.topic_of(car, Role.GATE)
+    with closing(open_transport(fleet)) as transport:
         status = next_status(transport, topic, patience)
     if status is None:
         raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")

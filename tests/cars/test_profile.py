@@ -63,7 +63,7 @@ def test_its_gate_sends_its_own_command_message(rover: CarProfile) -> None:
     hub, sent, now = Hub(), list[Arrival](), [time.time_ns()]
     hub.connect().subscribe("robots/svea7/drive", sent.append)
     clock = GateClock(lambda: now[0], lambda: now[0])
-    link = GateConnection(Gate("svea7", USUAL, clock, profile=rover), "svea7", hub.connect(), None, rover)
+    link = GateConnection(Gate("svea7", USUAL, clock, profile=rover), hub.connect())
     now[0] += PERIOD
     link.tick()
     message = decode(sent[0].payload, "ackermann_msgs/msg/AckermannDriveStamped").drive

@@ -35,10 +35,10 @@ class Stage:
         profile: CarProfile = SVEA,
         **options: Any,
     ) -> None:
-        self.now, self.wall, self.died = 10**12, 1_700_000_000 * 10**9, list[str]()
-        self.complaints: list[str] = []
+        self.now, self.wall = 10**12, 1_700_000_000 * 10**9
         self.scenario: Scenario = load_scenario(environment, overrides or {})
         sensors = sensors or Sensors()
+        wheel = sensors.odometry == "wheel"
         self.fleet = Deployment(
             environment=environment, cars=cars, markers=MARKERS, fakes=True, sensors=sensors, profile=profile
         )
@@ -48,16 +48,7 @@ class Stage:
         binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
         clock = GateClock(lambda: self.wall + self.now, lambda: self.now)
         self.cars = {
-            car.name: Fake(
-                self.fleet,
-                binding,
-                car.name,
-                self.hub.connect(),
-                clock=clock,
-                die=lambda name=car.name: self.died.append(name),
-                complain=self.complaints.append,
-                **{"gate": False, **options},
-            )
+            car.name: Fake(binding, car.name, self.hub.connect(), differential=wheel, clock=clock, **options)
             for car in cars
         }
 

@@ -18,8 +18,8 @@ from coopenv.base.interrupts import before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
-from coopenv.cars.fake.car import REAL, Fake
-from coopenv.cars.gate.process import GateSettings
+from coopenv.cars.fake.car import Fake
+from coopenv.cars.gate.process import CLOCK, prepare_gate
 
 READY = 300.0
 """s that fakes have until they can be seen: the first ones on a computer compile the simulation's kernels."""
@@ -167,7 +167,7 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
     Args:
         path: deployment file.
         car: its name.
-        gate: as for `Fake`.
+        gate: whether commands come through a gate of its own; else it obeys ManualControl.
         station: whose commands count at its gate (None: those of the file's `security.identity`).
 
     Raises:
@@ -179,11 +179,8 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
     if scenario.backend != "simulated":
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
     binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None, fleet.profile)
-    given = GateSettings.of(car, Path(path)).changed({}, station=station)
-    signer, verifier = given.identities() if gate else (None, None)
-    trusting = fleet.security.model_copy(update={"identity": given.station})
-    fleet = fleet.model_copy(update={"security": trusting})
-    return partial(Fake, fleet, binding, car, gate=gate, signer=signer, verifier=verifier)
+    own_gate = prepare_gate(fleet, car, station) if gate else None
+    return partial(Fake, binding, car, differential=fleet.sensors.odometry == "wheel", gate=own_gate)
 
 
 def run(fake: Fake, stop: threading.Event) -> None:
@@ -191,6 +188,6 @@ def run(fake: Fake, stop: threading.Event) -> None:
     try:
         while not stop.is_set():
             fake.advance()
-            stop.wait(max((fake.next - REAL.steady()) * 1e-9, REST))
+            stop.wait(max((fake.next - CLOCK.steady()) * 1e-9, REST))
     finally:
         fake.close()

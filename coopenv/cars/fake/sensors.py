@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.codec import encode, header, make, pose
+from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import CarProfile, Role
@@ -23,153 +23,6 @@ from coopenv.world.random import ODOMETRY_NOISE
 TRUTH_RATE, WHEEL_RATE, IMU_RATE, FILTER_RATE = 100.0, 50.0, 100.0, 20.0
 LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 60.0, 5.0, 1.0
 """Hz: motion capture, wheels, gyro, own filter; poses of a moving landmark, conditions of a car, its calibration."""
-
-
-class CarSensors:
-    """The odometry of one car. Lasting errors are those that the world has drawn."""
-
-    def __init__(self, world: CarWorld, *, differential: bool = True) -> None:
-        """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
-        self._differential = differential
-        self._world, self._noise = world, world.scenario.noises[world.vehicle]
-        self.wheel_std = deviation(self._noise.velocity, self._noise, WHEEL_RATE)
-        """m/s, of a sample."""
-        self.wheel_turn_std = deviation(self._noise.angular_velocity, self._noise, WHEEL_RATE)
-        self.gyro_std = deviation(self._noise.angular_velocity, self._noise, IMU_RATE)
-        """rad/s, of a sample of each axis."""
-
-    def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode: the filter starts at its own origin, noise comes from `rng`."""
-        self._rng = rng
-        self.pose = np.zeros(3)
-        """Of the filter, x and y in m and the heading in rad, from where the car began."""
-        self.speed, self.turn_rate = 0.0, 0.0  # last samples
-        self._since = 0
-        self._factor = float(self._world.view("parameter")[0, int(ODOMETRY_NOISE)])
-
-    def wheel(self, now: int) -> tuple[float, float]:
-        """Return the speed, m/s, and the turn rate, rad/s, by the wheels at a time in ns."""
-        velocity, turn = self._world.twist
-        slip = self._world.view("slip")[0, self._world.vehicle]
-        scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
-        self.dead_reckon(now)
-        self.speed = float(velocity[0] * scale * math.cos(slip[1]) + self._rng.normal() * self._factor * self.wheel_std)
-        turned = float(turn[2] * scale + self._rng.normal() * self._factor * self.wheel_turn_std)
-        return self.speed, turned if self._differential else 0.0
-
-    def gyro(self, now: int) -> Array:
-        """Return the turn rates about the body's axes, (3,) rad/s."""
-        _, turn = self._world.twist
-        bias = self._world.view("gyro_bias")[0, self._world.vehicle]
-        read: Array = turn + bias + self._rng.normal(size=3) * self._factor * self.gyro_std
-        self.dead_reckon(now)
-        self.turn_rate = float(read[2])
-        return read
-
-    def dead_reckon(self, now: int) -> None:
-        """Move the filter's pose to a time by the last samples, held and summed."""
-        dt = (now - self._since) * 1e-9 if self._since else 0.0
-        self._since = now
-        middle = self.pose[2] + 0.5 * dt * self.turn_rate
-        way = dt * self.speed
-        self.pose += (way * math.cos(middle), way * math.sin(middle), dt * self.turn_rate)
-
-
-def deviation(stated: float, noise: Noise, rate: float) -> float:
-    """Return the standard deviation of a sample at a rate, Hz, whose density is that of what a scenario states."""
-    if not noise.enabled:
-        return 0.0
-    return stated if isinstance(noise.odometry_rate, str) else stated * math.sqrt(rate / noise.odometry_rate)
-
-
-MARKER = 0.08  # m, side of a marker
-OLDEST = 255  # frames that the camera counts
-
-
-class Pixy:
-    """The camera of one car."""
-
-    def __init__(self, world: CarWorld, binding: Binding, others: Neighbours, faults: Faults) -> None:
-        """Put it on the car.
-
-        Args:
-            world: what it looks at.
-            binding: markers of the cars and of landmarks, and those that it identifies.
-            others: the other cars, which are placed for each frame.
-            faults: that it may have.
-        """
-        self._world, self._others, self._faults = world, others, faults
-        self._markers = {target: marker for marker, target in binding.targets.items()}
-        smallest, largest = binding.profile.markers
-        self._numbers = range(smallest, largest + 1)
-        self.calibration = Calibration.of(world.scenario.cameras[world.vehicle])
-        """Of its lens."""
-
-    def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode: frames count from here, faults draw from `rng`."""
-        self._ages: dict[int, int] = {}
-        self._frames, self._rng = 0, rng
-
-    def frame(self, now: int) -> list[Any]:
-        """Take a frame at a time in ns; return its blocks (ObjectInfo), the largest first."""
-        self._others.place()
-        self._frames += 1
-        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
-        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
-        blocks = self._blocks(seen) if seen else []
-        blocks.sort(key=lambda block: -block.width * block.height)
-        return self._with_faults(blocks, now)
-
-    def _blocks(self, seen: dict[int, Array]) -> list[Any]:
-        c, rays = self.calibration, np.array([*seen.values()])
-        flat = distort(rays[:, :2] / rays[:, 2:], c.distortion)
-        pixels = np.rint(flat * c.focal_length + c.principal_point).clip(0, np.array(c.image_size) - 1)
-        blocks = []
-        for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
-            number, near = self._markers[agent], MARKER / max(self._world.distance(agent), MARKER)
-            width, height = (max(1, round(f * near)) for f in c.focal_length)
-            blocks.append(_block(number, x, y, width, height, number - 1, self._ages[agent]))
-        return blocks
-
-    def _with_faults(self, blocks: list[Any], now: int) -> list[Any]:
-        faults, rng, (width, height) = self._faults, self._rng, self.calibration.image_size
-        if faults.value("swapped_signatures", now):
-            numbers = [block.signature for block in blocks]
-            blocks = [replace(b, signature=n) for b, n in zip(blocks, reversed(numbers), strict=True)]
-        if share := faults.value("duplicate_blocks", now):
-            doubled = [block for block in blocks if rng.random() < share]
-            for b in doubled:
-                x, sides = (
-                    min(b.center_x + 3, width - 1),
-                    {"width": max(1, b.width // 2), "height": max(1, b.height // 2)},
-                )
-                blocks = [*blocks, replace(b, center_x=x, **sides, age=1)]
-        if rate := faults.value("false_blocks", now):
-            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
-                x, y = int(rng.integers(width)), int(rng.integers(height))
-                blocks = [*blocks, _block(int(rng.choice(self._numbers)), x, y, 2, 2)]
-        return blocks
-
-    def bearings(self, blocks: list[Any]) -> list[Any]:
-        """Return the ObjectBearings of blocks as the authors compute them.
-
-        They are unit vectors from the target to the camera; distortion is not removed.
-        """
-        c, pixels = self.calibration, np.array([(b.center_x, b.center_y) for b in blocks], dtype=np.float64)
-        flat = (np.array(c.principal_point) - pixels.reshape(-1, 2)) / c.focal_length
-        rays = np.concatenate([flat, -np.ones((len(blocks), 1))], axis=-1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        rows = zip(blocks, rays.tolist(), strict=True)
-        return [
-            make("pixy_camera/msg/ObjectBearing", id=b.signature, bearing_x=x, bearing_y=y, bearing_z=z)
-            for b, (x, y, z) in rows
-        ]
-
-
-def _block(signature: int, x: int, y: int, width: int, height: int, index: int = 0, age: int = 1) -> Any:
-    """Return the block of a marker in the camera's image; `age` is in frames in a row."""
-    sides = {"center_x": x, "center_y": y, "width": width, "height": height}
-    return make("pixy_camera/msg/ObjectInfo", signature=signature, **sides, index=index, age=age)
 
 
 GRAVITY = 9.81  # m/s^2
@@ -188,109 +41,216 @@ Act = Callable[[int, int], None]
 
 
 class SensorPublisher:
-    """Publishes the messages of a car: motion capture, and those of a vehicle or of a moving landmark."""
+    """Publishes messages of a car on a network."""
 
-    def __init__(
-        self,
-        name: str,
-        world: CarWorld,
-        profile: CarProfile,
-        wire: Transport,
-        outside: Transport,
-        shared_clock: Callable[[int], int],
-        vehicle: tuple[Pixy, CarSensors] | None,
-    ) -> None:
-        """Prepare the messages of a car.
+    def __init__(self, name: str, profile: CarProfile, network: Transport) -> None:
+        """Take the car's name, its make, and the network."""
+        self.name, self._profile, self._network = name, profile, network
 
-        Args:
-            name: of the car.
-            world: its world.
-            profile: make of the car.
-            wire: its own link.
-            outside: the network of motion capture, which has nothing to do with the car's.
-            shared_clock: returns the stamp of motion capture for a time of the steady clock.
-            vehicle: camera and sensors of a vehicle; None: it is a moving landmark.
+    def send(self, role: Role, kind: str, stamp: int, frame: str, /, **fields: Any) -> None:
+        """Publish a message by its fields; a stamp in ns.
+
+        Raises:
+            CoopenvError: the profile has another type for the role.
         """
-        self._name, self._world, self._profile = name, world, profile
-        self._wire, self._outside, self._shared_clock = wire, outside, shared_clock
-        self._origin = np.array(world.scenario.map.origin)
-        self.acts: dict[str, tuple[float, Act]] = {"truth": (TRUTH_RATE, self._truth)}
-        """Rates in Hz, and what is published, by name."""
-        if vehicle is None:
-            self.acts["leader"] = LEADER_RATE, self._leader
-            return
-        self._pixy, self._sensors = vehicle
-        self.acts |= {
-            "camera": (world.scenario.rates.camera, self._camera),
-            "wheel": (WHEEL_RATE, self._wheel),
-            "imu": (IMU_RATE, self._imu),
-            "odometry": (FILTER_RATE, self._odometry),
-            "condition": (CONDITION_RATE, self._condition),
-            "camera_info": (CAMERA_INFO_RATE, self._camera_info),
-        }
-
-    def _send(self, role: Role, kind: str, stamp: int, frame: str, /, **fields: Any) -> None:
-        """Publish a message: motion capture on its own network, all else on the car's link."""
-        topic, name = self._profile.topics[role], self._profile.topic_of(self._name, role)
+        topic = self._profile.topics[role]
         if kind != topic.type:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type}: fake cars have {kind} alone")
         payload = encode(make(kind, header=header(stamp, frame), **fields))
-        network = self._outside if role is Role.TRUTH else self._wire
-        network.publish(name, payload, urgent=topic.urgent, reliable=topic.reliable)
+        name = self._profile.topic_of(self.name, role)
+        self._network.publish(name, payload, urgent=topic.urgent, reliable=topic.reliable)
 
-    def _truth(self, due: int, _stamp: int) -> None:
-        R, p = self._world.pose(self._world.agent)
-        twist = {"twist": self._world.twist}
-        placed, stamp = {"pose": pose(R, p + self._origin)}, self._shared_clock(due)
-        self._send(Role.TRUTH, ODOMETRY, stamp, "mocap", child_frame_id=self._name, pose=placed, twist=twist)
 
-    def _leader(self, _due: int, stamp: int) -> None:
-        R, p = self._world.pose(self._world.agent)
-        kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._send(Role.ESTIMATE, kind, stamp, "map", pose={"pose": pose(R, p + self._origin)})
+class CarSensors:
+    """Odometry and condition of one car. Lasting errors are those that the world has drawn."""
 
-    def _camera(self, due: int, stamp: int) -> None:
-        blocks = self._pixy.frame(due)
-        self._send(Role.DETECTIONS, "pixy_camera/msg/ObjectInfoArrayStamped", stamp, "camera", objects=blocks)
-        bearing = self._pixy.bearings(blocks)
-        self._send(Role.BEARINGS, "pixy_camera/msg/ObjectBearingArrayStamped", stamp, "camera", bearing=bearing)
+    def __init__(self, world: CarWorld, publisher: SensorPublisher, *, differential: bool) -> None:
+        """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
+        self._world, self._publisher, self._differential = world, publisher, differential
+        noise = world.scenario.noises[world.vehicle]
+        self._wheel_std = deviation(noise.velocity, noise, WHEEL_RATE)  # m/s, of a sample
+        self._wheel_turn_std = deviation(noise.angular_velocity, noise, WHEEL_RATE)
+        self._gyro_std = deviation(noise.angular_velocity, noise, IMU_RATE)  # rad/s, of a sample of each axis
+        self.acts: list[tuple[float, Act]] = [
+            (WHEEL_RATE, self._wheel),
+            (IMU_RATE, self._imu),
+            (FILTER_RATE, self._odometry),
+            (CONDITION_RATE, self._condition),
+        ]
+        """Rates in Hz, and what is published."""
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Begin an episode: the filter starts at its own origin, noise comes from `rng`."""
+        self._rng = rng
+        self._pose = np.zeros(3)  # of the filter, x and y in m and the heading in rad, from where the car began
+        self._speed, self._turn_rate = 0.0, 0.0  # last samples
+        self._since = 0
+        self._factor = float(self._world.view("parameter")[0, int(ODOMETRY_NOISE)])
 
     def _wheel(self, due: int, stamp: int) -> None:
-        s = self._sensors
-        speed, turn = s.wheel(due)
-        covariance = np.diag([s.wheel_std**2, 0.0, 0.0, 0.0, 0.0, s.wheel_turn_std**2])
-        twist = {"twist": ((speed, 0.0, 0.0), (0.0, 0.0, turn)), "covariance": covariance}
+        velocity, turn = self._world.twist
+        slip = self._world.view("slip")[0, self._world.vehicle]
+        scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
+        self._dead_reckon(due)
+        noise = self._rng.normal(size=2) * self._factor * (self._wheel_std, self._wheel_turn_std)
+        self._speed = float(velocity[0] * scale * math.cos(slip[1]) + noise[0])
+        turned = float(turn[2] * scale + noise[1]) if self._differential else 0.0
+        covariance = np.diag([self._wheel_std**2, 0.0, 0.0, 0.0, 0.0, self._wheel_turn_std**2])
+        twist = {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, turned)), "covariance": covariance}
         kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-        self._send(Role.WHEEL, kind, stamp, f"{self._name}/base_link", twist=twist)
+        self._publisher.send(Role.WHEEL, kind, stamp, f"{self._publisher.name}/base_link", twist=twist)
 
     def _imu(self, due: int, stamp: int) -> None:
-        """Send turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
-        fields = {"angular_velocity": self._sensors.gyro(due), "linear_acceleration": (0.0, 0.0, GRAVITY)}
-        fields["angular_velocity_covariance"] = self._sensors.gyro_std**2 * np.eye(3)
+        """Publish turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
+        bias = self._world.view("gyro_bias")[0, self._world.vehicle]
+        turn = self._world.twist[1] + bias + self._rng.normal(size=3) * self._factor * self._gyro_std
+        self._dead_reckon(due)
+        self._turn_rate = float(turn[2])
+        fields = {"angular_velocity": turn, "linear_acceleration": (0.0, 0.0, GRAVITY)}
+        fields["angular_velocity_covariance"] = self._gyro_std**2 * np.eye(3)
         unknown = {"orientation": (0.0, 0.0, 0.0, 1.0), "orientation_covariance": [-1.0, *np.zeros(8)]}
-        self._send(Role.IMU, "sensor_msgs/msg/Imu", stamp, f"{self._name}/imu", **fields, **unknown)
+        kind, frame = "sensor_msgs/msg/Imu", f"{self._publisher.name}/imu"
+        self._publisher.send(Role.IMU, kind, stamp, frame, **fields, **unknown)
 
     def _odometry(self, due: int, stamp: int) -> None:
-        s = self._sensors
-        s.dead_reckon(due)
-        x, y, heading = s.pose.tolist()
+        self._dead_reckon(due)
+        x, y, heading = self._pose.tolist()
         turned = (0.0, 0.0, math.sin(heading / 2.0), math.cos(heading / 2.0))
         fields = {
             "pose": {"pose": ((x, y, 0.0), turned)},
-            "twist": {"twist": ((s.speed, 0.0, 0.0), (0.0, 0.0, s.turn_rate))},
+            "twist": {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, self._turn_rate))},
         }
-        child = f"{self._name}/base_link"
-        self._send(Role.ODOMETRY, ODOMETRY, stamp, f"{self._name}/odom", child_frame_id=child, **fields)
+        name = self._publisher.name
+        self._publisher.send(
+            Role.ODOMETRY, ODOMETRY, stamp, f"{name}/odom", child_frame_id=f"{name}/base_link", **fields
+        )
+
+    def _dead_reckon(self, now: int) -> None:
+        """Move the filter's pose to a time by the last samples, held and summed."""
+        dt = (now - self._since) * 1e-9 if self._since else 0.0
+        self._since = now
+        middle = self._pose[2] + 0.5 * dt * self._turn_rate
+        way = dt * self._speed
+        self._pose += (way * math.cos(middle), way * math.sin(middle), dt * self._turn_rate)
+
+    def _condition(self, _due: int, stamp: int) -> None:
+        self._publisher.send(Role.STATE, "mavros_msgs/msg/State", stamp, "", **STANDING)
+        self._publisher.send(Role.REMOTE, "mavros_msgs/msg/RCIn", stamp, "", rssi=200, channels=[1500] * 8)
+        self._publisher.send(Role.BATTERY, "sensor_msgs/msg/BatteryState", stamp, "", **BATTERY)
+
+
+def deviation(stated: float, noise: Noise, rate: float) -> float:
+    """Return the standard deviation of a sample at a rate, Hz, whose density is that of what a scenario states."""
+    if not noise.enabled:
+        return 0.0
+    return stated if isinstance(noise.odometry_rate, str) else stated * math.sqrt(rate / noise.odometry_rate)
+
+
+MARKER = 0.08  # m, side of a marker
+OLDEST = 255  # frames that the camera counts
+
+
+class Pixy:
+    """The camera of one car."""
+
+    def __init__(
+        self, world: CarWorld, binding: Binding, others: Neighbours, faults: Faults, publisher: SensorPublisher
+    ) -> None:
+        """Put it on the car.
+
+        Args:
+            world: what it looks at.
+            binding: markers of the cars and of landmarks, and those that it identifies.
+            others: the other cars, which are placed for each frame.
+            faults: that it may have.
+            publisher: of its messages.
+        """
+        self._world, self._others, self._faults, self._publisher = world, others, faults, publisher
+        self._markers = {target: marker for marker, target in binding.targets.items()}
+        smallest, largest = binding.profile.markers
+        self._numbers = range(smallest, largest + 1)
+        self._calibration = Calibration.of(world.scenario.cameras[world.vehicle])
+        self.acts: list[tuple[float, Act]] = [
+            (world.scenario.rates.camera, self._camera),
+            (CAMERA_INFO_RATE, self._camera_info),
+        ]
+        """Rates in Hz, and what is published."""
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Begin an episode: frames count from here, faults draw from `rng`."""
+        self._ages: dict[int, int] = {}
+        self._frames, self._rng = 0, rng
+
+    def _camera(self, due: int, stamp: int) -> None:
+        blocks = self._frame(due)
+        kind, bearing = "pixy_camera/msg/ObjectInfoArrayStamped", self._bearings(blocks)
+        self._publisher.send(Role.DETECTIONS, kind, stamp, "camera", objects=blocks)
+        self._publisher.send(
+            Role.BEARINGS, "pixy_camera/msg/ObjectBearingArrayStamped", stamp, "camera", bearing=bearing
+        )
 
     def _camera_info(self, _due: int, stamp: int) -> None:
-        c = self._pixy.calibration
+        c = self._calibration
         (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
         matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
         fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
         fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
-        self._send(Role.CAMERA_INFO, "sensor_msgs/msg/CameraInfo", stamp, "camera", **fields)
+        self._publisher.send(Role.CAMERA_INFO, "sensor_msgs/msg/CameraInfo", stamp, "camera", **fields)
 
-    def _condition(self, _due: int, stamp: int) -> None:
-        self._send(Role.STATE, "mavros_msgs/msg/State", stamp, "", **STANDING)
-        self._send(Role.REMOTE, "mavros_msgs/msg/RCIn", stamp, "", rssi=200, channels=[1500] * 8)
-        self._send(Role.BATTERY, "sensor_msgs/msg/BatteryState", stamp, "", **BATTERY)
+    def _frame(self, now: int) -> list[Any]:
+        """Take a frame at a time in ns; return its blocks (ObjectInfo), the largest first."""
+        self._others.place()
+        self._frames += 1
+        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
+        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
+        blocks = self._blocks(seen) if seen else []
+        blocks.sort(key=lambda block: -block.width * block.height)
+        return self._with_faults(blocks, now)
+
+    def _blocks(self, seen: dict[int, Array]) -> list[Any]:
+        c, rays = self._calibration, np.array([*seen.values()])
+        flat = distort(rays[:, :2] / rays[:, 2:], c.distortion)
+        pixels = np.rint(flat * c.focal_length + c.principal_point).clip(0, np.array(c.image_size) - 1)
+        blocks = []
+        for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
+            number, near = self._markers[agent], MARKER / max(self._world.distance(agent), MARKER)
+            width, height = (max(1, round(f * near)) for f in c.focal_length)
+            blocks.append(_block(number, x, y, width, height, number - 1, self._ages[agent]))
+        return blocks
+
+    def _with_faults(self, blocks: list[Any], now: int) -> list[Any]:
+        faults, rng, (width, height) = self._faults, self._rng, self._calibration.image_size
+        if faults.value("swapped_signatures", now):
+            numbers = [block.signature for block in blocks]
+            blocks = [replace(b, signature=n) for b, n in zip(blocks, reversed(numbers), strict=True)]
+        if share := faults.value("duplicate_blocks", now):
+            doubled = [block for block in blocks if rng.random() < share]
+            for b in doubled:
+                sides = {"width": max(1, b.width // 2), "height": max(1, b.height // 2)}
+                blocks = [*blocks, replace(b, center_x=min(b.center_x + 3, width - 1), **sides, age=1)]
+        if rate := faults.value("false_blocks", now):
+            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
+                x, y = int(rng.integers(width)), int(rng.integers(height))
+                blocks = [*blocks, _block(int(rng.choice(self._numbers)), x, y, 2, 2)]
+        return blocks
+
+    def _bearings(self, blocks: list[Any]) -> list[Any]:
+        """Return the ObjectBearings of blocks as the authors compute them.
+
+        They are unit vectors from the target to the camera; distortion is not removed.
+        """
+        c, pixels = self._calibration, np.array([(b.center_x, b.center_y) for b in blocks], dtype=np.float64)
+        flat = (np.array(c.principal_point) - pixels.reshape(-1, 2)) / c.focal_length
+        rays = np.concatenate([flat, -np.ones((len(blocks), 1))], axis=-1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        rows = zip(blocks, rays.tolist(), strict=True)
+        return [
+            make("pixy_camera/msg/ObjectBearing", id=b.signature, bearing_x=x, bearing_y=y, bearing_z=z)
+            for b, (x, y, z) in rows
+        ]
+
+
+def _block(signature: int, x: int, y: int, width: int, height: int, index: int = 0, age: int = 1) -> Any:
+    """Return the block of a marker in the camera's image; `age` is in frames in a row."""
+    sides = {"center_x": x, "center_y": y, "width": width, "height": height}
+    return make("pixy_camera/msg/ObjectInfo", signature=signature, **sides, index=index, age=age)

@@ -197,8 +197,8 @@ class Gate:
             station: identity that may arm and command.
             profile: make of the car.
         """
-        self._car, self._limits, self._clock = car, limits, clock
-        self._verifier, self._station, self._profile = verifier, station, profile
+        self.car, self.profile = car, profile
+        self._limits, self._clock, self._verifier, self._station = limits, clock, verifier, station
         self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
         self._counts = dict.fromkeys(Reason, 0)
         self._state, self._nonce = GateMode.DISARMED, secrets.token_hex(8)
@@ -231,10 +231,13 @@ class Gate:
                 raise Rejected(Reason.TOO_LONG)
             self._readers[role](payload, attachment)
         except Malformed:
-            return self._count(Reason.MALFORMED)
+            reason = Reason.MALFORMED
         except Rejected as rejected:
-            return self._count(rejected.reason)
-        return None
+            reason = rejected.reason
+        else:
+            return None
+        self._counts[reason] += 1
+        return reason
 
     def tick(self) -> bytes:
         """Return the message for the car now; to be called every 50 ms."""
@@ -248,12 +251,12 @@ class Gate:
             )
             self._output = Drive(steering, speed)
         self._ticked = now
-        return write_drive(self._clock.wall(), self._profile.command, self._output)
+        return write_drive(self._clock.wall(), self.profile.command, self._output)
 
     def neutral(self) -> bytes:
         """Close for good and return the message of a car that stands."""
         self._come_to_a_stand(GateMode.STOPPED)
-        return write_drive(self._clock.wall(), self._profile.command, NEUTRAL)
+        return write_drive(self._clock.wall(), self.profile.command, NEUTRAL)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
@@ -273,8 +276,7 @@ class Gate:
             raise Rejected(Reason.MALFORMED)
         if int(digits) <= self._sequence:
             raise Rejected(Reason.SEQUENCE)
-        self._check_stamp(stamp)
-        self._check_signature(Role.COMMAND, payload, attachment)
+        self._check(Role.COMMAND, stamp, payload, attachment)
         if not all(map(math.isfinite, numbers)):
             self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
             raise Rejected(Reason.NOT_FINITE)
@@ -287,8 +289,7 @@ class Gate:
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
         stamp, _, session, nonce, armed = read(payload, ARM)
-        self._check_stamp(stamp)
-        self._check_signature(Role.ARM, payload, attachment)
+        self._check(Role.ARM, stamp, payload, attachment)
         if not armed:
             if self.state is not GateMode.STOPPED:
                 self._come_to_a_stand(GateMode.DISARMED)
@@ -311,21 +312,14 @@ class Gate:
         if state is not GateMode.TIMED_OUT:
             self._nonce = secrets.token_hex(8)
 
-    def _check_stamp(self, stamp: int) -> None:
+    def _check(self, role: Role, stamp: int, payload: bytes, attachment: bytes) -> None:
+        """Reject a message that is not of this moment, or not of the station."""
         age = self._clock.wall() - stamp
-        if age > self._profile.topics[Role.COMMAND].max_age_ns:
+        if age > self.profile.topics[Role.COMMAND].max_age_ns:
             raise Rejected(Reason.STALE)
         if age < -MOST_AHEAD:
             raise Rejected(Reason.FUTURE)
-
-    def _check_signature(self, role: Role, payload: bytes, attachment: bytes) -> None:
-        known = self._verifier
-        if (
-            known is not None
-            and known.signer(self._profile.topic_of(self._car, role), payload, attachment) != self._station
-        ):
+        if self._verifier is None:
+            return
+        if self._verifier.signer(self.profile.topic_of(self.car, role), payload, attachment) != self._station:
             raise Rejected(Reason.SIGNATURE)
-
-    def _count(self, reason: Reason) -> Reason:
-        self._counts[reason] += 1
-        return reason

@@ -1,32 +1,20 @@
 """The gate on the network: messages come in by callbacks, the car's command goes out 20 times a second."""
 
-from __future__ import annotations
-
 import secrets
 import threading
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coopenv.base.errors import CoopenvError, shown
+from coopenv.cars.deployment import Car, Deployment, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, write
-from coopenv.cars.keys import (
-    LONGEST_IDENTITY,
-    Signer,
-    Verifier,
-    check_known,
-    is_identity,
-    load_signer,
-    load_verifier,
-)
-from coopenv.cars.profile import SVEA, USUAL, CarProfile, Limits, Role, presence_of
+from coopenv.cars.keys import LONGEST_IDENTITY, Signer, check_known, is_identity, load_signer, load_verifier
+from coopenv.cars.profile import Role, presence_of
 from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
-
-if TYPE_CHECKING:
-    from coopenv.cars.deployment import Deployment
 
 CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz
@@ -36,21 +24,16 @@ LAST_NEUTRALS = 5  # that the car gets before the gate goes
 class GateConnection:
     """A gate and its connection; its owner calls `tick` every 50 ms, from one thread."""
 
-    def __init__(
-        self, gate: Gate, car: str, transport: Transport, signer: Signer | None = None, profile: CarProfile = SVEA
-    ) -> None:
+    def __init__(self, gate: Gate, transport: Transport, signer: Signer | None = None) -> None:
         """Listen, and announce the car.
 
         Args:
             gate: decides; used by this connection alone from now on.
-            car: its name.
             transport: the caller's, which closes it.
             signer: signs the status, as the car; None: it is not signed.
-            profile: make of the car.
         """
         self._gate, self._transport, self._signer = gate, transport, signer
-        self._profile = profile
-        self._topics = {role: profile.topic_of(car, role) for role in Role}
+        self._topics = {role: gate.profile.topic_of(gate.car, role) for role in Role}
         self._lock = threading.Lock()
         self._ticks = 0
         self._own = secrets.token_bytes(16)  # marks what comes back to us: it must not stop a car that is armed again
@@ -58,7 +41,7 @@ class GateConnection:
         """Set when the state or the nonce has changed, so that the status is published at once."""
         for role in (Role.COMMAND, Role.ARM, Role.STOP):
             transport.subscribe(self._topics[role], partial(self._arrive, role))
-        transport.announce(presence_of(car))
+        transport.announce(presence_of(gate.car))
 
     def tick(self) -> bytes:
         """Send the car's command, and every 0.2 s the status; return the command."""
@@ -104,7 +87,7 @@ class GateConnection:
             self.news.set()
 
     def _send(self, role: Role, payload: bytes, attachment: bytes = b"") -> None:
-        topic = self._profile.topics[role]
+        topic = self._gate.profile.topics[role]
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
@@ -126,83 +109,68 @@ def run(link: GateConnection) -> None:
             time.sleep(PERIOD / 1e9)
 
 
-@dataclass(frozen=True)
-class GateSettings:
-    """Of one gate."""
+def gate_deployment(car: str, path: Path | None, connect: str | None = None, off_board: bool = False) -> Deployment:
+    """Return a deployment whose network is that of a car's gate: the car's own router.
 
-    car: str
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    limits: Limits = USUAL
-    keys: Path | None = None  # folder
-    station: str = "station"
-    fleet: Deployment | None = None  # of the file, if there is one
+    Args:
+        car: its name.
+        path: deployment file; None: the usual settings.
+        connect: endpoint in place of the file's.
+        off_board: allow a router that is not on this computer, where neutral gets lost with the link.
 
-    @property
-    def profile(self) -> CarProfile:
-        """Make of the car."""
-        return SVEA if self.fleet is None else self.fleet.profile
+    Raises:
+        CoopenvError: the name is none, the file cannot be read, or knows no such car; an endpoint is none, or not on
+            this computer.
+    """
+    if path is not None:
+        fleet = load_deployment(path)
+        fleet.car(car)
+    elif is_identity(car):
+        fleet = Deployment(environment="", cars=(Car.model_construct(name=car),))
+    else:
+        raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+    endpoints = fleet.gate_connect if connect is None else (connect,)
+    addresses = {endpoint: address_of(endpoint) for endpoint in endpoints}
+    for endpoint, address in addresses.items():
+        if not address.loopback and not off_board:
+            raise CoopenvError(
+                f"{endpoint}: is not on this computer, and when the link to it dies the wheels get no neutral: "
+                "expected the car's own router, e.g. tcp/127.0.0.1:7447 ([gate] connect, --connect), or --off-board"
+            )
+    secure = any(address.protocol in SECURE for address in addresses.values())
+    tls = fleet.network.tls if secure else None  # on the car itself nothing need be
+    network = fleet.network.model_copy(update={"connect": endpoints, "tls": tls})
+    return fleet.model_copy(update={"network": network})
 
-    @classmethod
-    def of(cls, car: str, path: Path | None) -> GateSettings:
-        """Return the settings for a car by a deployment file, or the usual ones.
 
-        Raises:
-            CoopenvError: the name is none, the file cannot be read, or knows no such car.
-        """
-        if path is None:
-            if not is_identity(car):
-                raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
-            return cls(car)
-        from coopenv.cars.deployment import load_deployment
+def prepare_gate(
+    fleet: Deployment,
+    car: str,
+    station: str | None = None,
+    keys: Path | None = None,
+    limits: Mapping[str, Any] | None = None,
+) -> Callable[[Transport, GateClock], GateConnection]:
+    """Return what connects the gate of a car to a network: all that can be wrong without one.
 
-        read = load_deployment(path)
-        keys = None if read.security.keys is None else read.folder / read.security.keys
-        return cls(read.car(car).name, read.gate_connect, read.limits, keys, read.security.identity, read)
+    Args:
+        fleet: that the car belongs to.
+        car: its name.
+        station: identity that may arm and command (None: the fleet's).
+        keys: folder of keys (None: the fleet's; without any nothing is signed, and any station can drive the car).
+        limits: in place of the fleet's, by name; None leaves one as it is.
 
-    def changed(self, limits: Mapping[str, Any], **values: Any) -> GateSettings:
-        """Return these settings with others in place of some; None leaves one as it is.
+    Raises:
+        CoopenvError: a limit is beyond the hardest, or a key is missing or unsafe.
+    """
+    profile, station, folder = fleet.profile, station or fleet.security.identity, keys or fleet.keys
+    given = {name: value for name, value in (limits or {}).items() if value is not None}
+    bounds = replace(fleet.limits, **given).check(profile.hardest)
+    signer, verifier = None, None
+    if folder is not None:
+        verifier = load_verifier(folder)
+        check_known(verifier, station, folder)
+        signer = load_signer(folder, car)
 
-        Raises:
-            CoopenvError: a limit is beyond the hardest.
-        """
-        bounds = replace(self.limits, **{name: value for name, value in limits.items() if value is not None})
-        rest = {name: value for name, value in values.items() if value is not None}
-        return replace(self, limits=bounds.check(self.profile.hardest), **rest)
-
-    def check_place(self, off_board: bool) -> None:
-        """Refuse a router that is not on the car, where neutral would get lost with the link; `off_board` allows it.
-
-        Raises:
-            CoopenvError: an endpoint is none, or not on this computer.
-        """
-        for endpoint in self.connect:
-            if not address_of(endpoint).loopback and not off_board:
-                raise CoopenvError(
-                    f"{endpoint}: is not on this computer, and when the link to it dies the wheels get no neutral: "
-                    "expected the car's own router, e.g. tcp/127.0.0.1:7447 ([gate] connect, --connect), or --off-board"
-                )
-
-    def open(self) -> Transport:
-        """Connect to the network; errors as for `coopenv.cars.transport.zenoh.open_transport`."""
-        if self.fleet is None:
-            from coopenv.cars.transport.zenoh import open_zenoh
-
-            return open_zenoh("client", self.connect)
-        from coopenv.cars.transport.zenoh import open_transport
-
-        secure = any(address_of(endpoint).protocol in SECURE for endpoint in self.connect)
-        tls = self.fleet.network.tls if secure else None  # on the car itself nothing need be
-        network = self.fleet.network.model_copy(update={"connect": self.connect, "tls": tls})
-        return open_transport(self.fleet.model_copy(update={"network": network}))
-
-    def identities(self) -> tuple[Signer | None, Verifier | None]:
-        """Return what signs as the car and what knows the station. Raises CoopenvError: a key is missing or unsafe."""
-        if self.keys is None:
-            return None, None
-        own = None if self.fleet is None else self.fleet.security.keys
-        if self.fleet is not None and own is not None and self.keys == self.fleet.folder / own:
-            verifier = load_verifier(self.fleet.keys or self.keys)  # which names the field where there is none
-        else:
-            verifier = load_verifier(self.keys)
-        check_known(verifier, self.station, self.keys)
-        return load_signer(self.keys, self.car), verifier
+    return lambda transport, clock: GateConnection(
+        Gate(car, bounds, clock, verifier, station, profile), transport, signer
+    )

@@ -5,6 +5,10 @@ import re
 import socket
 import ssl
 import stat
+import threading
+import time
+import uuid
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +34,9 @@ class Arrival:
 Callback = Callable[[Arrival], None]
 """Called in a thread of the transport: it is to keep the message and return."""
 
+Change = Callable[[str, bool], None]
+"""Called with a name and whether it is there."""
+
 
 class Transport(Protocol):
     """A connection to the network; used from any thread."""
@@ -48,7 +55,7 @@ class Transport(Protocol):
         """Announce the presence of `name` until this connection ends."""
         ...
 
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+    def watch(self, pattern: str, callback: Change) -> None:
         """Be called with (name, whether it is there) for every announced name that matches, now and later."""
         ...
 
@@ -62,6 +69,95 @@ def matcher(pattern: str) -> Callable[[str], bool]:
     wild = {"*": "[^/]+/", "**": "(?:[^/]+/)*"}
     expression = re.compile("".join(wild.get(part, f"{re.escape(part)}/") for part in pattern.split("/")))
     return lambda topic: expression.fullmatch(f"{topic}/") is not None
+
+
+PERIOD = 0.25  # s between two heartbeats
+LEASE = 1.0  # s of silence after which a name counts as gone
+
+
+class HeartbeatTransport(ABC):
+    """A transport on a network without presence: its ends send heartbeats of the names that they announce."""
+
+    def __init__(self) -> None:
+        self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
+        self._own: list[str] = []
+        self._last: dict[tuple[str, bytes], float] = {}
+        self._watchers: list[tuple[Callable[[str], bool], Change]] = []
+        self._presence = threading.RLock()
+        self._closed = threading.Event()
+
+    @abstractmethod
+    def _send_heartbeat(self, name: str, payload: bytes) -> None:
+        """Send a heartbeat to the other ends."""
+
+    @abstractmethod
+    def _receive_heartbeats(self) -> None:
+        """Begin to call `heartbeat` with those of other ends."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """End the connection, for `close`."""
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        with self._presence:
+            self._own.append(name)
+        self._send_heartbeat(name, b"+" + self._self)
+
+    def watch(self, pattern: str, callback: Change) -> None:
+        """Watch, see `Transport`."""
+        matches = matcher(pattern)
+        with self._presence:
+            first = not self._watchers
+            self._watchers.append((matches, callback))
+            for name in sorted(filter(matches, self._present())):
+                callback(name, True)
+        if first:
+            self._receive_heartbeats()
+
+    def heartbeat(self, name: str, payload: bytes) -> None:
+        """Take a heartbeat: `+` or `-` and the sender's bytes."""
+        with self._presence:
+            before = self._present()
+            if payload[:1] == b"+":
+                self._last[name, payload[1:]] = time.monotonic()
+            else:
+                self._last.pop((name, payload[1:]), None)
+            self._notify(before)
+
+    def beat(self) -> None:
+        """Send the heartbeats and find silent names; to be called every `PERIOD`."""
+        with self._presence:
+            own, late, before = list(self._own), time.monotonic() - LEASE, self._present()
+            self._last = {who: last for who, last in self._last.items() if last >= late}
+            self._notify(before)
+        for name in own:
+            self._send_heartbeat(name, b"+" + self._self)
+
+    def _beat_on(self) -> None:
+        while not self._closed.wait(PERIOD):
+            self.beat()
+
+    def close(self) -> None:
+        """End the connection, and before it the presence of what was announced."""
+        if self._closed.is_set():
+            return
+        with self._presence:
+            own, self._own = self._own, []
+            self._watchers.clear()
+        for name in own:
+            self._send_heartbeat(name, b"-" + self._self)
+        self._end()
+
+    def _present(self) -> set[str]:
+        return {name for name, _ in self._last}
+
+    def _notify(self, before: set[str]) -> None:
+        """Call the watchers of names that have come or gone."""
+        for name in sorted(before ^ self._present()):
+            for matches, callback in self._watchers:
+                if matches(name):
+                    callback(name, name not in before)
 
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")

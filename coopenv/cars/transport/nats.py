@@ -7,8 +7,8 @@ import queue
 import ssl
 import threading
 import time
-import uuid
 from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
@@ -18,6 +18,7 @@ from coopenv.cars.transport.base import (
     Arrival,
     Callback,
     Certificates,
+    HeartbeatTransport,
     LinkError,
     address_of,
     matcher,
@@ -57,81 +58,6 @@ def attachment_of(headers: dict[str, str] | None) -> bytes:
         return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
     except (binascii.Error, ValueError):
         return b""
-
-
-PERIOD = 0.25  # s between two times
-LEASE = 1.0  # s of silence after which a name counts as gone
-
-Change = Callable[[str, bool], None]
-
-
-class Presence:
-    """Names announced by this end and by others, by heartbeats."""
-
-    def __init__(self, send: Callable[[str, bytes], None], listen: Callable[[], None] = lambda: None) -> None:
-        """Take what sends a heartbeat, (name, payload), and what begins to receive those of others."""
-        self._send, self._listen, self._listening = send, listen, False
-        self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
-        self._own: list[str] = []
-        self._last: dict[tuple[str, bytes], float] = {}
-        self._watchers: list[tuple[Callable[[str], bool], Change]] = []
-        self._lock = threading.RLock()
-
-    def announce(self, name: str) -> None:
-        """Announce `name` from now on."""
-        with self._lock:
-            self._own.append(name)
-        self._send(name, b"+" + self._self)
-
-    def watch(self, pattern: str, callback: Change) -> None:
-        """Call back for every name that matches, now and when it comes or goes."""
-        matches = matcher(pattern)
-        with self._lock:
-            self._watchers.append((matches, callback))
-            for name in sorted({name for name, _ in self._last if matches(name)}):
-                callback(name, True)
-            first, self._listening = not self._listening, True
-        if first:
-            self._listen()
-
-    def receive(self, name: str, payload: bytes) -> None:
-        """Take a heartbeat."""
-        who = name, payload[1:]
-        with self._lock:
-            if payload[:1] == b"+":
-                new = all(known != name for known, _ in self._last)
-                self._last[who] = time.monotonic()
-                if new:
-                    self._notify(name, True)
-            elif self._last.pop(who, None) is not None:
-                self._notify_if_gone(name)
-
-    def beat(self) -> None:
-        """Send the heartbeats and find silent names; to be called every `PERIOD`."""
-        with self._lock:
-            own, late = list(self._own), time.monotonic() - LEASE
-            for who in [who for who, last in self._last.items() if last < late]:
-                del self._last[who]
-                self._notify_if_gone(who[0])
-        for name in own:
-            self._send(name, b"+" + self._self)
-
-    def leave(self) -> None:
-        """Send that this end leaves."""
-        with self._lock:
-            own, self._own = self._own, []
-            self._watchers.clear()
-        for name in own:
-            self._send(name, b"-" + self._self)
-
-    def _notify_if_gone(self, name: str) -> None:
-        if all(known != name for known, _ in self._last):
-            self._notify(name, False)
-
-    def _notify(self, name: str, there: bool) -> None:
-        for matches, callback in self._watchers:
-            if matches(name):
-                callback(name, there)
 
 
 Letter = tuple[str, bytes, bytes]
@@ -185,46 +111,52 @@ OPTIONS = {
 }
 
 
-class Nats:
+class Nats(HeartbeatTransport):
     """A connection to a broker as a transport; it lives in a thread of its own and comes back by itself."""
 
     def __init__(self) -> None:
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
-        self._thread.start()
-        self._client: Any = None
+        super().__init__()
         self._outbox = Outbox(MOST_WAITING, PATIENCE)
-        self._wake = asyncio.Event()
-        self._presence = Presence(lambda name, payload: self.publish(HEARTBEATS + name, payload), self._hear)
-        self.announce, self.watch = self._presence.announce, self._presence.watch
-        self._closed = False
+        self._opened: Future[None] = Future()
 
     def open(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
         """Connect within s; errors are the library's."""
-        self._client = self._wait(asyncio.wait_for(connect(), timeout), timeout + 5.0)
-        self._wait(self._start(), 5.0)
+        self._thread = threading.Thread(target=asyncio.run, args=(self._live(connect, timeout),), daemon=True)
+        self._thread.start()
+        self._opened.result(timeout + 5.0)
+        threading.Thread(target=self._beat_on, name="presence", daemon=True).start()
 
-    async def _start(self) -> None:
-        self._tasks = [asyncio.create_task(self._send()), asyncio.create_task(self._beat())]
+    async def _live(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
+        """Connect, and send until the end."""
+        self._loop, self._wake, self._task = asyncio.get_running_loop(), asyncio.Event(), asyncio.current_task()
+        try:
+            self._client = await asyncio.wait_for(connect(), timeout)
+        except Exception as error:
+            self._opened.set_exception(error)
+            return
+        self._opened.set_result(None)
+        with suppress(Exception, asyncio.CancelledError):  # of `_end`, where a broker is silent
+            while not self._closed.is_set() or self._wake.is_set():
+                await self._wake.wait()
+                self._wake.clear()
+                while (letter := self._outbox.take()) is not None:
+                    if self._client.is_connected:  # else it is lost: it would be too old later
+                        await self._post(letter)
+            await self._client.close()
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Send, see `Transport`."""
-        if self._closed:
+        if self._closed.is_set():
             return
         patient = reliable and threading.current_thread() is not self._thread
         self._outbox.put((topic, payload, attachment), urgent=urgent or reliable, patient=patient)
-        with suppress(RuntimeError):  # closed meanwhile
-            self._loop.call_soon_threadsafe(self._wake.set)
+        self._call(self._wake.set)
 
-    async def _send(self) -> None:
-        while True:
-            await self._wake.wait()
-            self._wake.clear()
-            while (letter := self._outbox.take()) is not None:
-                if self._client.is_connected:  # else it is lost: it would be too old later
-                    await self._post(letter)
+    def _call(self, act: Callable[[], object]) -> None:
+        with suppress(RuntimeError):  # closed meanwhile
+            self._loop.call_soon_threadsafe(act)
 
     async def _post(self, letter: Letter) -> None:
         topic, payload, attachment = letter
@@ -232,72 +164,46 @@ class Nats:
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
             await self._client.publish(subject_of(topic), payload, headers=headers)
 
-    async def _beat(self) -> None:
-        while True:
-            await asyncio.sleep(PERIOD)
-            self._presence.beat()
-
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
         matches = matcher(pattern)
 
-        async def arrive(message: Any) -> None:
-            topic = topic_of(message.subject)
-            if matches(topic) and not topic.startswith(HEARTBEATS):
-                callback(Arrival(topic, message.data, time.time_ns(), attachment_of(message.headers)))
+        def arrive(arrival: Arrival) -> None:
+            if matches(arrival.topic) and not arrival.topic.startswith(HEARTBEATS):
+                callback(arrival)
 
         self._listen(pattern, arrive)
 
-    def _hear(self) -> None:
-        async def receive(message: Any) -> None:
-            self._presence.receive(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
+    def _send_heartbeat(self, name: str, payload: bytes) -> None:
+        self.publish(HEARTBEATS + name, payload)
 
-        self._listen(HEARTBEATS + "**", receive)
+    def _receive_heartbeats(self) -> None:
+        self._listen(f"{HEARTBEATS}**", lambda a: self.heartbeat(a.topic.removeprefix(HEARTBEATS), a.payload))
 
-    def _listen(self, pattern: str, arrive: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
+    def _listen(self, pattern: str, callback: Callback) -> None:
+        async def arrive(message: Any) -> None:
+            topic, attachment = topic_of(message.subject), attachment_of(message.headers)
+            callback(Arrival(topic, message.data, time.time_ns(), attachment))
+
         async def subscribe() -> None:
             for subject in subjects_of(pattern):
                 await self._client.subscribe(subject, cb=arrive, pending_msgs_limit=MOST_WAITING)
             await self._client.flush(PATIENCE)
 
         with suppress(Exception):  # the broker is away: the library subscribes when it is back
-            self._wait(subscribe(), 2.0 * PATIENCE)
+            future = asyncio.run_coroutine_threadsafe(subscribe(), self._loop)
+            if threading.current_thread() is not self._thread:
+                future.result(2.0 * PATIENCE)
 
-    def _wait(self, work: Coroutine[Any, Any, Any], timeout: float) -> Any:
-        """Have the loop do something; wait for it, unless this is the loop's own thread."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        return None if threading.current_thread() is self._thread else future.result(timeout)
-
-    def close(self) -> None:
-        """End the connection and its thread."""
-        if self._closed:
+    def _end(self) -> None:
+        self._closed.set()
+        self._call(self._wake.set)
+        if threading.current_thread() is self._thread:
             return
-        self._presence.leave()
-        self._closed = True
-        with suppress(Exception):
-            self._wait(self._end(), 2.0 * PATIENCE)
-        with suppress(Exception):  # what still waits for a silent broker
-            self._wait(self._cancel(), PATIENCE)
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        if threading.current_thread() is not self._thread:
+        self._thread.join(2.0 * PATIENCE)
+        if self._thread.is_alive():  # what still waits for a silent broker
+            self._call(self._task.cancel)
             self._thread.join(PATIENCE)
-            if not self._thread.is_alive():
-                self._loop.close()
-
-    async def _cancel(self) -> None:
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
-
-    async def _end(self) -> None:
-        if self._client is None:
-            return
-        for task in self._tasks:
-            task.cancel()
-        while (letter := self._outbox.take()) is not None and self._client.is_connected:
-            await self._post(letter)
-        await self._client.close()
 
 
 def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: float = 2.0) -> Nats:

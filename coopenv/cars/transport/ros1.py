@@ -15,8 +15,16 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import ros1
-from coopenv.cars.transport.base import Address, Arrival, Callback, LinkError, address_of, matcher, trouble_at
-from coopenv.cars.transport.nats import PERIOD, Presence
+from coopenv.cars.transport.base import (
+    Address,
+    Arrival,
+    Callback,
+    HeartbeatTransport,
+    LinkError,
+    address_of,
+    matcher,
+    trouble_at,
+)
 
 ENVELOPE = "std_msgs/msg/UInt8MultiArray"
 """Type of topics that the authors do not have: CDR bytes, with what is beside them before them."""
@@ -131,7 +139,7 @@ PATIENCE = 0.5  # s that the first reliable message of a topic waits for a subsc
 CHECKS = 4  # of the presence's beats until the master is looked at again
 
 
-class Ros1:
+class Ros1(HeartbeatTransport):
     """The node of this process as a transport.
 
     What is beside a message (its signature) travels only where the topic's type is our own: types of ROS 1 have no
@@ -140,36 +148,35 @@ class Ros1:
 
     def __init__(self, master: Master, types: Mapping[str, str]) -> None:
         """Take a master, and the ROS 1 types of topics that have one."""
+        super().__init__()
         self._master, self._types, self._rospy = master, dict(types), rospy()
         self._lock = threading.RLock()
         self._publishers: dict[str, Any] = {}
         self._wanted: list[tuple[str, Callback]] = []
         self._subscribers: dict[tuple[int, str], Any] = {}  # by place in `_wanted` and topic
-        self._presence = Presence(lambda name, payload: self.publish(PRESENCE, payload, name.encode()), self._hear)
-        self.announce, self.watch = self._presence.announce, self._presence.watch
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="ros1", daemon=True)
-        self._thread.start()
+        self._beats = 0
+        threading.Thread(target=self._beat_on, name="ros1", daemon=True).start()
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Send, see `Transport`."""
-        if self._ended.is_set():
+        if self._closed.is_set():
             return
-        kind = self._types.get(topic, ENVELOPE)
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
-            publisher = self._publisher(topic, kind, reliable)
-            message = raw_type(kind)()
+            message = self._kind(topic)()
             message._buff = payload if topic in self._types else sealed(payload, attachment)
-            publisher.publish(message)
+            self._publisher(topic, reliable).publish(message)
 
-    def _publisher(self, topic: str, kind: str, patient: bool) -> Any:
+    def _kind(self, topic: str) -> Any:
+        return raw_type(self._types.get(topic, ENVELOPE))
+
+    def _publisher(self, topic: str, patient: bool) -> Any:
         with self._lock:
             found = self._publishers.get(topic)
             if found is not None:
                 return found
-            made = self._rospy.Publisher(f"/{topic}", raw_type(kind), queue_size=MOST_WAITING)
+            made = self._rospy.Publisher(f"/{topic}", self._kind(topic), queue_size=MOST_WAITING)
             self._publishers[topic] = made
         give_up = time.monotonic() + (PATIENCE if patient else 0.0)
         while time.monotonic() < give_up and not made.get_num_connections():
@@ -180,82 +187,62 @@ class Ros1:
         """Subscribe, see `Transport`; topics of a pattern are found as they appear, a moment later."""
         with self._lock:
             self._wanted.append((pattern, callback))
-            if "*" not in pattern:
-                self._subscribe(len(self._wanted) - 1, pattern)
-        with suppress(OSError):
-            self._discover()
+        self._discover()
 
-    def _subscribe(self, place: int, topic: str) -> None:
-        callback, typed = self._wanted[place][1], topic in self._types
+    def _subscribe(self, topic: str, callback: Callback) -> Any:
+        typed = topic in self._types
 
         def arrive(message: Any) -> None:
             content = (message._buff, b"") if typed else opened(message._buff)
-            if content is not None and not self._ended.is_set():
+            if content is not None and not self._closed.is_set():
                 callback(Arrival(topic, content[0], time.time_ns(), content[1]))
 
-        made = raw_type(self._types.get(topic, ENVELOPE))
-        self._subscribers[place, topic] = self._rospy.Subscriber(
-            f"/{topic}", made, arrive, queue_size=MOST_WAITING, tcp_nodelay=True
-        )
+        options = {"queue_size": MOST_WAITING, "tcp_nodelay": True}
+        return self._rospy.Subscriber(f"/{topic}", self._kind(topic), arrive, **options)
 
     def _discover(self) -> None:
-        """Subscribe to new topics that match a pattern and are of the type that is expected of them."""
-        with self._lock:
-            patterns = [(i, matcher(pattern)) for i, (pattern, _) in enumerate(self._wanted) if "*" in pattern]
-        published = self._master.ask("getPublishedTopics", "") if patterns else []
-        for name, kind in published or ():
-            topic = name.removeprefix("/")
-            if topic == PRESENCE or kind != self._types.get(topic, ENVELOPE).replace("/msg/", "/"):
-                continue
-            with self._lock:
-                for place, matches in patterns:
-                    if matches(topic) and (place, topic) not in self._subscribers and not self._ended.is_set():
-                        self._subscribe(place, topic)
-
-    def _hear(self) -> None:
-        with self._lock:
-            self._wanted.append((PRESENCE, self._heartbeat))
-            self._subscribe(len(self._wanted) - 1, PRESENCE)
-
-    def _heartbeat(self, arrival: Arrival) -> None:
-        self._presence.receive(arrival.attachment.decode(errors="replace"), arrival.payload)
-
-    def _beat(self) -> None:
-        beats = 0
-        while not self._ended.wait(PERIOD):
-            self._presence.beat()
-            beats += 1
+        """Subscribe to what is wanted: topics by name, and those of a pattern that are of the type expected of them."""
+        published: list[str] = []
+        if any("*" in pattern for pattern, _ in self._wanted):
             with suppress(OSError):  # the master is away: those who know each other go on
-                self._discover()
-                if beats % CHECKS == 0 and self._master.ask("lookupNode", self._rospy.get_name()) is None:
-                    self._register_again()
-
-    def _register_again(self) -> None:
-        """Tell a master that has been started anew what this node has; rospy itself does not."""
+                names = [
+                    (name.removeprefix("/"), kind) for name, kind in self._master.ask("getPublishedTopics", "") or ()
+                ]
+                published = [name for name, kind in names if kind == self._kind(name)._type and name != PRESENCE]
         with self._lock:
-            if not self._publishers and not self._subscribers:
-                return
-            self._unregister()
-            for place, (pattern, _) in enumerate(self._wanted):
-                if "*" not in pattern:
-                    self._subscribe(place, pattern)
+            for place, (pattern, callback) in enumerate(self._wanted):
+                for topic in filter(matcher(pattern), published) if "*" in pattern else (pattern,):
+                    if (place, topic) not in self._subscribers and not self._closed.is_set():
+                        self._subscribers[place, topic] = self._subscribe(topic, callback)
+
+    def _send_heartbeat(self, name: str, payload: bytes) -> None:
+        self.publish(PRESENCE, payload, name.encode())
+
+    def _receive_heartbeats(self) -> None:
+        self.subscribe(PRESENCE, lambda a: self.heartbeat(a.attachment.decode(errors="replace"), a.payload))
+
+    def beat(self) -> None:
+        """Look after the registration, too: a master that has been started anew knows nothing of this node."""
+        super().beat()
+        self._beats += 1
+        with suppress(OSError):
+            if self._beats % CHECKS == 0 and self._master.ask("lookupNode", self._rospy.get_name()) is None:
+                self._unregister()
+        self._discover()
 
     def _unregister(self) -> None:
-        for thing in (*self._publishers.values(), *self._subscribers.values()):
-            with suppress(Exception):  # not known to the master
-                thing.unregister()
-        self._publishers.clear()
-        self._subscribers.clear()
-
-    def close(self) -> None:
-        """Take back what this transport has published and subscribed; the node itself ends with the process."""
-        if self._ended.is_set():
-            return
-        self._presence.leave()
-        time.sleep(0.05)  # rospy sends in threads of its own
-        self._ended.set()
         with self._lock:
-            self._unregister()
+            for thing in (*self._publishers.values(), *self._subscribers.values()):
+                with suppress(Exception):  # not known to the master
+                    thing.unregister()
+            self._publishers.clear()
+            self._subscribers.clear()
+
+    def _end(self) -> None:
+        """Take back what this transport has published and subscribed; the node itself ends with the process."""
+        time.sleep(0.05)  # rospy sends in threads of its own
+        self._closed.set()
+        self._unregister()
 
 
 def open_ros1(endpoint: str, types: Mapping[str, str], timeout: float = 2.0) -> Ros1:

@@ -113,9 +113,7 @@ class Yard:
     def __init__(self) -> None:
         self.hub = Hub()
         self.clock = GateClock(time.time_ns, time.monotonic_ns)
-        self.links = {
-            car: GateConnection(Gate(car, USUAL, self.clock), car, self.hub.connect(), None) for car in ("a", "b")
-        }
+        self.links = {car: GateConnection(Gate(car, USUAL, self.clock), self.hub.connect()) for car in ("a", "b")}
         self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
         self.tell()
 
@@ -209,7 +207,7 @@ def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
 
 
 def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
-    yard.links["b"]._gate._check_signature = refuse  # type: ignore[method-assign]
+    yard.links["b"]._gate._check = refuse  # type: ignore[method-assign]
     with pytest.raises(CoopenvError, match=r"b: its gate refuses this end's signature: .*--station"):
         yard.gates.begin()
     yard.tell()

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from coopenv.base.fault_text import FaultError
 from coopenv.cars.codec import encode, make, stamp_of
+from coopenv.cars.fake import car
 from coopenv.cars.fake.faults import FAKE_FAULTS, Faults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
@@ -55,8 +56,8 @@ def test_a_fault_begins_and_ends() -> None:
     assert [faults.value("delay", int(t * 1e9)) for t in times] == [0.0, 0.2, 0.2, 0.5, 0.2, 0.2, 0.0]
 
 
-def ask(stage: Stage, text: str, car: str = "svea7") -> None:
-    stage.network.publish(fault_topic(car), encode(make("std_msgs/msg/String", data=text)))
+def ask(stage: Stage, text: str, name: str = "svea7") -> None:
+    stage.network.publish(fault_topic(name), encode(make("std_msgs/msg/String", data=text)))
     stage.run(0.001)
 
 
@@ -80,11 +81,16 @@ def test_a_frozen_car_says_nothing_and_stops_where_nobody_commands_it(stage: Sta
     assert stage.arrivals("svea7", Role.WHEEL)[-1].twist.twist.linear.x > 0.25
 
 
-def test_kill_ends_the_process(stage: Stage) -> None:
+def test_kill_ends_the_process(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    died: list[bool] = []
+    monkeypatch.setattr(car, "end_process", lambda: died.append(True))
     ask(stage, "kill@0.1")
-    assert not stage.died
+    assert not died
     stage.run(0.15)
-    assert set(stage.died) == {"svea7"}
+    assert died
+    stage.forget()
+    stage.run(0.1)
+    assert stage.arrivals("svea8", Role.IMU) and not stage.arrivals("svea7", Role.IMU)
 
 
 def test_loss_and_delay(stage: Stage) -> None:
@@ -139,14 +145,14 @@ def test_blocks_that_are_false_doubled_or_swapped(stage: Stage) -> None:
     assert sum(extra) == pytest.approx(30 * 3.9, rel=0.4)
 
 
-def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage) -> None:
+def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
     for name, kind in FAKE_FAULTS.items():
         ask(stage, f"{name}={kind.high:g}@1000")
-    assert not stage.complaints
+    assert not capsys.readouterr().err
     ask(stage, "melt")
     stage.network.publish(fault_topic("svea7"), b"\1\2")
     stage.network.publish(SVEA.topic_of("svea7", Role.MANUAL), b"nonsense")
     stage.run(0.01)
-    assert len(stage.complaints) == 3
-    assert "unknown fault 'melt'" in stage.complaints[0]
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 3 and told[0].startswith("svea7: unknown fault 'melt'")
     assert np.isfinite(stage.cars["svea7"].world.pose(stage.cars["svea7"].world.agent)[1]).all()

@@ -36,7 +36,7 @@ class Broken(Gate):
 def pair(kind: Callable[..., Gate] = Gate) -> tuple[GateConnection, Station]:
     hub = Hub()
     station = Station(hub.connect(), None)
-    return GateConnection(kind(CAR, LIMITS, CLOCK), CAR, hub.connect()), station
+    return GateConnection(kind(CAR, LIMITS, CLOCK), hub.connect()), station
 
 
 def test_a_tick_sends_what_it_returns() -> None:

@@ -18,14 +18,12 @@ from hypothesis import strategies as st
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.transport import nats
-from coopenv.cars.transport.base import Arrival, Certificates, LinkError, matcher
+from coopenv.cars.transport import base
+from coopenv.cars.transport.base import LEASE, Arrival, Certificates, HeartbeatTransport, LinkError, matcher
 from coopenv.cars.transport.nats import (
-    LEASE,
     MOST_WAITING,
     Letter,
     Outbox,
-    Presence,
     open_nats,
     subject_of,
     subjects_of,
@@ -209,18 +207,34 @@ def test_no_topic_is_missed_and_none_comes_twice(pattern: list[str], topic: list
         assert times == 1
 
 
+class End(HeartbeatTransport):
+    """An end whose heartbeats reach one other."""
+
+    def __init__(self, other: HeartbeatTransport | None = None) -> None:
+        super().__init__()
+        self._other = other
+
+    def _send_heartbeat(self, name: str, payload: bytes) -> None:
+        if self._other is not None:
+            self._other.heartbeat(name, payload)
+
+    def _receive_heartbeats(self) -> None: ...
+
+    def _end(self) -> None: ...
+
+
 def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(nats.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(base.time, "monotonic", lambda: now[0])
     seen: list[tuple[str, bool]] = []
-    watcher = Presence(lambda name, payload: None)
-    ends = [Presence(watcher.receive) for _ in range(2)]
+    watcher = End()
+    ends = [End(watcher) for _ in range(2)]
     watcher.watch("fleet/alive/*", lambda *change: seen.append(change))
     for end in ends:
         end.announce("fleet/alive/svea7")
     ends[0].announce("fleet/other")
     assert seen == [("fleet/alive/svea7", True)]
-    ends[0].leave()
+    ends[0].close()
     assert len(seen) == 1
     now[0] += 0.9 * LEASE
     ends[1].beat()
