@@ -239,14 +239,14 @@ def decode(payload: bytes, kind: str) -> Any:
     return _decoded(ros2().deserialize_cdr, payload, kind)
 
 
-def encode_ros1(message: Any) -> bytes:
-    """Return the ROS 1 bytes of a message."""
-    return bytes(ros1().serialize_ros1(message, message.__msgtype__))
+def ros1_of(payload: bytes, kind: str) -> bytes:
+    """Return the ROS 1 bytes of a message in CDR, with 0 as the `seq` of its header; errors as for `decode`."""
+    return bytes(_decoded(ros2().cdr_to_ros1, payload, kind))
 
 
-def decode_ros1(payload: bytes, kind: str) -> Any:
-    """Return the message of ROS 1 bytes; errors as for `decode`."""
-    return _decoded(ros1().deserialize_ros1, payload, kind)
+def cdr_of(payload: bytes, kind: str) -> bytes:
+    """Return the CDR bytes of a message in ROS 1 bytes; errors as for `decode`."""
+    return bytes(_decoded(ros2().ros1_to_cdr, payload, kind))
 
 
 def _decoded(read: Any, payload: bytes, kind: str) -> Any:

@@ -11,53 +11,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import decode, decode_ros1, encode, encode_ros1, make, ros1, ros2
+from coopenv.cars.codec import cdr_of, decode, encode, make, ros1, ros1_of
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import SVEA, CarProfile, CommandMessage, Drive, Role
 from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
-
-
-def to_ros1(message: Any) -> Any:
-    """Return a ROS 2 message as the ROS 1 message of the same type; its header's `seq` is 0."""
-    return _converted(ros1(), message, message.__msgtype__)
-
-
-def to_ros2(message: Any) -> Any:
-    """Return a ROS 1 message as the ROS 2 message of the same type."""
-    return _converted(ros2(), message, message.__msgtype__)
-
-
-def point_of(message: Any) -> Any:
-    """Return the position of a ROS 2 PoseWithCovarianceStamped as a ROS 1 PointStamped."""
-    position = message.pose.pose.position
-    return to_ros1(make("geometry_msgs/msg/PointStamped", header=message.header, point=position))
-
-
-def _converted(store: Any, message: Any, kind: str) -> Any:
-    values = {name: _value(store, node, _field(message, name)) for name, node in store.fielddefs[kind][1]}
-    return store.types[kind](**values)
-
-
-def _field(message: Any, name: str) -> Any:
-    """Return a field; ROS 1 writes the matrices of cameras large, ROS 2 small, and only ROS 1 counts headers."""
-    if name == "seq":
-        return 0
-    return getattr(message, name) if hasattr(message, name) else getattr(message, name.swapcase())
-
-
-def _value(store: Any, node: Any, value: Any) -> Any:
-    """Return a field's value in the types of a store; `node` is the field as rosbags describes it."""
-    kind, of = node
-    if kind.name == "NAME":
-        return _converted(store, value, of)
-    if kind.name == "BASE" or isinstance(value, np.ndarray):
-        return value
-    return [_value(store, of[0], element) for element in value]
-
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
 DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wheels do not turn
@@ -113,13 +72,15 @@ class Route:
     def out(self, payload: bytes) -> bytes:
         """Return ROS 1 bytes for CDR bytes. Raises CoopenvError: they are no such message."""
         if self.role is Role.MANUAL:
-            return encode_ros1(low_level(read_drive(payload, self.command), self.command))
-        message = decode(payload, self.ours)
-        return encode_ros1(point_of(message) if self.role is Role.ESTIMATE else to_ros1(message))
+            return bytes(ros1().serialize_ros1(low_level(read_drive(payload, self.command), self.command), self.theirs))
+        if self.role is Role.ESTIMATE:
+            message = decode(payload, self.ours)
+            payload = encode(make(self.theirs, header=message.header, point=message.pose.pose.position))
+        return ros1_of(payload, self.theirs)
 
     def back(self, payload: bytes) -> bytes:
         """Return CDR bytes for ROS 1 bytes, likewise."""
-        return encode(to_ros2(decode_ros1(payload, self.theirs)))
+        return cdr_of(payload, self.theirs)
 
     def warm_up(self) -> None:
         """Translate once, since the first time compiles and takes a tenth of a second."""

@@ -214,7 +214,7 @@ def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
     assert states(yard) == ["disarmed", "disarmed"]
 
 
-def refuse(role: Role, payload: bytes, attachment: bytes) -> None:
+def refuse(*_message: object) -> None:
     from coopenv.cars.gate.core import Reason, Rejected
 
     raise Rejected(Reason.SIGNATURE)

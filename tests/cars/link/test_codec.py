@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import (
     MOST_BYTES,
+    cdr_of,
     decode,
-    decode_ros1,
     encode,
-    encode_ros1,
     header,
     make,
     ros1,
+    ros1_of,
     ros2,
     stamp_of,
 )
@@ -62,16 +62,14 @@ def test_an_odometry_comes_back_as_it_was() -> None:
 
 
 def test_a_point_of_ros1_is_these_43_bytes() -> None:
-    stored = ros1().types
-    head = stored["std_msgs/msg/Header"](seq=7, stamp=stored["builtin_interfaces/msg/Time"](3, 4), frame_id="map")
-    where = stored["geometry_msgs/msg/Point"](x=1.5, y=-2.0, z=0.25)
-    payload = encode_ros1(stored[POINT](header=head, point=where))
-    assert payload == struct.pack("<III", 7, 3, 4) + struct.pack("<I", 3) + b"map" + struct.pack("<3d", 1.5, -2.0, 0.25)
+    payload = ros1_of(encode(make(POINT, header=header(3_000_000_004, "map"), point=(1.5, -2.0, 0.25))), POINT)
+    assert payload == struct.pack("<III", 0, 3, 4) + struct.pack("<I", 3) + b"map" + struct.pack("<3d", 1.5, -2.0, 0.25)
     assert len(payload) == 43
-    assert stamp_of(decode_ros1(payload, POINT)) == 3_000_000_004
+    assert stamp_of(ros1().deserialize_ros1(payload, POINT)) == 3_000_000_004
+    assert stamp_of(decode(cdr_of(payload, POINT), POINT)) == 3_000_000_004
 
 
-@pytest.mark.parametrize("read", [decode, decode_ros1])
+@pytest.mark.parametrize("read", [decode, cdr_of, ros1_of])
 @pytest.mark.parametrize("payload", [b"", b"\0\1\0\0", bytes(MOST_BYTES + 1)])
 def test_bytes_that_are_no_message_are_refused_in_one_line(read: Any, payload: bytes) -> None:
     with pytest.raises(CoopenvError, match=r"^nav_msgs/msg/Odometry: [^\n]+$"):
@@ -86,7 +84,7 @@ def test_a_message_that_is_cut_off_is_refused(cut: int) -> None:
 
 @given(payload=st.binary(max_size=200))
 def test_random_bytes_are_refused_or_read(payload: bytes) -> None:
-    for read in (decode, decode_ros1):
+    for read in (decode, cdr_of, ros1_of):
         try:
             assert read(payload, MANUAL if read is decode else POINT) is not None
         except CoopenvError as error:

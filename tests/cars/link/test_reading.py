@@ -14,7 +14,6 @@ from coopenv import CoopenvError
 from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import READERS, Calibration, CarPose, CarStatus, Detections, RobustReport, Twist, read
-from coopenv.cars.transport.authors import to_ros1
 from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
@@ -28,7 +27,7 @@ def make(kind: str, ros: int = 2, **fields: Any) -> Any:
     message = codec.make(kind, header=codec.header(5), **fields)
     if ros == 2:
         return codec.decode(codec.encode(message), kind)
-    return codec.decode_ros1(codec.encode_ros1(to_ros1(message)), kind)
+    return codec.ros1().deserialize_ros1(codec.ros1_of(codec.encode(message), kind), kind)
 
 
 def pose(p: Any = (1, 2, 3), q: Any = (0, 0, 0, 1), covariance: Any = None) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.codec import decode, decode_ros1, encode, header, make
+from coopenv.cars.codec import decode, encode, header, make
+from coopenv.cars.codec import ros1 as types_of_ros1
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import ros1
@@ -71,7 +72,7 @@ def test_without_rospy_one_line_says_what_to_install(monkeypatch: pytest.MonkeyP
 
 @given(payload=st.binary(max_size=99), attachment=st.binary(max_size=99))
 def test_an_envelope_is_a_message_of_bytes(payload: bytes, attachment: bytes) -> None:
-    message = decode_ros1(sealed(payload, attachment), ENVELOPE)
+    message = types_of_ros1().deserialize_ros1(sealed(payload, attachment), ENVELOPE)
     assert bytes(message.data[4:]) == attachment + payload
     assert opened(sealed(payload, attachment)) == (payload, attachment)
 
