@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.profile import SVEA, CarProfile
+from coopenv.cars.profile import SVEA, CarProfile, Role
 
 CAMERA = {
     "pixy_camera/msg/ObjectInfo": """
@@ -56,24 +56,9 @@ STOPPED = "coopenv_msgs/msg/Stopped"
 
 ROS_2 = {
     **CAMERA,
-    "mavros_msgs/msg/ManualControl": """
-std_msgs/Header header
-float32 x
-float32 y
-float32 z
-float32 r
-uint16 buttons
-uint16 buttons2
-uint8 enabled_extensions
-float32 s
-float32 t
-float32 aux1
-float32 aux2
-float32 aux3
-float32 aux4
-float32 aux5
-float32 aux6
-""",
+    SVEA.topics[Role.MANUAL].type: "\n".join(
+        ["std_msgs/Header header", *(f"{kind} {name}" for name, (kind, _) in SVEA.command.neutral.items())]
+    ),
     "mavros_msgs/msg/State": """
 std_msgs/Header header
 bool connected
@@ -278,7 +263,9 @@ def quaternion(rotation: Any) -> list[float]:
     return [x, y, z, w]
 
 
-_warm: set[str] = set()
+@cache
+def _compile(kind: str) -> None:
+    decode(encode(make(kind)), kind)
 
 
 def warm_up(profile: CarProfile = SVEA) -> None:
@@ -290,6 +277,4 @@ def warm_up(profile: CarProfile = SVEA) -> None:
     for role, topic in profile.topics.items():
         if topic.type not in ros2().types:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type} is not known")
-        if topic.type not in _warm:
-            decode(encode(make(topic.type)), topic.type)
-            _warm.add(topic.type)
+        _compile(topic.type)

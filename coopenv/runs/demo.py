@@ -1,6 +1,6 @@
 """`coopenv svea demo`: an experiment of the laboratory with fake cars, from the first process to the figures."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -33,13 +33,19 @@ STEADY_FROM = 2.0
 
 def links_line(backend: Svea) -> str:
     """Return the state of the links in a few words, for a line that is shown while it runs."""
-    parts = []
-    for vehicle in backend.binding.local:
-        notes = backend.notes(vehicle)
-        refused = sum(notes["gate_rejections"].values()) + sum(backend.intake.rejected[notes["name"]].values())
-        parts.append(f"{notes['name']} {notes['gate']}" + (f", {refused} refused" if refused else ""))
+    parts = [
+        f"{notes['name']} {notes['gate']}" + (f", {here + there} refused" if here + there else "")
+        for notes, here, there in _links(backend)
+    ]
     late = f"; {backend.link.missed} deadlines missed" if backend.link.missed else ""
     return "; ".join(parts) + late
+
+
+def _links(backend: Svea) -> Iterator[tuple[dict[str, Any], int, int]]:
+    """Yield the notes of each car driven here, and how many messages were refused here and by its gate."""
+    for vehicle in backend.binding.local:
+        notes = backend.notes(vehicle)
+        yield notes, sum(backend.intake.rejected[notes["name"]].values()), sum(notes["gate_rejections"].values())
 
 
 def kept_drive(path: Path | None, backend: Svea) -> str:
@@ -51,15 +57,12 @@ def kept_drive(path: Path | None, backend: Svea) -> str:
 
 def links_report(backend: Svea, out: Console) -> None:
     """Print a table with a row per car, and a line on time and on why it ended."""
-    health, cars = backend.link, backend.binding
+    health = backend.link
     table = Table(title="Links", title_justify="left", box=None)
     for name in ("car", "gate", "clock offset", "messages refused", "gate refused"):
         table.add_column(name, justify="left" if name in ("car", "gate") else "right")
-    for vehicle in cars.local:
-        notes = backend.notes(vehicle)
-        offset = f"{1e3 * notes['clock_offset']:.1f} ms"
-        refused = str(sum(backend.intake.rejected[notes["name"]].values()))
-        table.add_row(notes["name"], notes["gate"], offset, refused, str(sum(notes["gate_rejections"].values())))
+    for notes, here, there in _links(backend):
+        table.add_row(notes["name"], notes["gate"], f"{1e3 * notes['clock_offset']:.1f} ms", str(here), str(there))
     out.print(table)
     late = 1e3 * backend.pacer.late(0.99)
     out.print(
@@ -69,9 +72,8 @@ def links_report(backend: Svea, out: Console) -> None:
     )
     if left_out := [f"{name} {count}" for name, count in health.refused.items() if count]:
         out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
-    trip = backend.watchdog.trip
-    if trip is not None:
-        out.print(f"Stopped: {trip.reason}", soft_wrap=True)
+    if backend.watchdog.trip is not None:
+        out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
 
 
 def truth_report(backend: Svea) -> str:
@@ -104,6 +106,10 @@ def judged(run: Rollout) -> Rows:
     return rows
 
 
+MEANS = (("steady_position_rmse_m", 1, 4), ("steady_orientation_rmse_deg", 1, 2), ("hidden_share", 100, 1))
+"""Figures of the table side by side: key, factor, digits."""
+
+
 def side_by_side(vehicles: list[str], backends: Mapping[str, list[Rows]]) -> Table:
     """Return a row per vehicle and backend, of all episodes: the last settling; means with standard errors."""
     headings = ("\nseeds", "settles\nby [s]", "RMSE [m]\nmean±SE", "RMSE [deg]\nmean±SE", "hidden [%]\nmean±SE")
@@ -111,23 +117,15 @@ def side_by_side(vehicles: list[str], backends: Mapping[str, list[Rows]]) -> Tab
     for i, vehicle in enumerate(vehicles):
         for name, episodes in backends.items():
             settled = float(np.max([rows[i]["settle_time_s"] for rows in episodes]))  # NaN where one never does
-            means = [
-                _mean(np.array([factor * rows[i][key] for rows in episodes]), digits)
-                for key, factor, digits in (
-                    ("steady_position_rmse_m", 1, 4),
-                    ("steady_orientation_rmse_deg", 1, 2),
-                    ("hidden_share", 100, 1),
-                )
-            ]
+            means = [_mean([factor * rows[i][key] for rows in episodes], digits) for key, factor, digits in MEANS]
             table.add_row(vehicle, name, str(len(episodes)), *seconds([settled]), *means)
     return table
 
 
-def _mean(values: np.ndarray, digits: int) -> str:
+def _mean(values: list[float], digits: int) -> str:
     """Return mean and standard error in words; the latter needs two values."""
-    if len(values) < 2:
-        return f"{values.mean():.{digits}f}"
-    return f"{values.mean():.{digits}f}±{values.std(ddof=1) / np.sqrt(len(values)):.{digits}f}"
+    error = f"±{np.std(values, ddof=1) / np.sqrt(len(values)):.{digits}f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{error}"
 
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}

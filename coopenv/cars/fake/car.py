@@ -13,7 +13,7 @@ from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, warm_up
 from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
-from coopenv.cars.fake.sensors import LEADER_RATE, ODOMETRY, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
+from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
 from coopenv.cars.gate.process import CLOCK, GateConnection
@@ -189,12 +189,10 @@ class Fake:
     def _truth(self, due: int, _stamp: int) -> None:
         """Publish the message of motion capture, whose clock is right."""
         placed, twist = {"pose": self._pose()}, {"twist": self.world.twist}
-        fields = {"child_frame_id": self.name, "pose": placed, "twist": twist}
-        self._outside.send(Role.TRUTH, ODOMETRY, self._stamp(due), "mocap", **fields)
+        self._outside.send(Role.TRUTH, self._stamp(due), "mocap", child_frame_id=self.name, pose=placed, twist=twist)
 
     def _leader(self, _due: int, stamp: int) -> None:
-        kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._publisher.send(Role.ESTIMATE, kind, stamp, "map", pose={"pose": self._pose()})
+        self._publisher.send(Role.ESTIMATE, stamp, "map", pose={"pose": self._pose()})
 
     def _pose(self) -> object:
         R, p = self.world.pose(self.world.agent)

@@ -12,7 +12,7 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import CarWorld, Neighbours
-from coopenv.cars.profile import CarProfile, Role
+from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import Calibration
 from coopenv.cars.transport.base import Transport
 from coopenv.estimation.lens import distort
@@ -34,8 +34,6 @@ BATTERY = {
     **{"power_supply_status": 2, "power_supply_health": 1, "power_supply_technology": 3, "present": True},
 }
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-
 Act = Callable[[int, int], None]
 """Called with when it was due, steady clock, and the stamp by the car's clock; ns."""
 
@@ -47,13 +45,13 @@ class SensorPublisher:
         """Take the car's name, its make, and the network."""
         self.name, self._profile, self._network = name, profile, network
 
-    def send(self, role: Role, kind: str, stamp: int, frame: str, /, **fields: Any) -> None:
+    def send(self, role: Role, stamp: int, frame: str, /, **fields: Any) -> None:
         """Publish a message by its fields; a stamp in ns.
 
         Raises:
-            CoopenvError: the profile has another type for the role.
+            CoopenvError: the profile has another type for the role than SVEA's.
         """
-        topic = self._profile.topics[role]
+        topic, kind = self._profile.topics[role], SVEA.topics[role].type
         if kind != topic.type:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type}: fake cars have {kind} alone")
         payload = encode(make(kind, header=header(stamp, frame), **fields))
@@ -97,8 +95,7 @@ class CarSensors:
         turned = float(turn[2] * scale + noise[1]) if self._differential else 0.0
         covariance = np.diag([self._wheel_std**2, 0.0, 0.0, 0.0, 0.0, self._wheel_turn_std**2])
         twist = {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, turned)), "covariance": covariance}
-        kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-        self._publisher.send(Role.WHEEL, kind, stamp, f"{self._publisher.name}/base_link", twist=twist)
+        self._publisher.send(Role.WHEEL, stamp, f"{self._publisher.name}/base_link", twist=twist)
 
     def _imu(self, due: int, stamp: int) -> None:
         """Publish turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
@@ -109,8 +106,7 @@ class CarSensors:
         fields = {"angular_velocity": turn, "linear_acceleration": (0.0, 0.0, GRAVITY)}
         fields["angular_velocity_covariance"] = self._gyro_std**2 * np.eye(3)
         unknown = {"orientation": (0.0, 0.0, 0.0, 1.0), "orientation_covariance": [-1.0, *np.zeros(8)]}
-        kind, frame = "sensor_msgs/msg/Imu", f"{self._publisher.name}/imu"
-        self._publisher.send(Role.IMU, kind, stamp, frame, **fields, **unknown)
+        self._publisher.send(Role.IMU, stamp, f"{self._publisher.name}/imu", **fields, **unknown)
 
     def _odometry(self, due: int, stamp: int) -> None:
         self._dead_reckon(due)
@@ -121,9 +117,7 @@ class CarSensors:
             "twist": {"twist": ((self._speed, 0.0, 0.0), (0.0, 0.0, self._turn_rate))},
         }
         name = self._publisher.name
-        self._publisher.send(
-            Role.ODOMETRY, ODOMETRY, stamp, f"{name}/odom", child_frame_id=f"{name}/base_link", **fields
-        )
+        self._publisher.send(Role.ODOMETRY, stamp, f"{name}/odom", child_frame_id=f"{name}/base_link", **fields)
 
     def _dead_reckon(self, now: int) -> None:
         """Move the filter's pose to a time by the last samples, held and summed."""
@@ -134,9 +128,9 @@ class CarSensors:
         self._pose += (way * math.cos(middle), way * math.sin(middle), dt * self._turn_rate)
 
     def _condition(self, _due: int, stamp: int) -> None:
-        self._publisher.send(Role.STATE, "mavros_msgs/msg/State", stamp, "", **STANDING)
-        self._publisher.send(Role.REMOTE, "mavros_msgs/msg/RCIn", stamp, "", rssi=200, channels=[1500] * 8)
-        self._publisher.send(Role.BATTERY, "sensor_msgs/msg/BatteryState", stamp, "", **BATTERY)
+        self._publisher.send(Role.STATE, stamp, "", **STANDING)
+        self._publisher.send(Role.REMOTE, stamp, "", rssi=200, channels=[1500] * 8)
+        self._publisher.send(Role.BATTERY, stamp, "", **BATTERY)
 
 
 def deviation(stated: float, noise: Noise, rate: float) -> float:
@@ -183,11 +177,8 @@ class Pixy:
 
     def _camera(self, due: int, stamp: int) -> None:
         blocks = self._frame(due)
-        kind, bearing = "pixy_camera/msg/ObjectInfoArrayStamped", self._bearings(blocks)
-        self._publisher.send(Role.DETECTIONS, kind, stamp, "camera", objects=blocks)
-        self._publisher.send(
-            Role.BEARINGS, "pixy_camera/msg/ObjectBearingArrayStamped", stamp, "camera", bearing=bearing
-        )
+        self._publisher.send(Role.DETECTIONS, stamp, "camera", objects=blocks)
+        self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
 
     def _camera_info(self, _due: int, stamp: int) -> None:
         c = self._calibration
@@ -195,7 +186,7 @@ class Pixy:
         matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
         fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
         fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
-        self._publisher.send(Role.CAMERA_INFO, "sensor_msgs/msg/CameraInfo", stamp, "camera", **fields)
+        self._publisher.send(Role.CAMERA_INFO, stamp, "camera", **fields)
 
     def _frame(self, now: int) -> list[Any]:
         """Take a frame at a time in ns; return its blocks (ObjectInfo), the largest first."""

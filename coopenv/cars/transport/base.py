@@ -9,7 +9,7 @@ import threading
 import time
 import uuid
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -162,7 +162,6 @@ class HeartbeatTransport(ABC):
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")
 SECURE = ("tls", "quic")
-NO_ANSWER = "no answer"
 
 WRITTEN = re.compile(r"([a-z]+)/(\[[0-9A-Fa-f:.]+\]|[^\s/:?#\[\]]+):(\d{1,5})(?:[?#]\S*)?")
 
@@ -215,9 +214,15 @@ def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float)
         with socket.create_connection((address.host, address.port), timeout) as plain:
             return _tls_trouble(plain, address.host, context) if address.protocol == "tls" and context else None
     except TimeoutError:
-        return NO_ANSWER
+        return "no answer"
     except OSError as error:
         return error.strerror or str(error)
+
+
+def first_trouble(endpoints: Sequence[str], context: ssl.SSLContext | None, otherwise: str) -> str:
+    """Return why a connection to the first of the endpoints with a trouble fails, or else what a library says."""
+    troubles = (trouble_at(address_of(endpoint), context, 1.0) for endpoint in endpoints)
+    return next(filter(None, troubles), otherwise)
 
 
 def _tls_trouble(plain: socket.socket, host: str, context: ssl.SSLContext) -> str | None:

@@ -2,11 +2,10 @@
 
 import asyncio
 import base64
-import binascii
-import queue
 import ssl
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -14,15 +13,14 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.transport.base import (
-    Address,
     Arrival,
     Callback,
     Certificates,
     HeartbeatTransport,
     LinkError,
     address_of,
+    first_trouble,
     matcher,
-    trouble_at,
 )
 
 ATTACHMENT = "Coopenv-Attachment"
@@ -44,54 +42,42 @@ def subjects_of(pattern: str) -> tuple[str, ...]:
     parts = pattern.split("/")
     if "**" not in parts:
         return (subject_of(pattern),)
-    first = parts.index("**")
-    before = ".".join(parts[:first])
-    if not before:
-        return (">",)
-    alone = all(part == "**" for part in parts[first:])
-    return (before, f"{before}.>") if alone else (f"{before}.>",)
+    before = ".".join(parts[: parts.index("**")])
+    return (before, f"{before}.>") if before else (">",)
 
 
 def attachment_of(headers: dict[str, str] | None) -> bytes:
     """Return what is beside a message; nothing, if its header is none of ours."""
     try:
         return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
-    except (binascii.Error, ValueError):
+    except ValueError:
         return b""
 
 
 Letter = tuple[str, bytes, bytes]
 """A message in the outbox: topic, payload, attachment."""
 
+POLL = 0.002  # s
+
 
 class Outbox:
     """Two queues; used from any thread."""
 
-    def __init__(self, most: int, patience: float) -> None:
-        """Make it.
+    def __init__(self, most: int) -> None:
+        """Make it for so many messages of each queue; then the oldest is dropped."""
+        self._urgent, self._other = (deque[Letter](maxlen=most) for _ in range(2))
 
-        Args:
-            most: messages of each queue; then the oldest is dropped.
-            patience: s that the sender of a reliable message waits before that.
-        """
-        self._patience = patience
-        self._urgent, self._other = queue.Queue[Letter](most), queue.Queue[Letter](most)
-
-    def put(self, letter: Letter, *, urgent: bool, patient: bool) -> None:
-        """Add a message; if there is no room, a patient sender waits for some, and then the oldest goes."""
-        letters = self._urgent if urgent else self._other
-        while True:
-            try:
-                return letters.put(letter, patient, self._patience)
-            except queue.Full:
-                with suppress(queue.Empty):
-                    letters.get_nowait()
+    def put(self, letter: Letter, *, urgent: bool, patience: float = 0.0) -> None:
+        """Add a message; if there is no room, the sender waits for some, s at most, and then the oldest goes."""
+        letters, give_up = self._urgent if urgent else self._other, time.monotonic() + patience
+        while len(letters) == letters.maxlen and time.monotonic() < give_up:
+            time.sleep(POLL)
+        letters.append(letter)
 
     def take(self) -> Letter | None:
         """Return the next message; None: there is none."""
-        for letters in (self._urgent, self._other):
-            with suppress(queue.Empty):
-                return letters.get_nowait()
+        with suppress(IndexError):
+            return (self._urgent or self._other).popleft()
         return None
 
 
@@ -99,7 +85,7 @@ HEARTBEATS = "presence/"
 """Topics of heartbeats; no topic of a car."""
 
 MOST_WAITING = 1024  # messages to send, and received ones per subscription; then the oldest, or the new ones, are lost
-PATIENCE = 1.0  # s
+PATIENCE = 1.0  # s that the sender of a reliable message waits for room
 PENDING_BYTES = 131_072  # that the library may hold: what waits longer than a broker's hiccup is of no use
 
 OPTIONS = {
@@ -116,7 +102,7 @@ class Nats(HeartbeatTransport):
 
     def __init__(self) -> None:
         super().__init__()
-        self._outbox = Outbox(MOST_WAITING, PATIENCE)
+        self._outbox = Outbox(MOST_WAITING)
         self._opened: Future[None] = Future()
 
     def open(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
@@ -150,8 +136,8 @@ class Nats(HeartbeatTransport):
         """Send, see `Transport`."""
         if self._closed.is_set():
             return
-        patient = reliable and threading.current_thread() is not self._thread
-        self._outbox.put((topic, payload, attachment), urgent=urgent or reliable, patient=patient)
+        patience = PATIENCE if reliable and threading.current_thread() is not self._thread else 0.0
+        self._outbox.put((topic, payload, attachment), urgent=urgent or reliable, patience=patience)
         self._call(self._wake.set)
 
     def _call(self, act: Callable[[], object]) -> None:
@@ -237,14 +223,10 @@ def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: 
         made.open(lambda: nats.connect(servers, error_cb=keep, tls=context, **OPTIONS), timeout)
     except Exception as error:  # the library's own, of the network, of TLS
         made.close()
-        reason = _reason(last[0] if last else error, addresses)
+        cause = last[0] if last else error
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            reason = f"its certificate is refused: {cause.verify_message}"
+        else:
+            reason = first_trouble(connect, None, str(cause) or "no answer in the language of NATS")
         raise LinkError(f"{', '.join(connect)}: no NATS broker there ({reason})") from None
     return made
-
-
-def _reason(error: Exception, addresses: Sequence[Address]) -> str:
-    """Return why no broker has answered."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is refused: {error.verify_message}"
-    troubles = (trouble_at(address, None, 1.0) for address in addresses)
-    return next(filter(None, troubles), str(error) or "no answer in the language of NATS")

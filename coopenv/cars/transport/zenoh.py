@@ -8,7 +8,6 @@ from typing import Any, Literal
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport.base import (
-    NO_ANSWER,
     SECURE,
     Arrival,
     Callback,
@@ -16,7 +15,7 @@ from coopenv.cars.transport.base import (
     LinkError,
     Transport,
     address_of,
-    trouble_at,
+    first_trouble,
 )
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
@@ -130,23 +129,10 @@ def open_zenoh(
         return Zenoh(zenoh.open(config), zenoh)
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen]) or "no endpoints"
-        reason = _reason(error, connect, tls)
-        if reason is None:
-            raise LinkError(f"{where}: does not answer within {timeout:g} s") from None
+        text = str(error).split(" at /")[0].split("\n")[0][:120]  # the first sentence
+        text = f"no answer within {timeout:g} s" if connect and "Timeout" in text else text
+        reason = first_trouble(connect, tls.context() if tls else None, text)
         raise LinkError(f"{where}: no Zenoh there ({reason})") from None
-
-
-def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str | None:
-    """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error.
-
-    None: no answer, or a connection without an answer, as by a firewall.
-    """
-    context = tls.context() if tls else None
-    for endpoint in connect:
-        if trouble := trouble_at(address_of(endpoint), context, 1.0):
-            return None if trouble == NO_ANSWER else trouble
-    text = str(error).split(" at /")[0].split("\n")[0][:120]
-    return None if connect and "Timeout" in text else text
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:

@@ -122,7 +122,7 @@ def test_a_broker_that_has_frozen_keeps_neither_senders_nor_memory(tmp_path: Pat
         for _ in range(3 * MOST_WAITING):
             ours.publish("fleet/x", bytes(10_000))
         assert time.monotonic() - began < 10.0
-        assert ours._outbox._other.qsize() <= MOST_WAITING
+        assert len(ours._outbox._other) <= MOST_WAITING
         ours.publish("fleet/stop", b"", reliable=True)
         os.kill(broker.pid, signal.SIGCONT)
         ours.close()
@@ -177,7 +177,7 @@ def test_a_subject_is_the_topic_with_dots() -> None:
         ("agent7/riccatiPoint", ("agent7.riccatiPoint",)),
         ("fleet/*/x", ("fleet.*.x",)),
         ("fleet/a/**", ("fleet.a", "fleet.a.>")),
-        ("fleet/**/x", ("fleet.>",)),
+        ("fleet/**/x", ("fleet", "fleet.>")),
         ("**", (">",)),
     ],
 )
@@ -253,17 +253,17 @@ def letter(number: int) -> Letter:
 
 
 def test_urgent_ones_overtake_and_the_oldest_go_first_when_there_is_no_room() -> None:
-    outbox = Outbox(2, 0.0)
+    outbox = Outbox(2)
     for number in range(4):
-        outbox.put(letter(number), urgent=False, patient=False)
-    outbox.put(letter(9), urgent=True, patient=False)
+        outbox.put(letter(number), urgent=False)
+    outbox.put(letter(9), urgent=True)
     assert [outbox.take() for _ in range(4)] == [letter(9), letter(2), letter(3), None]
 
 
 def test_a_patient_sender_waits_for_room_and_loses_nothing() -> None:
-    outbox = Outbox(1, 60.0)
-    outbox.put(letter(1), urgent=True, patient=False)
-    sender = threading.Thread(target=lambda: outbox.put(letter(2), urgent=True, patient=True), daemon=True)
+    outbox = Outbox(1)
+    outbox.put(letter(1), urgent=True)
+    sender = threading.Thread(target=lambda: outbox.put(letter(2), urgent=True, patience=60.0), daemon=True)
     sender.start()
     time.sleep(0.1)
     assert sender.is_alive()
