@@ -179,14 +179,11 @@ def _field(node: Any) -> Callable[[Any], Any]:
         names = [name for name, _ in ros2().fielddefs[of][1]]
 
         def nested(given: Any) -> Any:
-            if given is None:
-                return make(of)
-            if isinstance(given, dict):
-                return make(of, **given)
-            if isinstance(given, tuple | list | np.ndarray):
-                values = given.tolist() if isinstance(given, np.ndarray) else given
-                return make(of, **dict(zip(names, values, strict=True)))
-            return given
+            if given is None or isinstance(given, dict):
+                return make(of, **(given or {}))
+            if isinstance(given, np.ndarray):
+                given = given.tolist()
+            return make(of, **dict(zip(names, given, strict=True))) if isinstance(given, tuple | list) else given
 
         return nested
     (name, element), length = of[0], of[1] if kind.name == "ARRAY" else 0

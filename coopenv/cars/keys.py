@@ -44,8 +44,7 @@ class Signer:
         Raises:
             CoopenvError: the identity is none.
         """
-        if not is_identity(identity):
-            raise CoopenvError(f"identity {shown(identity)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+        check_identity(identity, "identity")
         self.identity = identity
         self._key = key
 
@@ -85,6 +84,12 @@ def is_identity(name: str) -> bool:
     return 0 < len(name) <= LONGEST_IDENTITY and name.isascii() and name.replace("_", "").replace("-", "").isalnum()
 
 
+def check_identity(name: str, what: str) -> None:
+    """Refuse a name that cannot be an identity, with a CoopenvError that begins with `what`."""
+    if not is_identity(name):
+        raise CoopenvError(f"{what} {shown(name)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+
+
 def _signed(name: bytes, topic: str, payload: bytes) -> bytes:
     """Return what is signed; the lengths stand before the parts, so that none can pass for another."""
     place = topic.encode()
@@ -120,8 +125,7 @@ def make_keys(folder: str | Path, identities: Iterable[str], force: bool = False
     """
     folder, names = Path(folder), list(dict.fromkeys(identities))
     for name in names:
-        if not is_identity(name):
-            raise KeyFileError(f"{shown(name)} names no key: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+        check_identity(name, "name of a key")
     library()
     with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -73,9 +73,13 @@ def inside(corners: Sequence[Point], x: float, y: float) -> bool:
 
 def is_simple(corners: Sequence[Point]) -> bool:
     """Return whether corners enclose something, and no two edges of theirs cross or touch beyond a common corner."""
-    if len(corners) < 3 or len(set(corners)) < len(corners):
-        return False
-    return not any(_meet(*first, *second) for first, second in combinations(_edges(corners), 2))
+    edges = _edges(corners)
+    crossing = any(
+        _side(a, b, c) * _side(a, b, d) < 0.0 and _side(c, d, a) * _side(c, d, b) < 0.0
+        for (a, b), (c, d) in combinations(edges, 2)
+    )
+    touching = any(_between(a, c, b) for a, b in edges for c in corners if c not in (a, b))
+    return 3 <= len(corners) == len(set(corners)) and not crossing and not touching
 
 
 def _edges(corners: Sequence[Point]) -> list[tuple[Point, Point]]:
@@ -87,18 +91,9 @@ def _side(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def _meet(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Return whether two segments have a point in common that is no common end."""
-    if _side(a, b, c) * _side(a, b, d) < 0.0 and _side(c, d, a) * _side(c, d, b) < 0.0:
-        return True
-    return any(_on(p, q, r) for p, q, r in ((a, b, c), (a, b, d), (c, d, a), (c, d, b)))
-
-
-def _on(a: Point, b: Point, c: Point) -> bool:
-    """Return whether c is on the segment a-b and none of its ends."""
-    if _side(a, b, c) != 0.0 or c in (a, b):
-        return False
-    return min(a[0], b[0]) <= c[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= c[1] <= max(a[1], b[1])
+def _between(a: Point, c: Point, b: Point) -> bool:
+    """Return whether c is on the segment a-b."""
+    return _side(a, b, c) == 0.0 and min(a, b) <= c <= max(a, b)
 
 
 class Role(StrEnum):

@@ -1,14 +1,13 @@
 """What may go wrong with a fake car, on request: `NAME[=VALUE][@START[+DURATION]]`."""
 
-import heapq
 import itertools
 import os
 import random
 import signal
-import threading
 from collections.abc import Callable
 from functools import partial
 from math import isinf
+from queue import PriorityQueue
 
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.cars.profile import PREFIX
@@ -95,9 +94,8 @@ class Wire:
         """
         self._transport, self._faults, self._steady = transport, faults, steady
         self.announce, self.watch = transport.announce, transport.watch
-        self._rng, self._lock = random.Random(seed), threading.Lock()
-        self._late: list[tuple[int, int, Callable[[], None]]] = []
-        self._numbers = itertools.count()
+        self._rng, self._numbers = random.Random(seed), itertools.count()
+        self._late: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -115,18 +113,16 @@ class Wire:
 
     def close(self) -> None:
         """Forget what is under way."""
-        with self._lock:
-            self._late.clear()
+        self._late = PriorityQueue()
 
     def flush(self) -> None:
         """Pass on what has been under way for long enough."""
-        now = self._steady()
-        while self._late:
-            with self._lock:
-                if not self._late or self._late[0][0] > now:
-                    return
-                _, _, act = heapq.heappop(self._late)
-            act()
+        while not self._late.empty():
+            first = self._late.get()
+            if first[0] > self._steady():
+                self._late.put(first)
+                return
+            first[2]()
 
     def _pass_on(self, act: Callable[[], None]) -> None:
         if not self._faults:
@@ -136,7 +132,6 @@ class Wire:
         if faults.value("freeze", now) or self._rng.random() < faults.value("loss", now):
             return
         if delay := faults.value("delay", now):
-            with self._lock:
-                heapq.heappush(self._late, (now + round(delay * 1e9), next(self._numbers), act))
-            return
-        act()
+            self._late.put((now + round(delay * 1e9), next(self._numbers), act))
+        else:
+            act()

@@ -34,7 +34,7 @@ class FakesError(CoopenvError):
     """The router or a fake car does not run."""
 
 
-class Process:
+class Process(subprocess.Popen[bytes]):
     """A command of coopenv, which leads a process group of its own."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
@@ -48,7 +48,7 @@ class Process:
         self.name = name
         self._logs = folder / f"{name}.out", folder / f"{name}.err"
         with held(), self._logs[0].open("w") as out, self._logs[1].open("w") as errors:
-            self._process = subprocess.Popen(
+            super().__init__(
                 [sys.executable, "-m", "coopenv", *command],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
@@ -64,9 +64,8 @@ class Process:
             FakesError: it has ended, or the time is over; the line quotes its last error.
         """
         while "ready" not in self._logs[0].read_text(encoding="utf-8", errors="replace"):
-            status = self._process.poll()
-            if status is not None:
-                raise FakesError(f"{self.name} has ended with status {status}: {self._last_error()}")
+            if self.poll() is not None:
+                raise FakesError(f"{self.name} has ended with status {self.returncode}: {self._last_error()}")
             if time.monotonic() > until:
                 raise FakesError(f"{self.name} is not ready in time: {self._last_error()}")
             time.sleep(POLL)
@@ -77,18 +76,18 @@ class Process:
             (line.removeprefix("error: ") for line in reversed(lines) if line.strip()), "it has printed nothing"
         )
 
-    def send(self, number: int) -> None:
+    def send_signal(self, number: int) -> None:
         """Send a signal to the process and to all that it has started."""
-        if self._process.poll() is None or number == signal.SIGKILL:
+        if self.poll() is None or number == signal.SIGKILL:
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, number)
+                os.killpg(self.pid, number)
 
     def end(self, until: float) -> None:
         """Wait for it to end, at most until a time of the monotonic clock; then it is ended by force."""
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(max(until - time.monotonic(), 0.0))
-        self.send(signal.SIGKILL)
-        self._process.wait()
+            self.wait(max(until - time.monotonic(), 0.0))
+        self.kill()
+        self.wait()
         _running.remove(self)
 
 
@@ -136,7 +135,7 @@ def _end(started: list[Process]) -> None:
     """End processes, the router last: the cars' gates take their leave."""
     for some in (started[1:], started[:1]):
         for process in some:
-            process.send(signal.SIGTERM)
+            process.terminate()
         until = time.monotonic() + GRACE
         for process in some:
             process.end(until)
@@ -151,7 +150,7 @@ def free_port() -> int:
 
 def _kill_all() -> None:
     for process in list(_running):
-        process.send(signal.SIGKILL)
+        process.kill()
 
 
 before_a_hard_end(_kill_all)

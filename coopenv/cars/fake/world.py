@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode
 from coopenv.cars.profile import NEUTRAL, Drive, Role
-from coopenv.cars.readings import rotation_of
+from coopenv.cars.readings import CarPose, read
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array
@@ -159,12 +159,11 @@ class Neighbours:
         while self._received:
             try:
                 topic, payload = self._received.popitem()
-                message = decode(payload, self._truth_type)
-                place = message.pose.pose.position
-                R = rotation_of(message.pose.pose.orientation, "orientation")
+                value = read(Role.TRUTH, decode(payload, self._truth_type))
             except CoopenvError:
                 continue  # malformed
-            self._world.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
+            if isinstance(value, CarPose) and value.rotation is not None:
+                self._world.put(self._agents[topic], value.rotation, value.position - self._origin)
 
 
 class Actuators:
@@ -173,9 +172,8 @@ class Actuators:
     def __init__(self, latency: float, timeout: float) -> None:
         """Build them for a dead time, and a time without a command after which they go to neutral; both in s."""
         self._latency, self._timeout = round(latency * 1e9), round(timeout * 1e9)
-        self._waiting: deque[tuple[int, Drive]] = deque()  # from when on
+        self._waiting: deque[tuple[int, Drive]] = deque()  # from when on; the last one is the time-out
         self._now = NEUTRAL
-        self._until = 0  # when the command that is followed becomes too old
 
     def clear(self) -> None:
         """Forget all commands."""
@@ -184,20 +182,17 @@ class Actuators:
 
     def receive(self, drive: Drive, at: int) -> None:
         """Take a command that has come."""
-        self._waiting.append((at + self._latency, drive))
+        begin = at + self._latency
+        if self._waiting and self._waiting[-1][0] > begin:
+            self._waiting.pop()  # the command before it does not time out
+        self._waiting.extend([(begin, drive), (begin + self._timeout, NEUTRAL)])
 
     def pieces(self, begin: int, end: int) -> Iterator[tuple[float, Drive]]:
         """Yield (how long in s, what is followed) from a time to a later one; each stretch is asked for once."""
         now = begin
         while now < end:
-            if self._waiting and self._waiting[0][0] <= now:
-                since, self._now = self._waiting.popleft()
-                self._until = since + self._timeout
-                continue
-            if self._now != NEUTRAL and now >= self._until:
-                self._now = NEUTRAL
-            stop = min(end, self._waiting[0][0] if self._waiting else end)
-            if self._now != NEUTRAL:
-                stop = min(stop, self._until)
+            while self._waiting and self._waiting[0][0] <= now:
+                _, self._now = self._waiting.popleft()
+            stop = min(end, self._waiting[0][0]) if self._waiting else end
             yield (stop - now) * 1e-9, self._now
             now = stop

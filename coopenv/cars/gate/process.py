@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Car, Deployment, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, write
-from coopenv.cars.keys import LONGEST_IDENTITY, Signer, check_known, is_identity, load_signer, load_verifier
+from coopenv.cars.keys import Signer, check_identity, check_known, load_signer, load_verifier
 from coopenv.cars.profile import Role, presence_of
 from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
 
@@ -69,12 +69,11 @@ class GateConnection:
         if state is GateMode.STOPPED:
             self._send(Role.STOP, write("?", True), self._own)
 
-    def neutral(self) -> bytes:
-        """Close the gate for good and send the car a neutral command, which is returned."""
+    def neutral(self) -> None:
+        """Close the gate for good and send the car a neutral command."""
         with self._lock:
             payload = self._gate.neutral()
         self._send(Role.MANUAL, payload)
-        return payload
 
     def _arrive(self, role: Role, arrival: Arrival) -> None:
         if role is Role.STOP and arrival.attachment == self._own:
@@ -122,22 +121,20 @@ def gate_deployment(car: str, path: Path | None, connect: str | None = None, off
         CoopenvError: the name is none, the file cannot be read, or knows no such car; an endpoint is none, or not on
             this computer.
     """
-    if path is not None:
-        fleet = load_deployment(path)
-        fleet.car(car)
-    elif is_identity(car):
+    if path is None:
+        check_identity(car, "--car")
         fleet = Deployment(environment="", cars=(Car.model_construct(name=car),))
     else:
-        raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+        fleet = load_deployment(path)
+        fleet.car(car)
     endpoints = fleet.gate_connect if connect is None else (connect,)
-    addresses = {endpoint: address_of(endpoint) for endpoint in endpoints}
-    for endpoint, address in addresses.items():
-        if not address.loopback and not off_board:
+    for endpoint in endpoints:
+        if not address_of(endpoint).loopback and not off_board:
             raise CoopenvError(
                 f"{endpoint}: is not on this computer, and when the link to it dies the wheels get no neutral: "
                 "expected the car's own router, e.g. tcp/127.0.0.1:7447 ([gate] connect, --connect), or --off-board"
             )
-    secure = any(address.protocol in SECURE for address in addresses.values())
+    secure = any(address_of(endpoint).protocol in SECURE for endpoint in endpoints)
     tls = fleet.network.tls if secure else None  # on the car itself nothing need be
     network = fleet.network.model_copy(update={"connect": endpoints, "tls": tls})
     return fleet.model_copy(update={"network": network})

@@ -5,9 +5,8 @@ a position alone) or there is none, it goes out under our own name as well, as C
 """
 
 import math
-import threading
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,9 +115,6 @@ class Authors:
         self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
         self._routes = {route.topic: route for route in routes}
         self._names = {route.name for route in self._routes.values()}
-        self._lock = threading.Lock()
-        self.refused: Counter[str] = Counter()
-        """Messages that are not of their topic's type, by topic, ours or theirs."""
         warmed = {(route.ours, route.theirs): route for route in self._routes.values()}
         for route in warmed.values():
             route.warm_up()
@@ -132,10 +128,9 @@ class Authors:
             self._wire.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
         if route is None:
             return
-        translated = self._translated(route.out, payload, topic)
-        if translated is not None:
+        with suppress(CoopenvError):  # no message of its topic's type, which goes no further
             beside = attachment if route.exact else b""
-            self._wire.publish(route.name, translated, beside, urgent=urgent, reliable=reliable)
+            self._wire.publish(route.name, route.out(payload), beside, urgent=urgent, reliable=reliable)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
@@ -152,18 +147,13 @@ class Authors:
 
         self._wire.subscribe(pattern, pass_on)
 
-    def _translating(self, route: Route, callback: Callback) -> Callback:
+    @staticmethod
+    def _translating(route: Route, callback: Callback) -> Callback:
         def arrive(arrival: Arrival) -> None:
-            payload = self._translated(route.back, arrival.payload, route.name)
-            if payload is not None:
-                callback(Arrival(route.topic, payload, arrival.received, arrival.attachment))
+            try:
+                payload = route.back(arrival.payload)
+            except CoopenvError:
+                return
+            callback(Arrival(route.topic, payload, arrival.received, arrival.attachment))
 
         return arrive
-
-    def _translated(self, translate: Callable[[bytes], bytes], payload: bytes, name: str) -> bytes | None:
-        try:
-            return translate(payload)
-        except CoopenvError:
-            with self._lock:
-                self.refused[name] += 1
-            return None

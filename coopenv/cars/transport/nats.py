@@ -114,7 +114,8 @@ class Nats(HeartbeatTransport):
 
     async def _live(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
         """Connect, and send until the end."""
-        self._loop, self._wake, self._task = asyncio.get_running_loop(), asyncio.Event(), asyncio.current_task()
+        self._loop, self._wake = asyncio.get_running_loop(), asyncio.Event()
+        self._task: Any = asyncio.current_task()
         try:
             self._client = await asyncio.wait_for(connect(), timeout)
         except Exception as error:
