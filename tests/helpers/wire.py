@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from coopenv.cars.transport.base import Arrival, Transport
 from tests.helpers.processes import start
 
 PING, PONG, ECHO = "fleet/ping", "fleet/pong", "fleet/alive/echo"
@@ -20,6 +21,25 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def free_endpoint() -> str:
+    """Return an endpoint of the loopback that nobody listens at."""
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def heard_by(receiver: Transport, pattern: str) -> list[Arrival]:
+    """Return what a receiver hears from now on, filled as it comes."""
+    heard: list[Arrival] = []
+    receiver.subscribe(pattern, heard.append)
+    return heard
+
+
+def seen_by(receiver: Transport) -> list[tuple[str, bool]]:
+    """Return who comes and goes from now on, filled as it happens."""
+    seen: list[tuple[str, bool]] = []
+    receiver.watch("fleet/alive/*", lambda *change: seen.append(change))
+    return seen
 
 
 @contextmanager

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -20,26 +18,6 @@ from coopenv.cars.transport.base import Arrival, Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
 from tests.helpers.processes import COOPENV, start, wait_until
-
-ROUTER = """
-import sys, time
-from coopenv.cars.transport.zenoh import open_zenoh
-held = open_zenoh("router", listen=[sys.argv[1]])
-print("up", flush=True)
-time.sleep(600)
-"""
-
-
-def free_endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
-
-
-def start_router(endpoint: str, folder: Path) -> subprocess.Popen[str]:
-    process = start((sys.executable, "-c", ROUTER, endpoint), folder)
-    assert process.stdout is not None and process.stdout.readline() == "up\n"
-    return process
 
 
 def start_gate(endpoint: str, folder: Path, *options: str) -> subprocess.Popen[str]:

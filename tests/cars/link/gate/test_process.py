@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from random import Random
 
@@ -20,8 +21,9 @@ from coopenv.cli import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.hostile import messages_of_strangers
-from tests.cars.link.gate.station import Station, end, free_endpoint, start_gate, start_router
+from tests.cars.link.gate.station import Station, end, start_gate
 from tests.helpers.processes import start, wait_until
+from tests.helpers.wire import free_endpoint, heard_by, running
 
 pytest.importorskip("zenoh", reason="needs the extra 'svea'")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and modes of files")
@@ -35,11 +37,10 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def endpoint() -> Iterator[str]:
     where = free_endpoint()
-    router = start_router(where, tmp_path_factory.mktemp("router"))
-    yield where
-    end(router)
+    with running("router", where):
+        yield where
 
 
 @pytest.fixture
@@ -51,9 +52,8 @@ def gate(endpoint: str, keys: Path, tmp_path: Path) -> Iterator[subprocess.Popen
 
 @pytest.fixture
 def station(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> Iterator[Station]:
-    transport = open_zenoh("client", [endpoint])
-    yield Station(transport, load_signer(keys, "station"))
-    transport.close()
+    with closing(open_zenoh("client", [endpoint])) as transport:
+        yield Station(transport, load_signer(keys, "station"))
 
 
 def test_a_station_arms_drives_and_stops(station: Station) -> None:
@@ -138,37 +138,32 @@ def test_a_signal_leaves_the_car_in_neutral(
 
 def test_a_router_that_comes_back_finds_the_gate(keys: Path, tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    router = start_router(endpoint, tmp_path)
-    gate = start_gate(endpoint, tmp_path, "--keys", str(keys))
-    transport = open_zenoh("client", [endpoint])
-    try:
-        station = Station(transport, load_signer(keys, "station"))
-        station.arm("a")
-        station.drive()
-        end(router)
+    with ExitStack() as stack:
+        with running("router", endpoint):
+            gate = start_gate(endpoint, tmp_path, "--keys", str(keys))
+            stack.callback(end, gate)
+            transport = stack.enter_context(closing(open_zenoh("client", [endpoint])))
+            station = Station(transport, load_signer(keys, "station"))
+            station.arm("a")
+            station.drive()
         time.sleep(0.5)
-        router = start_router(endpoint, tmp_path)
-        heard = station.statuses
-        wait_until(lambda: station.statuses > heard + 1)
-        assert station.status.state == "timed_out"
-        station.drive()  # the session goes on
-        wait_until(lambda: station.present)
-        end(router)
+        with running("router", endpoint):
+            heard = station.statuses
+            wait_until(lambda: station.statuses > heard + 1)
+            assert station.status.state == "timed_out"
+            station.drive()  # the session goes on
+            wait_until(lambda: station.present)
         time.sleep(0.5)
         assert gate.poll() is None
         gate.terminate()  # ends without a router as well
         assert gate.wait(timeout=10) == 143
-    finally:
-        transport.close()
-        end(gate, router)
 
 
 def test_the_status_is_signed_by_the_car(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> None:
-    transport, heard, verifier = open_zenoh("client", [endpoint]), [], load_verifier(keys)
-    transport.subscribe("fleet/*/coopenv/gate", heard.append)
-    wait_until(lambda: heard)
-    transport.close()
-    assert verifier.signer(heard[0].topic, heard[0].payload, heard[0].attachment) == CAR
+    with closing(open_zenoh("client", [endpoint])) as transport:
+        heard = heard_by(transport, "fleet/*/coopenv/gate")
+        wait_until(lambda: heard)
+    assert load_verifier(keys).signer(heard[0].topic, heard[0].payload, heard[0].attachment) == CAR
 
 
 def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Path) -> None:
@@ -182,24 +177,22 @@ def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Pat
     lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
     (tmp_path / "fleet.toml").write_text("\n".join(lines))
     gate = start((sys.executable, "-m", "coopenv", "svea", "gate", "fleet.toml", "--car", CAR), tmp_path)
-    transport = open_zenoh("client", [endpoint])
     try:
-        station = Station(transport, load_signer(keys, "other"))
-        station.arm("a")
-        station.command(speed=0.3)
-        wait_until(lambda: station.count("limits") == 1)
+        with closing(open_zenoh("client", [endpoint])) as transport:
+            station = Station(transport, load_signer(keys, "other"))
+            station.arm("a")
+            station.command(speed=0.3)
+            wait_until(lambda: station.count("limits") == 1)
     finally:
-        transport.close()
         end(gate)
 
 
 def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
     gate = start_gate(endpoint, tmp_path)
-    transport = open_zenoh("client", [endpoint])
-    station = Station(transport, None)
-    station.arm("a")
-    station.drive()
-    transport.close()
+    with closing(open_zenoh("client", [endpoint])) as transport:
+        station = Station(transport, None)
+        station.arm("a")
+        station.drive()
     gate.terminate()
     assert gate.communicate(timeout=10)[1].startswith("warning: without --keys whoever")
 

@@ -17,6 +17,7 @@ from coopenv.cars.readings import CarPose, read
 from coopenv.cars.transport.authors import Authors, routes_of
 from coopenv.cars.transport.base import Arrival
 from tests.helpers.hub import Hub, HubTransport
+from tests.helpers.wire import heard_by, seen_by
 
 CAR = Car(name="svea1", agent=7)
 STAMP = 3_000_000_004
@@ -55,8 +56,7 @@ def test_an_estimate_is_the_43_bytes_of_a_riccati_point_and_itself() -> None:
 
 def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> None:
     authors, plain, _ = ends()
-    heard: list[Arrival] = []
-    authors.subscribe(HEARD, heard.append)
+    heard = heard_by(authors, HEARD)
     plain.publish("agent7/riccatiPoint", struct.pack("<I", 77) + POINT[4:], b"signed")
     plain.publish("agent8/riccatiPoint", POINT)
     assert [(a.topic, a.attachment) for a in heard] == [(HEARD, b"signed")]
@@ -137,8 +137,7 @@ def filled(kind: str, draw: Any) -> Any:
 def test_exact_counterparts_come_back_as_the_bytes_they_were(data: st.DataObject, role: Role) -> None:
     sender, plain, on_the_wire = ends()
     receiver = Authors(plain, routes_of(CAR))
-    heard: list[Arrival] = []
-    receiver.subscribe("fleet/**", heard.append)
+    heard = heard_by(receiver, "fleet/**")
     sent = encode(filled(SVEA.topics[role].type, data.draw))
     sender.publish(SVEA.topic_of("svea1", role), sent, b"signed")
     assert [arrival.topic for arrival in on_the_wire] == [NAMES[role]]
@@ -156,8 +155,7 @@ def test_matrices_of_a_camera_keep_their_values() -> None:
 
 def test_bytes_that_are_no_such_message_go_no_further() -> None:
     authors, plain, heard = ends()
-    back: list[Arrival] = []
-    authors.subscribe(HEARD, back.append)
+    back = heard_by(authors, HEARD)
     plain.publish("agent7/riccatiPoint", b"junk")
     authors.publish(SVEA.topic_of("svea1", Role.WHEEL), b"junk")
     assert not back
@@ -166,10 +164,8 @@ def test_bytes_that_are_no_such_message_go_no_further() -> None:
 
 def test_messages_of_ours_and_presences_pass_untouched() -> None:
     authors, plain, _ = ends()
-    seen: list[tuple[str, bool]] = []
-    back: list[Arrival] = []
-    authors.subscribe("**", back.append)
-    authors.watch("fleet/alive/*", lambda *change: seen.append(change))
+    back = heard_by(authors, "**")
+    seen = seen_by(authors)
     plain.announce("fleet/alive/svea1")
     plain.publish("fleet/svea1/coopenv/gate", b"anything", b"signed")
     plain.publish("agent7/riccatiPoint", POINT)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.nats import open_nats
 from coopenv.cars.transport.ros1 import open_ros1
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.brokers import nats_server, ros_master
 from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
-from tests.helpers.wire import free_port
+from tests.helpers.wire import free_endpoint, free_port, heard_by, seen_by
 
 Connect = Callable[[], Transport]
 
@@ -25,7 +25,7 @@ def local(folder: Path) -> Iterator[Connect]:
 
 
 def zenoh(folder: Path) -> Iterator[Connect]:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = free_endpoint()
     router = open_zenoh("router", listen=[endpoint])
     yield lambda: open_zenoh("client", connect=[endpoint])
     router.close()
@@ -63,13 +63,6 @@ def connect(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Connect]
 
             yield ending
             stack.close()
-
-
-def heard_by(receiver: Transport, pattern: str) -> list[Arrival]:
-    """Return what a receiver hears from now on, filled as it comes."""
-    heard: list[Arrival] = []
-    receiver.subscribe(pattern, heard.append)
-    return heard
 
 
 def settle(sender: Transport, receiver: Transport) -> None:
@@ -115,14 +108,11 @@ def test_patterns_choose(connect: Connect) -> None:
 
 def test_who_is_there_is_seen_by_those_who_came_before_and_after(connect: Connect) -> None:
     early, car, late = connect(), connect(), connect()
-    seen: list[tuple[str, bool]] = []
-    seen_late: list[tuple[str, bool]] = []
-    everything = heard_by(early, "**")
-    early.watch("fleet/alive/*", lambda *change: seen.append(change))
+    everything, seen = heard_by(early, "**"), seen_by(early)
     car.announce("fleet/alive/svea7")
     car.announce("fleet/elsewhere/svea7")
     wait_until(lambda: seen)
-    late.watch("fleet/alive/*", lambda *change: seen_late.append(change))
+    seen_late = seen_by(late)
     wait_until(lambda: seen_late)
     car.close()
     wait_until(lambda: len(seen) == 2 and len(seen_late) == 2)

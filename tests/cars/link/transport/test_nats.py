@@ -19,7 +19,7 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import base
-from coopenv.cars.transport.base import LEASE, Arrival, Certificates, HeartbeatTransport, LinkError, matcher
+from coopenv.cars.transport.base import LEASE, Certificates, HeartbeatTransport, LinkError, matcher
 from coopenv.cars.transport.nats import (
     MOST_WAITING,
     Letter,
@@ -32,7 +32,7 @@ from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.authority import Authority
 from tests.helpers.brokers import nats_server
 from tests.helpers.processes import wait_until
-from tests.helpers.wire import free_port, listening
+from tests.helpers.wire import free_port, heard_by, listening, seen_by
 
 POINT = struct.pack("<IIII", 1, 2, 3, 3) + b"map" + struct.pack("<3d", 1.0, 2.0, 3.0)
 
@@ -65,8 +65,7 @@ def test_a_plain_client_sees_the_authors_wire(tmp_path: Path) -> None:
     port = free_port()
     with nats_server(port, tmp_path):
         ours = open_nats([f"nats/127.0.0.1:{port}"])
-        heard: list[Arrival] = []
-        ours.subscribe("*/riccatiPoint", heard.append)
+        heard = heard_by(ours, "*/riccatiPoint")
 
         def send() -> None:
             ours.publish("agent7/riccatiPoint", POINT)
@@ -85,13 +84,12 @@ def test_a_plain_client_sees_the_authors_wire(tmp_path: Path) -> None:
 def test_a_connection_goes_on_when_its_broker_is_back_and_sends_nothing_old(tmp_path: Path) -> None:
     port = free_port()
     heard: list[bytes] = []
-    seen: list[tuple[str, bool]] = []
     with nats_server(port, tmp_path):
         before = listening(os.getpid())
         ours = open_nats([f"nats/127.0.0.1:{port}"])
         assert listening(os.getpid()) == before
         ours.subscribe("fleet/x", lambda arrival: heard.append(arrival.payload))
-        ours.watch("fleet/alive/*", lambda *change: seen.append(change))
+        seen = seen_by(ours)
         ours.announce("fleet/alive/svea7")
         wait_until(lambda: seen)
     wait_until(lambda: len(seen) == 2)
@@ -137,8 +135,7 @@ def test_tls_of_the_broker(tmp_path: Path) -> None:
     endpoint = [f"tls/127.0.0.1:{port}"]
     with nats_server(port, tmp_path, "--tlsverify", *files):
         ours = open_nats(endpoint, station)
-        heard: list[Arrival] = []
-        ours.subscribe("fleet/x", heard.append)
+        heard = heard_by(ours, "fleet/x")
         ours.publish("fleet/x", b"secret")
         wait_until(lambda: heard)
         ours.close()
@@ -156,8 +153,7 @@ def test_a_deployment_reaches_cars_over_the_authors_wire(tmp_path: Path) -> None
     bearings, gate = SVEA.topic_of("svea1", Role.BEARINGS), SVEA.topic_of("svea1", Role.GATE)
     with nats_server(port, tmp_path):
         car, station = open_transport(fleet), open_transport(fleet)
-        heard: list[Arrival] = []
-        station.subscribe("fleet/svea1/**", heard.append)
+        heard = heard_by(station, "fleet/svea1/**")
         sent = encode(make(SVEA.topics[Role.BEARINGS].type))
         car.publish(bearings, sent, b"signed")
         car.publish(gate, b"status", reliable=True)
@@ -226,10 +222,9 @@ class End(HeartbeatTransport):
 def test_a_name_is_there_while_any_of_its_ends_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(base.time, "monotonic", lambda: now[0])
-    seen: list[tuple[str, bool]] = []
     watcher = End()
     ends = [End(watcher) for _ in range(2)]
-    watcher.watch("fleet/alive/*", lambda *change: seen.append(change))
+    seen = seen_by(watcher)  # type: ignore[arg-type]
     for end in ends:
         end.announce("fleet/alive/svea7")
     ends[0].announce("fleet/other")

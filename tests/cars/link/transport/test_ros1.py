@@ -22,12 +22,12 @@ from coopenv.cars.codec import ros1 as types_of_ros1
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import ros1
-from coopenv.cars.transport.base import Address, Arrival, LinkError
+from coopenv.cars.transport.base import Address, LinkError
 from coopenv.cars.transport.ros1 import ENVELOPE, open_ros1, opened, sealed
 from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.brokers import ros_master
 from tests.helpers.processes import start, wait_until
-from tests.helpers.wire import free_port, listening
+from tests.helpers.wire import free_port, heard_by, listening
 
 TYPES = dict.fromkeys(("agent7/riccatiPoint", "agent8/riccatiPoint"), "geometry_msgs/msg/PointStamped")
 
@@ -101,8 +101,7 @@ def test_no_master_is_said_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_node_of_the_authors_stack_understands_the_bytes() -> None:
     with ros_master() as endpoint, authors(endpoint):
         ours = open_ros1(endpoint, TYPES)
-        heard: list[Arrival] = []
-        ours.subscribe("agent8/riccatiPoint", heard.append)
+        heard = heard_by(ours, "agent8/riccatiPoint")
 
         def answered() -> bool:
             ours.publish("agent7/riccatiPoint", point(1.0))
@@ -112,22 +111,15 @@ def test_a_node_of_the_authors_stack_understands_the_bytes() -> None:
         ours.close()
         assert heard[0].topic == "agent8/riccatiPoint"
         assert heard[0].payload[16:] == b"map" + struct.pack("<3d", 7.0, 2.0, 1.0)
-        assert all("0100007F" in place for place in listening_here())
-
-
-def listening_here() -> list[str]:
-    """Return where this process listens: rospy's servers."""
-    found = listening(os.getpid())
-    assert found
-    return found
+        servers = listening(os.getpid())  # those of rospy
+        assert servers and all("0100007F" in place for place in servers)
 
 
 @pytest.mark.ros1
 def test_a_node_goes_on_when_its_master_is_back() -> None:
-    heard: list[Arrival] = []
     with ros_master() as endpoint:
         ours = open_ros1(endpoint, TYPES)
-        ours.subscribe("agent8/riccatiPoint", heard.append)
+        heard = heard_by(ours, "agent8/riccatiPoint")
         ours.publish("agent7/riccatiPoint", point(1.0))
     with ros_master() as endpoint, authors(endpoint):
 
@@ -151,14 +143,12 @@ def test_a_process_is_a_node_of_one_master_only() -> None:
 @pytest.mark.ros1
 def test_a_deployment_reaches_the_authors_stack(tmp_path: Path) -> None:
     cars = [{"name": f"svea{n}", "agent": n} for n in (7, 8)]
-    heard: list[Arrival] = []
     with ros_master() as endpoint, authors(endpoint):
         network = {"kind": "ros1", "connect": [endpoint]}
         fleet = parse_deployment({"environment": "e", "cars": cars, "network": network}, tmp_path / "lab.toml")
         station = open_transport(fleet)
-        station.subscribe(SVEA.topic_of("svea8", Role.POINT), heard.append)
-        place = make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
-        message = encode(make("geometry_msgs/msg/PointStamped", header=header(5, "map"), point=place))
+        heard = heard_by(station, SVEA.topic_of("svea8", Role.POINT))
+        message = encode(make("geometry_msgs/msg/PointStamped", header=header(5, "map"), point=(1.0, 2.0, 3.0)))
 
         def answered() -> bool:
             station.publish(SVEA.topic_of("svea7", Role.POINT), message)

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from functools import cached_property
 
 import pytest
 
@@ -15,28 +16,30 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.transport.base import Arrival, LinkError
 from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
 from tests.helpers.processes import wait_until
-from tests.helpers.wire import ECHO, PING, PONG, free_port, listening, running
+from tests.helpers.wire import ECHO, PING, PONG, free_endpoint, heard_by, listening, running, seen_by
 
 
 @pytest.fixture
 def endpoint() -> str:
-    return f"tcp/127.0.0.1:{free_port()}"
+    return free_endpoint()
 
 
 @pytest.fixture
 def client(endpoint: str) -> Iterator[Zenoh]:
     """Return a client of a router that the test itself starts first."""
-    opened = []
 
     class Lazy:
-        def __getattr__(self, name: str) -> object:
-            if not opened:
-                opened.append(open_zenoh("client", connect=[endpoint]))
-            return getattr(opened[0], name)
+        @cached_property
+        def opened(self) -> Zenoh:
+            return open_zenoh("client", connect=[endpoint])
 
-    yield Lazy()  # type: ignore[misc]
-    for transport in opened:
-        transport.close()
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.opened, name)
+
+    lazy = Lazy()
+    yield lazy  # type: ignore[misc]
+    if "opened" in vars(lazy):
+        lazy.opened.close()
 
 
 def answered(client: Zenoh, heard: list[Arrival]) -> None:
@@ -52,10 +55,8 @@ def answered(client: Zenoh, heard: list[Arrival]) -> None:
 
 def test_two_processes_talk_and_a_killed_one_is_missed(endpoint: str, client: Zenoh) -> None:
     with running("router", endpoint), running("echo", endpoint) as echo:
-        heard: list[Arrival] = []
-        seen: list[tuple[str, bool]] = []
-        client.subscribe(PONG, heard.append)
-        client.watch("fleet/alive/*", lambda *change: seen.append(change))
+        heard = heard_by(client, PONG)
+        seen = seen_by(client)
         answered(client, heard)
         assert (heard[0].topic, heard[0].payload, heard[0].attachment) == (PONG, b"cba", b"signed")
         assert abs(heard[0].received - time.time_ns()) < 60e9
@@ -66,8 +67,7 @@ def test_two_processes_talk_and_a_killed_one_is_missed(endpoint: str, client: Ze
 
 def test_a_frozen_process_is_missed(endpoint: str, client: Zenoh) -> None:
     with running("router", endpoint), running("echo", endpoint) as echo:
-        seen: list[tuple[str, bool]] = []
-        client.watch("fleet/alive/*", lambda *change: seen.append(change))
+        seen = seen_by(client)
         wait_until(lambda: seen)
         os.kill(echo.pid, signal.SIGSTOP)
         began = time.monotonic()
@@ -76,11 +76,8 @@ def test_a_frozen_process_is_missed(endpoint: str, client: Zenoh) -> None:
 
 
 def test_a_session_goes_on_when_its_router_is_back(endpoint: str, client: Zenoh) -> None:
-    heard: list[Arrival] = []
-    seen: list[tuple[str, bool]] = []
     with running("router", endpoint):
-        client.subscribe(PONG, heard.append)
-        client.watch("fleet/alive/*", lambda *change: seen.append(change))
+        heard, seen = heard_by(client, PONG), seen_by(client)
         with running("echo", endpoint):
             answered(client, heard)
             wait_until(lambda: seen == [(ECHO, True)])
