@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from coopenv.estimation.observability import Trajectory
 from coopenv.runs.demo import FLEETS, Demo
 from tests.helpers.cars import write_fleet
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
+from tests.helpers.wire import free_endpoint
 
 OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"
 RESULTS = {"metrics.json", "trajectory.npz", "errors.png", "trajectories_2d.png", "topology.png"}
@@ -37,17 +39,23 @@ def demo(folder: Path, port: int, *options: str) -> subprocess.Popen[str]:
     return start((*COOPENV, "svea", "demo", "--port", str(port), *options), folder)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("environment", FLEETS)
-def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) -> None:
+def driven_demo(folder: Path, *options: str) -> str:
+    """Return what a demo prints that the watchdog does not stop."""
     for _ in range(ATTEMPTS):
         port = free_port()
-        process = demo(tmp_path, port, "--environment", environment)
+        process = demo(folder, port, *options)
         printed, errors = process.communicate(timeout=4 * DEADLOCK)
         assert process.returncode == (STOPPED if "Stopped: " in printed else 0), errors
         assert not mentioning(f"127.0.0.1:{port}")
         if process.returncode == 0:
             break
+    return printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", FLEETS)
+def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) -> None:
+    printed = driven_demo(tmp_path, "--environment", environment)
     assert "RMSE" in printed and "vehicle_1: arrived at" in printed and "deadlines missed" in printed
     assert {path.name for path in (tmp_path / "out" / environment).iterdir()} > RESULTS
     driven = json.loads((tmp_path / "out" / environment / "metrics.json").read_text())
@@ -91,12 +99,7 @@ def test_an_interrupt_leaves_no_process_and_what_has_been_driven(moment: str, tm
 def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     mine.write_text(OVERTAKING.read_text())
-    for _ in range(ATTEMPTS):
-        process = demo(tmp_path, free_port(), "--fleet", "mine.toml", "--set", "horizon=3")
-        printed, errors = process.communicate(timeout=4 * DEADLOCK)
-        assert process.returncode == (STOPPED if "Stopped: " in printed else 0), errors
-        if process.returncode == 0:
-            break
+    printed = driven_demo(tmp_path, "--fleet", "mine.toml", "--set", "horizon=3")
     assert "horizon reached at 3 s" in printed
     assert (tmp_path / "out" / "mine" / "metrics.json").exists() and (tmp_path / "out" / "mine.mcap").exists()
     mine.write_text(mine.read_text().replace("fakes = true", ""))
@@ -121,20 +124,14 @@ def fleet_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable
 def test_cars_that_are_stopped_end_the_demo_with_a_status_of_its_own(
     fleet_of_my_own: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(pacer: Pacer) -> None:
+    decide, begun = Pacer.decide, list[int]()
+
+    def late_from_the_second_second_on(pacer: Pacer) -> None:
         decide(pacer)
-        pacer.in_a_row = 1000 * (pacer.now() - begun > 1e9)
+        begun.append(pacer.now())
+        pacer.in_a_row = 1000 * (begun[-1] - begun[0] > 1e9)
 
-    decide, begun = Pacer.decide, 0
-    start_pacer = Pacer.start
-
-    def started(pacer: Pacer) -> int:
-        nonlocal begun
-        begun = start_pacer(pacer)
-        return begun
-
-    monkeypatch.setattr(Pacer, "start", started)
-    monkeypatch.setattr(Pacer, "decide", stop)
+    monkeypatch.setattr(Pacer, "decide", late_from_the_second_second_on)
     result = CliRunner().invoke(app, fleet_of_my_own(""))
     assert result.exit_code == STOPPED, (result.output, result.exception)
     assert result.output.count("Stopped: ") == 1
@@ -223,14 +220,11 @@ PATIENT = "odometry_age = 2.0\nmissed_deadlines = 60\n"
 
 def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    router = open_zenoh("router", listen=[endpoint])
-    try:
+    endpoint = free_endpoint()
+    with closing(open_zenoh("router", listen=[endpoint])):
         command = ["svea", "run", str(OVERTAKING), "--connect", endpoint, "--steps", "3", "--no-figures"]
         result = CliRunner().invoke(app, [*command, "--steady-from", "0"])
         too_short = CliRunner().invoke(app, command)
-    finally:
-        router.close()
     assert isinstance(result.exception, CoopenvError)
     assert str(result.exception).startswith(f"nothing has come from svea7, svea1 by {endpoint}")
     assert str(too_short.exception).startswith("steady_from 2 is not within the run of ")
@@ -244,9 +238,8 @@ def test_a_car_that_is_killed_ends_the_run_with_a_status_of_its_own(tmp_path: Pa
         command = ("svea", "run", "mine.toml", "--connect", endpoint, "--arm", "--policy", "route_follower")
         station = start((*COOPENV, *command, "--record", "drive.mcap", "--no-figures"), tmp_path)
         wait_until(lambda: (tmp_path / "drive.mcap").exists() and (tmp_path / "drive.mcap").stat().st_size > 100_000)
-        here = open_zenoh("client", [endpoint])
-        here.publish(fault_topic("svea1"), encode(make("std_msgs/msg/String", data="kill@0")), reliable=True)
-        printed, errors = station.communicate(timeout=DEADLOCK)
-        here.close()
+        with closing(open_zenoh("client", [endpoint])) as here:
+            here.publish(fault_topic("svea1"), encode(make("std_msgs/msg/String", data="kill@0")), reliable=True)
+            printed, errors = station.communicate(timeout=DEADLOCK)
     assert station.returncode == STOPPED, errors
     assert "Stopped: svea1: " in printed and "ended before its time" in printed

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import socket
+from contextlib import closing
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import scenario_of
@@ -17,6 +18,7 @@ from coopenv.cars.profile import presence_of
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from tests.helpers.processes import ROOT, mentioning, wait_until
+from tests.helpers.wire import free_endpoint, seen_by
 
 FLEETS = sorted((ROOT / "examples" / "fleet").glob("*.toml"))
 OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"
@@ -45,49 +47,35 @@ def test_an_endpoint_takes_the_place_of_the_files() -> None:
         load_deployment(OVERTAKING, "nonsense")
 
 
+def health(file: Path, endpoint: str = "", *options: str) -> Result:
+    connect = ("--connect", endpoint) if endpoint else ()
+    return CliRunner().invoke(app, ["svea", "health", str(file), "--car", "svea7", *connect, *options])
+
+
 def test_cars_come_and_go() -> None:
     with pytest.raises(ZeroDivisionError), fakes(OVERTAKING) as endpoint:
-        here, there = open_zenoh("client", [endpoint]), set()
-        try:
-            here.watch(presence_of("*"), lambda key, present: (there.add if present else there.discard)(key))
-            wait_until(lambda: there == {presence_of("svea7"), presence_of("svea1")})
+        with closing(open_zenoh("client", [endpoint])) as here:
+            seen = seen_by(here)
+            wait_until(lambda: set(seen) == {(presence_of("svea7"), True), (presence_of("svea1"), True)})
             assert len(mentioning(endpoint)) == 3
-            command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--car"]
-            said = CliRunner().invoke(app, [*command, "svea7"])
-            assert said.output == "svea7: gate disarmed, 0 commands accepted, 0 messages refused\n"
-        finally:
-            here.close()
+            assert health(OVERTAKING, endpoint).output == (
+                "svea7: gate disarmed, 0 commands accepted, 0 messages refused\n"
+            )
         raise ZeroDivisionError
     assert not mentioning(endpoint)
 
 
-def test_a_gate_that_is_not_there_is_not_well() -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    router = open_zenoh("router", listen=[endpoint])
-    try:
-        command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--patience", "0.2", "--car"]
-        found = CliRunner().invoke(app, [*command, "svea7"])
-        assert isinstance(found.exception, CoopenvError)
-        assert "svea7: no message of its gate for 0.2 s on fleet/svea7/coopenv/gate" in str(found.exception)
-    finally:
-        router.close()
-
-
 def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Path) -> None:
-    endpoint, file = f"tcp/127.0.0.1:{free_port()}", tmp_path / "fleet.toml"
+    endpoint, file = free_endpoint(), tmp_path / "fleet.toml"
     text = OVERTAKING.read_text().replace("tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447")
     file.write_text(f'{text}\n[gate]\nconnect = ["{endpoint}"]\n')
-    router = open_zenoh("router", listen=[endpoint])
-    try:
-        command = ["svea", "health", str(file), "--patience", "0.2", "--car", "svea7"]
-        found = CliRunner().invoke(app, command)
-        assert "svea7: no message of its gate" in str(found.exception)  # so it has got there
-    finally:
-        router.close()
+    with closing(open_zenoh("router", listen=[endpoint])):
+        absent = "svea7: no message of its gate for 0.2 s on fleet/svea7/coopenv/gate"
+        assert str(health(file, "", "--patience", "0.2").exception) == absent  # so it has got there
+        assert str(health(OVERTAKING, endpoint, "--patience", "0.2").exception) == absent
     for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):
-        refused = CliRunner().invoke(app, [*command, "--connect", there])
-        assert str(refused.exception).startswith(f"{there}: is not on this computer")
-    tried = CliRunner().invoke(app, [*command, "--connect", "tcp/nowhere.invalid:7447", "--off-board"])
+        assert str(health(file, there).exception).startswith(f"{there}: is not on this computer")
+    tried = health(file, "tcp/nowhere.invalid:7447", "--off-board")
     assert str(tried.exception).startswith("tcp/nowhere.invalid:7447: no Zenoh there")
 
 

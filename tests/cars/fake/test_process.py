@@ -148,22 +148,11 @@ def test_as_a_process_over_zenoh(fleet: Path, tmp_path: Path) -> None:
             process.communicate()
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--car", "svea7", "--fault", "melt"), "unknown fault 'melt'"),
-        (("--car", "svea9"), "unknown car 'svea9'"),
-    ],
-)
-def test_what_does_not_fit_is_one_line(fleet: Path, options: tuple[str, ...], said: str) -> None:
-    hub = Hub()
-    if "--fault" not in options:
-        with pytest.raises(CoopenvError, match=said):
-            open_fake(fleet, options[1], hub.connect())
-        return
-    result = CliRunner().invoke(app, ["svea", "fake", str(fleet), *options])
-    assert isinstance(result.exception, CoopenvError)
-    assert said in str(result.exception)
+def test_what_does_not_fit_is_one_line(fleet: Path) -> None:
+    with pytest.raises(CoopenvError, match="unknown car 'svea9'"):
+        open_fake(fleet, "svea9", Hub().connect())
+    result = CliRunner().invoke(app, ["svea", "fake", str(fleet), "--car", "svea7", "--fault", "melt"])
+    assert isinstance(result.exception, CoopenvError) and "unknown fault 'melt'" in str(result.exception)
 
 
 def test_a_gate_obeys_whom_it_is_told_to(fleet: Path) -> None:

@@ -167,20 +167,6 @@ def test_a_subject_is_the_topic_with_dots() -> None:
     assert subject_of("agent7/riccatiPoint") == "agent7.riccatiPoint"
 
 
-@pytest.mark.parametrize(
-    ("pattern", "subjects"),
-    [
-        ("agent7/riccatiPoint", ("agent7.riccatiPoint",)),
-        ("fleet/*/x", ("fleet.*.x",)),
-        ("fleet/a/**", ("fleet.a", "fleet.a.>")),
-        ("fleet/**/x", ("fleet", "fleet.>")),
-        ("**", (">",)),
-    ],
-)
-def test_patterns_as_subjects(pattern: str, subjects: tuple[str, ...]) -> None:
-    assert subjects_of(pattern) == subjects
-
-
 def covers(subject: str, topic: str) -> bool:
     """Say what a NATS server delivers: `*` is a token, `>` at the end one or more."""
     wanted, tokens = subject.split("."), topic.split("/")
