@@ -8,7 +8,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.sections import Section, read_toml, validated
@@ -187,14 +187,7 @@ class Channel(Section):
     full: Positive
     """Steering angle (rad, left is positive) or speed (m/s) at full."""
     change: Number
-    """Change of the field from neutral to full."""
-
-    @field_validator("change")
-    @classmethod
-    def _is_not_zero(cls, change: float) -> float:
-        if change == 0.0:
-            raise ValueError("must not be 0")
-        return change
+    """Change of the field from neutral to full; not 0."""
 
 
 FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
@@ -215,10 +208,12 @@ class CommandMessage(Section):
     """Time without a message after which the car goes to neutral by itself, s (assumed by fake cars)."""
 
     @model_validator(mode="after")
-    def _channels_have_fields(self) -> Self:
+    def _channels_move_fields(self) -> Self:
         for name, channel in (("steering", self.steering), ("speed", self.speed)):
             if not self.neutral.get(channel.field, ("", 0.0))[0].startswith("float"):
                 raise ValueError(f"{name}.field: {shown(channel.field)} is no float32 or float64 of neutral")
+            if channel.change == 0.0:
+                raise ValueError(f"{name}.change: must not be 0")
         return self
 
     def share(self, channel: Channel, value: float) -> float:

@@ -305,19 +305,17 @@ def run(given: RunOptions) -> None:
     if given.arm and backend.deployment.security.keys is None and not backend.deployment.fakes:
         print("warning: without security.keys any station on the network can drive these cars", file=sys.stderr)
     also_kept(partial(kept_drive, given.record, backend))
-    try:
-        wishes = {"arm": given.arm, "release": given.release}
+    wishes = {"arm": given.arm, "release": given.release}
+    name, folder = given.config.stem, given.out or Path("out") / given.config.stem
+    figures, watched = None if given.no_figures else "png", partial(links_line, backend)
+    with closing(backend):
         rollout = Rollout(
             backend.scenario, given.seed, given.steps, policy=given.policy, backend=backend, options=wishes
         )
-        folder = given.out or Path("out") / given.config.stem
-        figures = None if given.no_figures else "png"
-        watched = partial(links_line, backend)
-        result = execute(given.config.stem, rollout, folder, log, changes, given.steady_from, figures, False, watched)
-    except NoTruthError:
-        raise CoopenvError(truth_report(backend)) from None
-    finally:
-        backend.close()
+        try:
+            result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched)
+        except NoTruthError:
+            raise CoopenvError(truth_report(backend)) from None
     if given.as_json:
         options.print_json(result)
     else:

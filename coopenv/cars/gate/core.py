@@ -153,11 +153,7 @@ class Reason(StrEnum):
 
 
 class Rejected(Exception):  # noqa: N818
-    """A message is not accepted."""
-
-    def __init__(self, reason: Reason) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """A message is not accepted; its argument is the reason."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +229,7 @@ class Gate:
         except Malformed:
             reason = Reason.MALFORMED
         except Rejected as rejected:
-            reason = rejected.reason
+            [reason] = rejected.args
         else:
             return None
         self._counts[reason] += 1

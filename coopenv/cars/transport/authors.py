@@ -115,8 +115,7 @@ class Authors:
         self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
         self._routes = {route.topic: route for route in routes}
         self._names = {route.name for route in self._routes.values()}
-        warmed = {(route.ours, route.theirs): route for route in self._routes.values()}
-        for route in warmed.values():
+        for route in {(route.ours, route.theirs): route for route in self._routes.values()}.values():
             route.warm_up()
 
     def publish(

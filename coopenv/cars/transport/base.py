@@ -10,6 +10,7 @@ import time
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -212,31 +213,25 @@ def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float)
         return None
     try:
         with socket.create_connection((address.host, address.port), timeout) as plain:
-            return _tls_trouble(plain, address.host, context) if address.protocol == "tls" and context else None
+            if address.protocol == "tls" and context is not None:
+                with context.wrap_socket(plain, server_hostname=address.host) as secured, suppress(TimeoutError):
+                    secured.settimeout(0.2)
+                    secured.recv(1)  # a peer asks for our certificate, or refuses it, only now
     except TimeoutError:
         return "no answer"
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate is refused: {error.verify_message}"
+    except ssl.SSLError as error:
+        return f"TLS: {(error.reason or str(error)).replace('_', ' ').lower()}"
     except OSError as error:
         return error.strerror or str(error)
+    return None
 
 
 def first_trouble(endpoints: Sequence[str], context: ssl.SSLContext | None, otherwise: str) -> str:
     """Return why a connection to the first of the endpoints with a trouble fails, or else what a library says."""
     troubles = (trouble_at(address_of(endpoint), context, 1.0) for endpoint in endpoints)
     return next(filter(None, troubles), otherwise)
-
-
-def _tls_trouble(plain: socket.socket, host: str, context: ssl.SSLContext) -> str | None:
-    try:
-        with context.wrap_socket(plain, server_hostname=host) as secured:
-            secured.settimeout(0.2)
-            secured.recv(1)  # a peer asks for our certificate, or refuses it, only now
-    except ssl.SSLCertVerificationError as error:
-        return f"its certificate is refused: {error.verify_message}"
-    except ssl.SSLError as error:
-        return f"TLS: {(error.reason or str(error)).replace('_', ' ').lower()}"
-    except TimeoutError:
-        pass
-    return None
 
 
 FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO

@@ -32,11 +32,6 @@ def subject_of(topic: str) -> str:
     return topic.replace("/", ".")
 
 
-def topic_of(subject: str) -> str:
-    """Return the topic of a name on the wire."""
-    return subject.replace(".", "/")
-
-
 def subjects_of(pattern: str) -> tuple[str, ...]:
     """Return subjects that hold at least what a pattern matches; NATS has no `**` but at the end, for one or more."""
     parts = pattern.split("/")
@@ -169,8 +164,8 @@ class Nats(HeartbeatTransport):
 
     def _listen(self, pattern: str, callback: Callback) -> None:
         async def arrive(message: Any) -> None:
-            topic, attachment = topic_of(message.subject), attachment_of(message.headers)
-            callback(Arrival(topic, message.data, time.time_ns(), attachment))
+            topic = message.subject.replace(".", "/")
+            callback(Arrival(topic, message.data, time.time_ns(), attachment_of(message.headers)))
 
         async def subscribe() -> None:
             for subject in subjects_of(pattern):
