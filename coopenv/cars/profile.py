@@ -187,7 +187,7 @@ class Channel(Section):
     full: Positive
     """Steering angle (rad, left is positive) or speed (m/s) at full."""
     change: Number
-    """Change of the field from neutral to full; not 0."""
+    """Change of the field from neutral to full."""
 
 
 FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import signal
-import threading
+import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +16,22 @@ from typer.testing import CliRunner
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.codec import decode, encode, make
-from coopenv.cars.fake.fleet import run
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import RESET_TOPIC, SVEA, Limits, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
-from tests.helpers.cars import open_fake
+from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
 from tests.helpers.hub import Hub
 from tests.helpers.processes import COOPENV, start, wait_until
-from tests.helpers.wire import free_port
+from tests.helpers.wire import free_endpoint
 
 LIMITS = Limits(speed=0.5, steering=0.5, acceleration=1.0, steering_rate=2.0)
-FLEET = """
-environment = "svea_overtaking"
-fakes = true
-cars = [{ name = "svea7", marker = 7 }, { name = "svea8", marker = 6 }]
-markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
-network = { connect = ["tcp/127.0.0.1:PORT"] }
-"""
 
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Path:
-    file = tmp_path / "fleet.toml"
-    file.write_text(FLEET.replace("PORT", str(free_port())))
-    return file
+    return write_fleet(tmp_path, f'{OVERTAKING}[network]\nconnect = ["{free_endpoint()}"]\n', safety="")
 
 
 class Ears:
@@ -78,20 +68,6 @@ def drive(gates: Gates, car: str, speed: float, until: Callable[[], bool]) -> No
     wait_until(driven)
 
 
-@contextmanager
-def threaded(fleet: Path, car: str, hub: Hub, **options: Any) -> Iterator[None]:
-    stop, transport = threading.Event(), hub.connect()
-    fake = open_fake(fleet, car, transport, **options)
-    thread = threading.Thread(target=run, args=(fake, stop))
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(10.0)
-        transport.close()
-
-
 def through_its_gate(transport: Transport, ears: Ears) -> None:
     """Arm, drive, and let the commands end: the car stands."""
     gates = Gates(transport, ("svea7",), LIMITS, None)
@@ -112,40 +88,37 @@ def through_its_gate(transport: Transport, ears: Ears) -> None:
 
 
 def test_in_a_thread_behind_its_gate(fleet: Path) -> None:
-    hub = Hub()
-    station = hub.connect()
-    ears = Ears(station, "svea7")
-    with threaded(fleet, "svea7", hub):
+    with fakes(fleet) as (hub, _):
+        station = hub.connect()
+        ears = Ears(station, "svea7")
         through_its_gate(station, ears)
     assert not ears.there
 
 
 def test_as_a_process_over_zenoh(fleet: Path, tmp_path: Path) -> None:
     endpoint = fleet.read_text().split('"')[-2]
-    router = start((*COOPENV, "svea", "router", "--listen", endpoint), tmp_path)
-    processes = [router]
-    try:
-        assert router.stdout is not None
-        assert endpoint in router.stdout.readline()
-        station = open_zenoh("client", [endpoint])
+    with ExitStack() as stack:
+
+        def launch(*command: str) -> tuple[subprocess.Popen[str], str]:
+            process = stack.enter_context(start((*COOPENV, "svea", *command), tmp_path))
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            return process, process.stdout.readline()
+
+        router, line = launch("router", "--listen", endpoint)
+        assert endpoint in line
+        station = stack.enter_context(closing(open_zenoh("client", [endpoint])))
         ears = Ears(station, "svea7")
-        car = start((*COOPENV, "svea", "fake", str(fleet), "--car", "svea7", "--seed", "2"), tmp_path)
-        processes.append(car)
-        assert car.stdout is not None
-        assert car.stdout.readline() == "svea7: fake ready\n"
+        car, line = launch("fake", str(fleet), "--car", "svea7", "--seed", "2")
+        assert line == "svea7: fake ready\n"
         through_its_gate(station, ears)
         asked = time.monotonic()
         car.send_signal(signal.SIGTERM)
         car.wait(20.0)
         assert time.monotonic() - asked < 5.0  # a second where nobody else computes
         wait_until(lambda: not ears.there)
-        station.close()
         router.send_signal(signal.SIGINT)
         router.wait(20.0)
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
 
 
 def test_what_does_not_fit_is_one_line(fleet: Path) -> None:
@@ -158,10 +131,9 @@ def test_what_does_not_fit_is_one_line(fleet: Path) -> None:
 def test_a_gate_obeys_whom_it_is_told_to(fleet: Path) -> None:
     fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
     keys = fleet.parent / "keys"
-    make_keys(keys, ["svea7", "svea8", "station"])
-    hub = Hub()
-    here, verifier = hub.connect(), load_verifier(keys)
-    with threaded(fleet, "svea7", hub, station="svea7"):
+    make_keys(keys, ["svea7", "svea1", "station"])
+    with fakes(fleet, station="svea7") as (hub, _):
+        here, verifier = hub.connect(), load_verifier(keys)
         own, other = (
             Gates(here, ("svea7",), LIMITS, load_signer(keys, name), verifier) for name in ("svea7", "station")
         )
@@ -173,7 +145,7 @@ def test_a_gate_obeys_whom_it_is_told_to(fleet: Path) -> None:
         assert own.states["svea7"].state == "armed"
         own.end()
     with pytest.raises(CoopenvError, match="no public key of 'svea9'"):
-        open_fake(fleet, "svea7", hub.connect(), station="svea9")
+        open_fake(fleet, "svea7", Hub().connect(), station="svea9")
 
 
 def test_keys_of_the_gate_are_needed_where_the_deployment_has_some(fleet: Path) -> None:
