@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from functools import cached_property
 
 import pytest
@@ -123,12 +124,11 @@ def test_who_does_not_answer_is_said() -> None:
 
 
 def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
-    router = open_zenoh("router", listen=[endpoint])
-    try:
-        with pytest.raises(LinkError, match=r"Address already in use"):
-            open_zenoh("router", listen=[endpoint])
-    finally:
-        router.close()
+    with (
+        closing(open_zenoh("router", listen=[endpoint])),
+        pytest.raises(LinkError, match=r"Address already in use"),
+    ):
+        open_zenoh("router", listen=[endpoint])
 
 
 @pytest.mark.parametrize("endpoint", ["127.0.0.1:7447", "tcp/127.0.0.1", "tls/127.0.0.1:7447"])
