@@ -108,20 +108,12 @@ class ObserverOptions:
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""
         from coopenv.bench.observers.comparison import Plan
+        from coopenv.bench.observers.sources import find_source
 
-        return Plan.of(
-            self.names,
-            self.source,
-            range(self.first, self.first + self.seeds),
-            variants=self.variants,
-            overrides=options.parse_overrides(self.overrides),
-            steady_from=self.steady_from,
-            windows=self.windows,
-            data=self.data,
-            topics=self.topics,
-            faults=self.faults or (),
-            policy=self.policy,
-        )
+        changes = options.parse_overrides(self.overrides)
+        source = find_source(self.source, changes, self.data, self.topics, self.faults or (), self.policy)
+        seeds = range(self.first, self.first + self.seeds)
+        return Plan.of(self.names, source, seeds, self.variants, self.steady_from, self.windows)
 
     def command_of(self, plan: "Plan") -> str:
         """Return the command line that gives the same tables again, with all names that a plan has chosen."""
@@ -142,7 +134,7 @@ OF_THE_OUTPUT = ("jobs", "engine", "address", "out", "figures", "width", "open_r
 def bench_observers(given: ObserverOptions) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import find_executor
-    from coopenv.bench.observers.command import REPORT_FILE, Request, perform
+    from coopenv.bench.observers.command import REPORT_FILE, perform
     from coopenv.bench.observers.convergence import check_source
     from coopenv.bench.observers.tables import WIDE
 
@@ -156,9 +148,9 @@ def bench_observers(given: ObserverOptions) -> None:
         if given.basin:
             check_source(plan.source)
         plan.source.check()
-    width = given.width and given.width.value
-    request = Request(plan, given.command_of(plan), given.basin, given.out, given.figures, width, given.as_json)
-    perform(request, find_executor(given.engine, given.jobs, given.address), printed, log)
+    executor, command = find_executor(given.engine, given.jobs, given.address), given.command_of(plan)
+    output = {"out": given.out, "figures": given.figures, "width": given.width and given.width.value}
+    perform(plan, command, executor, printed, log, basin=given.basin, as_json=given.as_json, **output)
     if given.open_report and given.out is not None:
         options.show(given.out / REPORT_FILE)
 

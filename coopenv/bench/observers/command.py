@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -34,63 +34,62 @@ JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.
 WINDOWS_FILE, LATEX_FILE = "windows.csv", "leaderboard.tex"
 
 
-class Request(NamedTuple):
-    """A comparison, and where its results go."""
-
-    plan: Plan
-    command: str
-    """The command line that gives the same table again."""
-    basin: int = 0
-    """Draws of initial estimates; 0: no study of basins."""
-    out: Path | None = None
-    """Folder of the files; None: no files."""
-    figures: str | None = None
-    """Format of figures as files of their own; None: figures are in the report alone."""
-    width: str | None = None
-    """Column of `coopenv.viz.figures` that these figures are drawn for; None: a page's."""
-    as_json: bool = False
-    """Whether the content of `leaderboard.json` is printed in place of the tables."""
-
-
-def perform(request: Request, executor: Executor, printed: Console, log: Console) -> None:
+def perform(
+    plan: Plan,
+    command: str,
+    executor: Executor,
+    printed: Console,
+    log: Console,
+    *,
+    basin: int = 0,
+    out: Path | None = None,
+    figures: str | None = None,
+    width: str | None = None,
+    as_json: bool = False,
+) -> None:
     """Compare, print the tables (or JSON) and write the files.
+
+    Args:
+        plan: what is compared.
+        command: the command line that gives the same table again.
+        executor: where the observers run.
+        printed: console of the tables.
+        log: console of the progress.
+        basin: draws of initial estimates; 0: no study of basins.
+        out: folder of the files; None: no files.
+        figures: format of figures as files of their own; None: figures are in the report alone.
+        width: column of `coopenv.viz.figures` that these figures are drawn for; None: a page's.
+        as_json: whether the content of `leaderboard.json` is printed in place of the tables.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    plan, out, found = request.plan, request.out, None
-    wanted = figure_files(plan.variants, request.figures)
+    found, wanted = None, figure_files(plan.variants, figures)
     if wanted and out is None:
-        raise CoopenvError(f"--figures {request.figures}: figures need a folder, --out DIR")
+        raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
     names = [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
-    try:
-        with nullcontext() if out is None else replacing_folder(out, names) as folder:
-            found = _compare(request, executor, log)
-            if folder is not None:
-                write_files(found, request.command, folder, wanted, request.width)
-                names = sorted(path.name for path in folder.iterdir())
-    finally:  # hours of work are printed even if they cannot be written
-        if found is not None and request.as_json:
-            sys.stdout.write(json_text(document(found, request.command)))
-        elif found is not None:
-            printed.print(found)
-    if out is not None and not request.as_json:
-        printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
-
-
-def _compare(request: Request, executor: Executor, log: Console) -> Comparison:
-    plan = request.plan
     for name, reason in plan.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
-    with Progress(log, plan.work, total=1.0) as progress:
-        comparison = plan.run(executor, progress.update)
-    if not request.basin:
-        return comparison
-    work = f"{len(plan.observers)} observers, {request.basin} initial estimates"
-    with Progress(log, work, total=1.0) as progress:
-        draws = study_basin(plan.source, plan.observers, request.basin, executor, progress.update)
-    return replace(comparison, draws=draws)
+    try:
+        with nullcontext() if out is None else replacing_folder(out, names) as folder:
+            with Progress(log, plan.work, total=1.0) as progress:
+                found = plan.run(executor, progress.update)
+            if basin:
+                work = f"{len(plan.observers)} observers, {basin} initial estimates"
+                with Progress(log, work, total=1.0) as progress:
+                    draws = study_basin(plan.source, plan.observers, basin, executor, progress.update)
+                found = replace(found, draws=draws)
+            if folder is not None:
+                write_files(found, command, folder, wanted, width)
+                names = sorted(path.name for path in folder.iterdir())
+    finally:  # hours of work are printed even if they cannot be written
+        if found is not None and as_json:
+            sys.stdout.write(json_text(document(found, command)))
+        elif found is not None:
+            printed.print(found)
+    if out is not None and not as_json:
+        printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
 
 def document(board: Leaderboard, command: str) -> dict[str, Any]:
@@ -107,13 +106,9 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
         return {}
     if form not in FORMATS:
         raise CoopenvError(f"--figures {form}: known are {', '.join(FORMATS)}")
-    drawn = {f"{kind}-{_as_file(v)}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
+    stems = {v: re.sub(r"[^A-Za-z0-9._+=-]", "_", v) for v in variants}  # which any system takes as a file's name
+    drawn = {f"{kind}-{stem}.{form}": (kind, v) for v, stem in stems.items() for kind in ("errors", "consistency")}
     return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
-
-
-def _as_file(variant: str) -> str:
-    """Return a variant's name as part of a file's name on any system."""
-    return re.sub(r"[^A-Za-z0-9._+=-]", "_", variant)
 
 
 def write_files(
@@ -160,19 +155,15 @@ def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
         "columns": [f.name for f in fields(Row) if f.name not in ("environment", "failure")],
         "definitions": {f.name: f.metadata["meaning"] for f in fields(Row)},
     }
-    template = _environment(board).get_template("report.html.j2")
-    text = template.render(values, with_rows=True)
-    return text if len(text.encode()) < MOST_BYTES else template.render(values, with_rows=False)
-
-
-def _environment(board: Leaderboard) -> Environment:
     environment = Environment(
         loader=PackageLoader("coopenv.bench.observers", "page"), autoescape=True, undefined=StrictUndefined
     )
     environment.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
     environment.globals["spread"] = spread
     environment.filters["append"] = lambda text, more: text + more
-    return environment
+    template = environment.get_template("report.html.j2")
+    text = template.render(values, with_rows=True)
+    return text if len(text.encode()) < MOST_BYTES else template.render(values, with_rows=False)
 
 
 def _variant(board: Leaderboard, name: str) -> dict[str, Any]:

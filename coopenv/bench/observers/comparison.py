@@ -63,10 +63,7 @@ class Comparison(Leaderboard):
         Raises:
             OutputError: the file cannot be written.
         """
-        text = tables.csv_text(self.rows)
-        if path is not None:
-            replace_text(path, text)
-        return text
+        return _written(tables.csv_text(self.rows), path)
 
     def to_latex(self, path: str | Path | None = None, variant: str | None = None) -> str:
         """Return the position RMSE with standard errors as a LaTeX table (package booktabs); write it to a path.
@@ -78,10 +75,7 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: the variant was not run, or the file cannot be written.
         """
-        text = tables.latex(self, self._checked(variant))
-        if path is not None:
-            replace_text(path, text)
-        return text
+        return _written(tables.latex(self, self._checked(variant)), path)
 
     def figure(
         self,
@@ -117,13 +111,10 @@ class Comparison(Leaderboard):
         if isinstance(width, str):
             figures.restyle(drawn, width)
         if path is not None:
-            save(drawn, Path(path), format or "", about=self._about(variant))
+            about = {"environment": self.environment, "observers": ", ".join(self.observers)}
+            about |= {"variant": variant or "all", "seeds": ", ".join(map(str, self.seeds))}
+            save(drawn, Path(path), format or "", about=about)
         return drawn
-
-    def _about(self, variant: str | None) -> dict[str, object]:
-        """Return the metadata of files of figures."""
-        about = {"environment": self.environment, "observers": ", ".join(self.observers), "variant": variant or "all"}
-        return {**about, "seeds": ", ".join(map(str, self.seeds))}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         return tables.everything(self, options.max_width)
@@ -139,6 +130,13 @@ class Comparison(Leaderboard):
         if variant not in self.variants:
             raise CoopenvError(f"variant '{variant}' was not run; there are {', '.join(self.variants)}")
         return variant
+
+
+def _written(text: str, path: str | Path | None) -> str:
+    """Return a text, which is also written where a path is given."""
+    if path is not None:
+        replace_text(path, text)
+    return text
 
 
 def compare(
@@ -179,19 +177,8 @@ def compare(
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
-    plan = Plan.of(
-        observers,
-        environment,
-        seeds,
-        variants=variants,
-        overrides=overrides,
-        steady_from=steady_from,
-        windows=windows,
-        data=data,
-        topics=topics,
-        faults=faults,
-        policy=policy,
-    )
+    source = find_source(environment, overrides, data, topics, faults, policy)
+    plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
         return plan.run(Local(jobs), progress.update)
@@ -216,35 +203,21 @@ class Plan:
     def of(
         cls,
         observers: Iterable[str | Factory] | None,
-        environment: str | Path,
+        source: Source,
         seeds: int | Iterable[int],
-        *,
         variants: str | Sequence[str] | None = None,
-        overrides: Mapping[str, Any] | None = None,
         steady_from: float | None = None,
         windows: Sequence[float] | str | None = None,
-        data: str | Path | None = None,
-        topics: str | Path | None = None,
-        faults: Sequence[str] = (),
-        policy: str | None = None,
     ) -> Plan:
-        """Return a checked plan; arguments and errors as for `compare`."""
-        if not isinstance(environment, str | Path):
-            kind = type(environment).__name__
-            raise CoopenvError(
-                f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}"
-            )
-        folder, bag_map = (None if path is None else Path(path) for path in (data, topics))
-        source = find_source(str(environment), overrides, folder, bag_map, faults, policy)
-        wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
-        names, chosen = _observers(observers, source), variants_of(source, wanted)
+        """Return a checked plan for a source; the other arguments, and errors, as for `compare`."""
+        names, chosen = _observers(observers, source), variants_of(source, variants)
         given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
         numbers = tuple(dict.fromkeys(map(checked_seed, given)))
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
         edges = checked_edges(windows) if windows is not None else () if source.planar else EDGES
         obstacles = {} if observers is not None else {name: obstacle(name) for name in observer_names()}
-        if wanted is not None and wanted.strip() == ALL:
+        if ALL in ([variants] if isinstance(variants, str) else variants or ()):
             obstacles |= {name: source.obstacle(name) for name in source.variants}
         left_out = {name: reason for name, reason in obstacles.items() if reason}
         return cls(source, names, chosen, numbers, steady_from, edges, left_out)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -364,9 +364,8 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
     return replace(variant, scenario=load_scenario(text, {**overrides, **found})) if found else variant
 
 
-def check_vehicles(fault: Fault, names: Iterable[str]) -> None:
+def check_vehicles(fault: Fault, known: Collection[str]) -> None:
     """Refuse unknown vehicles. Raises CoopenvError: it names the known ones."""
-    known = list(names)
     for name in fault.vehicles:
         if name not in known:
             raise CoopenvError(
@@ -374,12 +373,12 @@ def check_vehicles(fault: Fault, names: Iterable[str]) -> None:
             )
 
 
-def check_recorded(variant: FaultVariant, recording: Recording) -> None:
-    """Refuse faults that a finished record cannot have. Raises CoopenvError."""
+def check_recorded(variant: FaultVariant, vehicles: Collection[str]) -> None:
+    """Refuse faults that a finished record of these vehicles cannot have. Raises CoopenvError."""
     for fault in variant.faults:
         if isinstance(FAULTS[fault.name], WorldFault):
             raise CoopenvError(f"fault {fault.text}: is of a simulated world, this one is recorded")
-        check_vehicles(fault, [setup.name for setup in recording.setups])
+        check_vehicles(fault, vehicles)
 
 
 def changed(recording: Recording, **arrays: Any) -> Recording:

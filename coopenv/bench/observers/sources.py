@@ -6,8 +6,9 @@ A source is small and picklable, so that a worker process makes the record itsel
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,11 +26,18 @@ from coopenv.bench.observers.faults import (
     variant_of,
     with_world,
 )
-from coopenv.estimation.metrics import STEADY_SHARE, steady_start
+from coopenv.estimation.metrics import steady_start
 from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
+
+already_warned = partial(warnings.catch_warnings, action="ignore", category=DataWarning)
+"""Silences the warnings on recorded data that `Source.check` has given."""
+
+
+def _is_planar(recording: Recording) -> bool:
+    return all(setup.planar for setup in recording.setups)
 
 
 @dataclass(frozen=True)
@@ -60,25 +68,31 @@ class Source(ABC):
         known = VARIANTS | {made.name: made for made in self.added}
         return known.get(variant, FaultVariant(variant))
 
-    @property
-    def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane; observers suit either these or vehicles in space."""
-        return False
+    @abstractmethod
+    def world(self) -> Recording | Scenario:
+        """Return the vehicles of all variants, and the targets that each of them may measure."""
 
     @abstractmethod
     def recording(self, variant: str, seed: int) -> Recording:
         """Return a record with the faults of a variant."""
 
-    def followed(self) -> bool:
-        """Return whether a vehicle has another one as its neighbour, so that one can lie to another."""
-        return True
+    @property
+    def planar(self) -> bool:
+        """Whether its vehicles are robots on a plane; observers suit either these or vehicles in space."""
+        world = self.world()
+        return isinstance(world, Recording) and _is_planar(world)
 
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""
-        return NO_FOLLOWERS if self.fault(variant).needs_followers and not self.followed() else ""
+        alone = self.fault(variant).needs_followers and not leaders_of(self.world())
+        return NO_FOLLOWERS if alone else ""
 
-    def check(self) -> None:  # noqa: B027
+    def check(self) -> None:
         """Look at recorded data, so that errors and warnings come before the work."""
+        world = self.world()
+        names = world.vehicle_names if isinstance(world, Scenario) else [setup.name for setup in world.setups]
+        for variant in self.added:
+            check_recorded(variant, names)
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s; without a record only what is asked for is checked.
@@ -88,13 +102,11 @@ class Source(ABC):
         Raises:
             CoopenvError: what was asked for does not lie within the record.
         """
-        if given is not None:
-            if not 0.0 <= given < math.inf:
-                raise CoopenvError(f"start of the steady state at {given:g} s: not within the run")
-            return given if recording is None else steady_start(given, float(recording.t[-1]))
-        if recording is None or _is_planar(recording):
-            return 0.0
-        return STEADY_SHARE * float(recording.t[-1])
+        if given is not None and not 0.0 <= given < math.inf:
+            raise CoopenvError(f"start of the steady state at {given:g} s: not within the run")
+        if recording is None or (given is None and _is_planar(recording)):
+            return given or 0.0
+        return steady_start(given, float(recording.t[-1]))
 
 
 @dataclass(frozen=True)
@@ -106,14 +118,17 @@ class Simulated(Source):
     """Policy of the driven vehicles, as for `coopenv.runs.recorder.record`."""
     seeded: ClassVar[bool] = True
 
+    def world(self) -> Scenario:
+        """Return the scenario."""
+        return self.scenario
+
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the world of a seed with a fault."""
         fault = self.fault(variant)
         return fault.applied(record(fault.scenario or self.scenario, seed, self.policy), seed)
 
-    def followed(self) -> bool:
-        """Return whether a vehicle has another one as its neighbour."""
-        return bool(leaders_of(self.scenario))
+    def check(self) -> None:
+        """Nothing is recorded, and faults have become keys of the scenario."""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
@@ -139,15 +154,14 @@ class Robots(Source):
         """Its robots drive on a plane."""
         return True
 
-    def recording(self, variant: str, seed: int) -> Recording:
+    def world(self) -> Recording:
         """Return the robots' record."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # `check` has warned
-            return open_recording(self.name, self.data, variant)
+        return open_recording(self.name, self.data)
 
-    def check(self) -> None:
-        """Read the data once."""
-        open_recording(self.name, self.data)
+    def recording(self, variant: str, seed: int) -> Recording:
+        """Return the robots' record in a variant."""
+        with already_warned():
+            return open_recording(self.name, self.data, variant)
 
 
 @dataclass(frozen=True)
@@ -156,29 +170,18 @@ class LogFile(Source):
 
     path: Path
 
-    @property
-    def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane."""
-        return _is_planar(open_recording(self.path))
+    def world(self) -> Recording:
+        """Return the file's record."""
+        return open_recording(self.path)
 
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the file's record with a fault."""
-        recording = open_recording(self.path)
+        recording = self.world()
         if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
-            again = record(
-                open_backend(self.path, None, {}), seed
-            )  # messages are not recorded: the same is drawn again
+            # Messages are not recorded: the same are drawn again.
+            again = record(open_backend(self.path, None, {}), seed)
             recording = replace(recording, interference=again.interference)
         return self.fault(variant).applied(recording, seed)
-
-    def followed(self) -> bool:
-        """Return whether a vehicle has another one as its neighbour."""
-        return bool(leaders_of(open_recording(self.path)))
-
-    def check(self) -> None:
-        """Read the file once."""
-        for variant in self.added:
-            check_recorded(variant, open_recording(self.path))
 
 
 @dataclass(frozen=True)
@@ -190,39 +193,27 @@ class Bags(Source):
     overrides: Mapping[str, Any]
     seeded: ClassVar[bool] = True
 
+    def world(self) -> Scenario:
+        """Return the scenario that the bag is read into."""
+        return self._backend().scenario
+
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the bag as a record, with a fault."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # `check` has warned
-            recording = record(self._backend(), seed)
-        for made in self.added:
-            check_recorded(made, recording)
-        return self.fault(variant).applied(recording, seed)
-
-    def followed(self) -> bool:
-        """Return whether a vehicle has another one as its neighbour."""
-        return bool(leaders_of(self._backend().scenario))
-
-    def check(self) -> None:
-        """Read the bag once."""
-        self._backend()
+        with already_warned():
+            return self.fault(variant).applied(record(self._backend(), seed), seed)
 
     def _backend(self) -> Backend:
         return open_backend(self.path, None, self.overrides, topics=self.topics)
-
-
-def _is_planar(recording: Recording) -> bool:
-    return all(setup.planar for setup in recording.setups)
 
 
 ALL = "all"  # asks for every variant that the source can have
 
 
 def find_source(
-    text: str,
+    text: str | Path,
     overrides: Mapping[str, Any] | None = None,
-    data: Path | None = None,
-    topics: Path | None = None,
+    data: str | Path | None = None,
+    topics: str | Path | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
 ) -> Source:
@@ -239,48 +230,51 @@ def find_source(
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    kind, added = kind_of(text), tuple(variant_of(text) for text in dict.fromkeys(faults))
-    bag, name = is_bag(text, topics), Path(text).stem
-    if kind is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
+    if not isinstance(text, str | Path):
+        kind = type(text).__name__
+        raise CoopenvError(f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}")
+    sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(faults))
+    bag, path = is_bag(text, topics), Path(text)
+    if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
         scenario = load_scenario(text, overrides)
         worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
         if policy is not None:
             if not scenario.driven:
                 raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
             load_policy(policy, scenario, 0)
-        return Simulated(name, scenario, policy or "zero", added=worlds)
-    if policy is not None:
-        raise CoopenvError(f"--policy {policy}: {text} is recorded, its vehicles cannot be driven")
-    if faults and kind is SourceKind.DATASET:
-        raise CoopenvError(
-            f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"
-        )
-    if data is not None and kind is not SourceKind.DATASET:
-        raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
+        return Simulated(path.stem, scenario, policy or "zero", added=worlds)
+    robots = sort is SourceKind.DATASET
+    refused = {
+        f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
+        f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(Robots.named)}": (
+            robots and faults
+        ),
+        f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not robots,
+        f"--map {topics}: is for ROS bags, {text} is none": topics and not bag,
+        f"--set {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
+            overrides and not bag
+        ),
+        f"no such log file: {text}": not (bag or robots or path.is_file()),
+    }
+    for reason, holds in refused.items():
+        if holds:
+            raise CoopenvError(reason)
     if bag:
-        return Bags(name, Path(text), topics, dict(overrides or {}), added=added)
-    if topics is not None:
-        raise CoopenvError(f"--map {topics}: is for ROS bags, {text} is none")
-    if overrides:
-        raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
-    if kind is SourceKind.DATASET:
-        return Robots(text, data)
-    if not Path(text).is_file():
-        raise CoopenvError(f"no such log file: {text}")
-    return LogFile(name, Path(text), added=added)
+        return Bags(path.stem, path, topics and Path(topics), dict(overrides or {}), added=added)
+    return Robots(str(text), data and Path(data)) if robots else LogFile(path.stem, path, added=added)
 
 
-def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
-    """Return the variants to run: names with commas between, `all` that there can be, or None for the usual ones.
+def variants_of(source: Source, asked: str | Iterable[str] | None) -> tuple[str, ...]:
+    """Return the variants to run: names (a text has commas between), `all` that there can be, or None for the usual.
 
     Raises:
         CoopenvError: there is none of that name, or the source cannot have it.
     """
-    added = [variant.name for variant in source.added]
-    names = [*source.usual] if asked is None else [name.strip() for name in asked.split(",")]
+    given = source.usual if asked is None else asked.split(",") if isinstance(asked, str) else asked
+    names = [name.strip() for name in given]
     if names == [ALL]:
         return tuple(name for name in source.variants if not source.obstacle(name))
-    names = list(dict.fromkeys([*names, *added]))
+    names = list(dict.fromkeys([*names, *(variant.name for variant in source.added)]))
     for name in names:
         if name not in source.variants:
             known = ", ".join((*source.variants, ALL))
