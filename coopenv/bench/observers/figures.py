@@ -53,6 +53,18 @@ _FRAME = 1.15  # inches above and below the panels
 _DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
 
 
+def _curves(samples: Sequence[Sample]) -> dict[str, Array]:
+    """Return (S, N) medians over the seeds of errors and claims, m, and the mean NEES over its dimension."""
+    error, std, nees = (np.array(values) for values in zip(*(sample.series for sample in samples), strict=True))
+    mean = np.mean(nees, axis=0) / samples[0].nees_dof
+    return {"error": np.median(error, axis=0), "std": 3.0 * np.median(std, axis=0), "nees": mean}
+
+
+def _bound(samples: Sequence[Sample]) -> Array:
+    """Return (S, N) the joint bound over the seeds, m."""
+    return np.asarray(np.sqrt(np.mean([sample.scene.bound**2 for sample in samples], axis=0)))
+
+
 def error_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
     """Draw position errors against time, a row per observer, a column per vehicle; None where every observer failed.
 
@@ -66,15 +78,14 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
     shown = _chosen(len(scene.vehicles), style.fitting(inches, 1.6, MOST_VEHICLES))
     axes = figure.subplots(len(groups), len(shown), squeeze=False)
     for (name, own), line in zip(groups.items(), axes, strict=True):
-        error = np.median([sample.series.position_error for sample in own], axis=0)
-        claimed = 3.0 * np.median([sample.series.position_std for sample in own], axis=0)
-        bound = np.sqrt(np.mean([sample.scene.bound**2 for sample in own], axis=0))
+        curves, bound = _curves(own), _bound(own)
+        looks = (curves["std"], VERMILION, _DASHED, 1.0), (bound, GREY, "-", 1.0), (curves["error"], BLUE, "-", 0.9)
         for ax, i in zip(line, shown, strict=True):
             style.tidy(ax)
             ax.set_yscale("log")
-            ax.plot(scene.t, style.drawable(claimed[:, i], positive=True), color=VERMILION, linestyle=_DASHED, lw=1.0)
-            ax.plot(scene.t, style.drawable(bound[:, i], positive=True), color=GREY, lw=1.0)
-            ax.plot(scene.t, style.drawable(error[:, i], positive=True), color=BLUE, lw=0.9)
+            for values, colour, dashes, width_pt in looks:
+                drawn = style.drawable(values[:, i], positive=True)
+                ax.plot(scene.t, drawn, color=colour, linestyle=dashes, lw=width_pt)
             if scene.steady_from > 0.0:
                 ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
         line[0].set_ylabel(short_name(name), rotation=0, ha="right", va="center", labelpad=4, **style.TEXT)
@@ -116,7 +127,7 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         style.tidy(ax)
         ax.axhspan(*mean_bounds(dof, runs), color=SHADE, zorder=0)
         ax.axhline(1.0, color=GREY, linewidth=0.7)
-        mean = np.mean([sample.series.nees for sample in own], axis=0) / dof
+        mean = _curves(own)["nees"]
         for i in shown:
             values = np.clip(style.drawable(mean[:, i], positive=True), *NEES_RANGE)
             ax.plot(scene.t, values, color=vehicle_colour(i), linewidth=0.8)
@@ -283,23 +294,16 @@ def _variant(board: Leaderboard, name: str, points: int) -> dict[str, Any]:
     samples = [sample for sample in board.samples if sample.variant == name]
     t = samples[0].scene.t
     keep = np.unique(np.linspace(0, len(t) - 1, min(len(t), points)).round().astype(int))
-    own = groups[next(iter(groups))] if groups else samples[:1]
-    bound = np.sqrt(np.mean([sample.scene.bound**2 for sample in own], axis=0))
+    bound = _bound(groups[next(iter(groups))] if groups else samples[:1])
     return {
         "name": name,
         "t": _short(t[keep]),
         "bound": [_short(column) for column in bound[keep].T],
-        "curves": {observer: _curves(chosen, keep) for observer, chosen in groups.items()},
+        "curves": {
+            observer: {kind: [_short(column) for column in values[keep].T] for kind, values in _curves(own).items()}
+            for observer, own in groups.items()
+        },
     }
-
-
-def _curves(samples: list[Sample], keep: Array) -> dict[str, list[list[float]]]:
-    """Return medians over the seeds of errors and claims, m, and mean NEES over its dimension, a list per vehicle."""
-    error = np.median([sample.series.position_error[keep] for sample in samples], axis=0)
-    std = 3.0 * np.median([sample.series.position_std[keep] for sample in samples], axis=0)
-    nees = np.mean([sample.series.nees[keep] for sample in samples], axis=0) / samples[0].nees_dof
-    columns = {"error": error, "std": std, "nees": nees}
-    return {name: [_short(column) for column in values.T] for name, values in columns.items()}
 
 
 def _cost(board: Leaderboard, variant: str) -> list[dict[str, Any]]:

@@ -35,6 +35,10 @@ class Measured(NamedTuple):
     value: float
     error: float
 
+    def over(self, known: float) -> "Measured":
+        """Return the ratio to a number that has no error; NaN where the number is none above 0."""
+        return Measured(self.value / known, self.error / known) if known > 0.0 else UNKNOWN
+
 
 UNKNOWN = Measured(math.nan, math.nan)
 NOWHERE = Interval(math.nan, math.nan)
@@ -146,6 +150,20 @@ class Row:
     gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
 
 
+ERRORS = {
+    "position_rmse_m": "position_rmse_se_m",
+    "orientation_rmse_deg": "orientation_rmse_se_deg",
+    "anees": "anees_se",
+    "ratio_to_bound": "ratio_to_bound_se",
+    "ratio_to_bound_ancestors": "ratio_to_bound_ancestors_se",
+    "degradation": "degradation_se",
+}
+"""Column to that of its standard error."""
+
+BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
+"""Column to its line in tables."""
+
+
 def row_of(environment: str, own: Sequence[Sample], nominal: Sequence[Sample], i: int, w: int = -1) -> Row:
     """Sum up samples of one observer in one variant over seeds, of vehicle `i` in window `w` (-1: the steady state).
 
@@ -159,11 +177,17 @@ def row_of(environment: str, own: Sequence[Sample], nominal: Sequence[Sample], i
     def root(name: str) -> float:
         return float(np.sqrt(np.mean(seeds(name) ** 2)))
 
-    position = total(own, nominal, slice(i, i + 1), w)
-    orientation = mean_root(seeds("orientation_mse")[:, None])
-    each, anees, dof = np.sqrt(seeds("position_mse")), seeds("anees"), seeds("nis_dof").sum()
+    position, anees, dof = total(own, nominal, slice(i, i + 1), w), seeds("anees"), seeds("nis_dof").sum()
     bounds = [float(np.sqrt(np.mean([sample.scene.bounds[kind, i, w] for sample in own]))) for kind in range(3)]
-    joint, family = ([figure / bound if bound > 0.0 else math.nan for figure in position.rmse] for bound in bounds[:2])
+    measured = {
+        "position_rmse_m": position.rmse,
+        "orientation_rmse_deg": mean_root(seeds("orientation_mse")[:, None]),
+        "anees": Measured(float(np.mean(anees)), standard_error(anees)),
+        "ratio_to_bound": position.rmse.over(bounds[0]),
+        "ratio_to_bound_ancestors": position.rmse.over(bounds[1]),
+        "degradation": position.degradation,
+    }
+    each = np.sqrt(seeds("position_mse"))
     honest = mean_bounds(own[0].nees_dof, len(own)) if np.isfinite(anees).all() else NOWHERE
     consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
     return Row(
@@ -171,26 +195,14 @@ def row_of(environment: str, own: Sequence[Sample], nominal: Sequence[Sample], i
         variant=own[0].variant,
         observer=own[0].observer,
         vehicle=own[0].scene.vehicles[i],
-        position_rmse_m=position.rmse.value,
-        position_rmse_se_m=position.rmse.error,
-        orientation_rmse_deg=orientation.value,
-        orientation_rmse_se_deg=orientation.error,
-        bound_m=bounds[0],
-        anees=float(np.mean(anees)),
-        anees_se=standard_error(anees),
+        **{column: figure.value for column, figure in measured.items()},
+        **{ERRORS[column]: figure.error for column, figure in measured.items()},
+        **dict(zip(BOUNDS, bounds, strict=True)),
         settled_fraction=float(np.mean(np.isfinite(seeds("settle_time")))),
         settle_time_s=_median(seeds("settle_time")),
         bytes_per_s=float(np.mean(seeds("bytes_per_s"))),
         us_per_update=_median(seeds("us_per_update")),
         failure=next((sample.failure for sample in own if sample.failure), ""),
-        bound_ancestors_m=bounds[1],
-        bound_single_m=bounds[2],
-        ratio_to_bound=joint[0],
-        ratio_to_bound_se=joint[1],
-        ratio_to_bound_ancestors=family[0],
-        ratio_to_bound_ancestors_se=family[1],
-        degradation=position.degradation.value,
-        degradation_se=position.degradation.error,
         position_rmse_median_m=float(np.quantile(each, 0.5)),
         position_rmse_p90_m=float(np.quantile(each, 0.9)),
         converged_fraction=float(np.mean(np.isfinite(seeds("converge_time")))),
@@ -248,15 +260,6 @@ def window_row_of(environment: str, own: Sequence[Sample], i: int, w: int) -> Wi
     return WindowRow(**{column.name: known[column.name] for column in fields(WindowRow)})
 
 
-ERRORS = {
-    "position_rmse_m": "position_rmse_se_m",
-    "ratio_to_bound": "ratio_to_bound_se",
-    "ratio_to_bound_ancestors": "ratio_to_bound_ancestors_se",
-    "anees": "anees_se",
-}
-"""Column to that of its standard error."""
-
-
 class Spread(NamedTuple):
     """A figure over all vehicles: its median, and the worst with its standard error and vehicle."""
 
@@ -276,10 +279,6 @@ def spread(rows: Sequence[Row] | Sequence[WindowRow], column: str) -> Spread:
     worst = rows[int(known[np.argmax(off)])]
     error = getattr(worst, ERRORS[column])
     return Spread(float(np.median(values[known])), float(getattr(worst, column)), float(error), worst.vehicle)
-
-
-BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
-"""Column to its line in tables."""
 
 
 @dataclass(frozen=True)
