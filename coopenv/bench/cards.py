@@ -4,11 +4,13 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
@@ -19,7 +21,6 @@ from coopenv.base.installation import version
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
-from coopenv.runs import page
 from coopenv.scenario import Scenario
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
@@ -39,22 +40,97 @@ class Entrant:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Results of drivers, by their names."""
+class Contest:
+    """Drivers, and the held-out worlds that each of them drives in."""
 
     environment: str
-    block: int
+    overrides: Mapping[str, Any]
+    """Dotted keys of the scenario."""
     entrants: tuple[Entrant, ...]
+    worlds: int
+    block: int
+    """Number of the block of held-out seeds."""
+
+    @classmethod
+    def of(
+        cls,
+        environment: str,
+        overrides: Mapping[str, Any],
+        agents: Sequence[str],
+        worlds: int,
+        block: int = 0,
+        ideal: bool = False,
+    ) -> "Contest":
+        """Build the drivers.
+
+        Args:
+            environment: name or TOML file.
+            overrides: dotted keys of the scenario.
+            agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
+            worlds: how many.
+            block: number of the block of held-out seeds.
+            ideal: let the baseline drive under ideal sensing, too.
+
+        Raises:
+            CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
+        """
+        scenario, name = open_simulation(environment, overrides), Path(environment).stem
+        if not scenario.driven:
+            raise CoopenvError(f"{environment}: all motion here is prescribed, there is nothing to drive")
+        found = [find_agent(text) for text in agents or agents_for(name)]
+        if not found:
+            raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
+        entrants = [Entrant(agent, agent.name, agent.kind, scenario, agent.policy(scenario)) for agent in found]
+        names = [entrant.name for entrant in entrants]
+        for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
+            raise CoopenvError(f"--agents: two are called '{twice}'")
+        if ideal:
+            agent, seeing = find_agent(BASELINE), open_simulation(environment, {**overrides, **IDEAL_SENSING})
+            entrants.append(Entrant(agent, IDEAL, "reference", seeing, agent.policy(seeing)))
+        return cls(name, overrides, tuple(entrants), worlds, block)
+
+    def drive(self, on_progress: Callable[[float, str], None] = lambda done, name: None) -> "Evaluation":
+        """Let every driver drive an episode in each of the same worlds.
+
+        `on_progress` is called with the number of drivers that are done, shares included, and the driver's name.
+        """
+        seeds, episodes, engines = held_out_seeds(self.block, self.worlds), dict[str, Episodes](), dict[int, Engine]()
+        with ExitStack() as stack:
+            for place, entrant in enumerate(self.entrants):
+                world = id(entrant.scenario)
+                if world not in engines:
+                    engines[world] = stack.enter_context(closing(Engine(entrant.scenario, self.worlds)))
+                    engines[world].load()
+
+                def report(share: float, place: int = place, name: str = entrant.name) -> None:
+                    on_progress(place + share, name)
+
+                episodes[entrant.name] = drive(engines[world], entrant.policy, seeds, report)
+        return Evaluation(**vars(self), episodes=episodes)
+
+
+@dataclass(frozen=True)
+class Evaluation(Contest):
+    """What drivers did, and their figures, by their names."""
+
     episodes: Mapping[str, Episodes]
-    results: Mapping[str, Sequence[Result]]
-    reference: str
-    """Driver that the differences are to."""
-    differences: Mapping[str, Sequence[Difference]]
+
+    @cached_property
+    def results(self) -> dict[str, list[Result]]:
+        """The figures of every driver."""
+        return {name: score(own, self.block) for name, own in self.episodes.items()}
 
     @property
-    def worlds(self) -> int:
-        """Number of worlds of every driver."""
-        return next(iter(self.episodes.values())).worlds
+    def reference(self) -> str:
+        """Driver that the differences are to."""
+        return BASELINE if BASELINE in self.episodes else self.entrants[0].name
+
+    @cached_property
+    def differences(self) -> dict[str, list[Difference]]:
+        """The differences of all other drivers to the reference."""
+        base, others = self.episodes[self.reference], {**self.episodes}
+        del others[self.reference]
+        return {name: compare_paired(own, base, self.block) for name, own in others.items()}
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one flat row per driver and metric."""
@@ -71,70 +147,6 @@ class Evaluation:
             for name, differences in self.differences.items()
             for difference in differences
         ]
-
-
-def enter(environment: str, overrides: Mapping[str, Any], agents: Sequence[str], ideal: bool = False) -> list[Entrant]:
-    """Return the drivers of an evaluation, built.
-
-    Args:
-        environment: name or TOML file.
-        overrides: dotted keys of the scenario.
-        agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
-        ideal: let the baseline drive under ideal sensing, too.
-
-    Raises:
-        CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
-    """
-    scenario, name = open_simulation(environment, overrides), Path(environment).stem
-    if not scenario.driven:
-        raise CoopenvError(f"{environment}: all motion here is prescribed, there is nothing to drive")
-    found = [find_agent(text) for text in agents or agents_for(name)]
-    if not found:
-        raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
-    entrants = [Entrant(agent, agent.name, agent.kind, scenario, agent.policy(scenario)) for agent in found]
-    names = [entrant.name for entrant in entrants]
-    for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
-        raise CoopenvError(f"--agents: two are called '{twice}'")
-    if ideal:
-        agent, seeing = find_agent(BASELINE), open_simulation(environment, {**overrides, **IDEAL_SENSING})
-        entrants.append(Entrant(agent, IDEAL, "reference", seeing, agent.policy(seeing)))
-    return entrants
-
-
-def contest(
-    environment: str,
-    entrants: Sequence[Entrant],
-    worlds: int,
-    block: int,
-    on_progress: Callable[[float, str], None] = lambda done, name: None,
-) -> Evaluation:
-    """Let every entrant drive an episode in each of the same worlds, and judge them.
-
-    Args:
-        environment: its name or TOML file.
-        entrants: those of one environment.
-        worlds: how many.
-        block: number of the block of held-out seeds.
-        on_progress: called with the number of drivers that are done, shares included, and the driver's name.
-    """
-    seeds, episodes, engines = held_out_seeds(block, worlds), dict[str, Episodes](), dict[int, Engine]()
-    with ExitStack() as stack:
-        for place, entrant in enumerate(entrants):
-            world = id(entrant.scenario)
-            if world not in engines:
-                engines[world] = stack.enter_context(closing(Engine(entrant.scenario, worlds)))
-                engines[world].load()
-
-            def report(share: float, place: int = place, name: str = entrant.name) -> None:
-                on_progress(place + share, name)
-
-            episodes[entrant.name] = drive(engines[world], entrant.policy, seeds, report)
-    results = {name: score(own, block) for name, own in episodes.items()}
-    reference = BASELINE if BASELINE in episodes else entrants[0].name
-    others = {
-        name: compare_paired(own, episodes[reference], block) for name, own in episodes.items() if name != reference
-    }
-    return Evaluation(Path(environment).stem, block, tuple(entrants), episodes, results, reference, others)
 
 
 COLUMNS = {
@@ -171,30 +183,32 @@ def changes(differences: Sequence[Difference], metrics: Iterable[str]) -> dict[s
     }
 
 
-def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
-    """Return a figure and the ends of its interval with as many decimals as the first digit of its width needs."""
-    width = high - low
+def shown(found: Mapping[str, Any], factor: float, figure: str = "mean") -> tuple[str, str, str]:
+    """Return a figure of a card and the ends of its interval, with the decimals that the interval's width needs.
+
+    Args:
+        found: as a card holds it, where null stands for no number.
+        factor: to the unit that is shown.
+        figure: key of the figure.
+    """
+    values = [float("nan") if found[key] is None else factor * found[key] for key in (figure, "ci_low", "ci_high")]
+    width = values[2] - values[1]
     decimals = 1
     if np.isfinite(width) and width > 0.0:
         decimals = int(np.clip(-np.floor(np.log10(width)), 0, 2))
-    first, second, third = (f"{v:z.{decimals}f}" if np.isfinite(v) else NONE for v in (mean, low, high))
+    first, second, third = (f"{v:z.{decimals}f}" if np.isfinite(v) else NONE for v in values)
     return first, second, third
-
-
-def values_of(found: Mapping[str, Any], factor: float, figure: str = "mean") -> list[float]:
-    """Return figure and interval as a card holds them, where null stands for no number."""
-    return [float("nan") if found[key] is None else factor * found[key] for key in (figure, "ci_low", "ci_high")]
 
 
 def cell(result: Mapping[str, Any], factor: float) -> str:
     """Return a figure of a card with its interval in brackets."""
-    mean, low, high = shown(*values_of(result, factor))
+    mean, low, high = shown(result, factor)
     return NONE if mean == NONE else f"{mean} [{low}, {high}]"
 
 
-def _percent(change: Mapping[str, Any]) -> str:
+def percent(change: Mapping[str, Any]) -> str:
     """Return a relative difference of a card and its interval, in percent."""
-    mean, low, high = shown(*values_of(change, 100.0, "relative"))
+    mean, low, high = shown(change, 100.0, "relative")
     return f"{signed(mean)} [{low}, {high}] %"
 
 
@@ -204,29 +218,29 @@ def signed(text: str) -> str:
 
 
 CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}
-
-
-def _changes_text(found: Mapping[str, Any], metrics: Iterable[str] = CHANGES) -> str:
-    return ", ".join(f"{CHANGES[metric]} {_percent(found[metric])}" for metric in metrics)
+"""Metrics of which cards tell changes, and what they call them."""
 
 
 JSON_FILE, TEXT_FILE = CARD_FILES
 
 
-def check(entrants: Sequence[Entrant]) -> None:
-    """Find out before any work whether every agent has a folder for its card, with a readable card or none.
+def carded(contest: Contest) -> list[tuple[Entrant, Path]]:
+    """Return the drivers that get a card, with their folders, each of which has a readable card or none.
 
     Raises:
-        CoopenvError: one has not.
+        CoopenvError: an agent has no folder, or its card cannot be read or written.
     """
-    for entrant in entrants:
-        if entrant.name == IDEAL:
-            continue
-        if entrant.agent.folder is None:
+    found = []
+    for entrant in contest.entrants:
+        folder = entrant.agent.folder
+        if folder is None:
             raise CoopenvError(f"--write-card: {entrant.name} is a place in code; a card needs an agent's folder")
-        read(entrant.agent.folder)
-        for name in (JSON_FILE, TEXT_FILE):
-            check_file(entrant.agent.folder / name)
+        if entrant.name != IDEAL:
+            read(folder)
+            for name in CARD_FILES:
+                check_file(folder / name)
+            found.append((entrant, folder))
+    return found
 
 
 def read(folder: Path) -> dict[str, Any]:
@@ -245,13 +259,10 @@ def read(folder: Path) -> dict[str, Any]:
         raise CoopenvError(f"{path}: not a card: {error}") from None
 
 
-def write(evaluation: Evaluation, command: str) -> list[Path]:
-    """Write the results of an evaluation to the cards of its agents; those of other environments stay."""
+def write(evaluation: Evaluation, cards: Iterable[tuple[Entrant, Path]], command: str) -> list[Path]:
+    """Write the results of an evaluation to cards, see `carded`; those of other environments stay."""
     written = []
-    for entrant in evaluation.entrants:
-        folder = entrant.agent.folder
-        if folder is None or entrant.name == IDEAL:
-            continue
+    for entrant, folder in cards:
         card = read(folder)
         known = card["environments"]
         results = figures(evaluation.results[entrant.name])
@@ -269,127 +280,47 @@ def measured(command: str, worlds: int, block: int, results: Mapping[str, Any]) 
 def save(folder: Path, description: str, card: Mapping[str, Any]) -> Path:
     """Write a card to an agent's folder, and return the path of the one for people."""
     replace_text(folder / JSON_FILE, json_text(card))
-    replace_text(folder / TEXT_FILE, text(description, card))
+    text = rendered("card.md.j2", card={"study": None, **card}, description=" ".join(description.split()))
+    replace_text(folder / TEXT_FILE, text)
     return folder / TEXT_FILE
 
 
-def figure_table(
-    first: Sequence[str],
-    rows: Iterable[tuple[Sequence[str], Mapping[str, Any], Sequence[str]]],
-    last: Sequence[str] = (),
-    metrics: Iterable[str] = COLUMNS,
-) -> str:
-    """Return a table in Markdown; each row has what stands before its figures, these by metric, and what stands after.
-
-    Args:
-        first: headings of what stands before.
-        rows: of the table.
-        last: headings of what stands after.
-        metrics: of the columns between.
-    """
-    columns = [COLUMNS[metric] for metric in metrics]
-    headings = [heading.strip().replace("\n", " ") for heading, _ in columns]
-    factors = {metric: factor for metric, (_, factor) in zip(metrics, columns, strict=True)}
-    lines = [
-        (*before, *(cell(found[metric], factor) for metric, factor in factors.items()), *after)
-        for before, found, after in rows
-    ]
-    return page.table((*first, *headings, *last), lines)
-
-
-def text(description: str, card: Mapping[str, Any]) -> str:
-    """Return a card for people, in Markdown."""
-    known = card["environments"]
-    rows = [((name, str(entry["worlds"])), entry["results"], ()) for name, entry in known.items()]
-    meaning = "; ".join(f"{word}: {words}" for word, words in EXPLANATIONS.items())
-    commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in known.values())
-    parts = [
-        f"# {card['agent']}",
-        " ".join(description.split()),
-        figure_table(("environment", "worlds"), rows),
-        f"{meaning[0].upper()}{meaning[1:]}. Measured with",
-        "\n".join(f"    {command} --write-card  # coopenv {number}" for command, number in commands),
-        *(_study_parts(card["study"]) if "study" in card else []),
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
+OVERVIEW = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
 WITHIN = 0.15
 """Seeds whose e95 is at most so much above the best one's count as alike."""
-
-
-def _study_parts(study: Mapping[str, Any]) -> list[str]:
-    """Return parts of Markdown: figures of every seed and of scripted drivers, differences, spread."""
-    rows = []
-    for seed, entry in study["seeds"].items():
-        best = " (best)" if int(seed) == study["best"] else ""
-        minutes = f"{entry['runs']['steps'] / 1e6:.1f} M steps, {entry['runs']['cpu_minutes']:.1f} min"
-        rows.append(((f"seed {seed}{best}",), entry["results"], (minutes,)))
-    rows += [((name,), found, ("",)) for name, found in study["beside"].items()]
-    errors = sorted(entry["results"]["e95_m"]["mean"] for entry in study["seeds"].values())
-    alike = sum(error <= (1.0 + WITHIN) * errors[0] for error in errors)
-    lines = [f"- Best against `{name}`: {_changes_text(found)}." for name, found in study["against"].items()]
-    lines.append(
-        f"- e95 over seeds: {100 * errors[0]:.1f} to {100 * errors[-1]:.1f} cm; {alike} of {len(errors)} within "
-        f"{100 * WITHIN:.0f} % of the least."
-    )
-    return [
-        figure_table(("on the same worlds",), rows, ("trained",)),
-        "Minutes are of one core. The best has the highest return by its own reward, in worlds that are not these.",
-        "\n".join(lines),
-        "Trained with, in this folder,",
-        f"    {study['seeds'][str(study['best'])]['runs']['command']}",
-    ]
-
-
-OVERVIEW = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
-INTRODUCTION = """# Agents
-
-One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) describes the scripted drivers.
-`study.toml` lists the learned agents, `train.toml` their settings and arms. `make agents` trains them and writes this
-page. It shows the best seed of each agent, chosen by the training reward in other worlds.
-"""
-LEGEND = """95 % intervals over {worlds} held-out worlds, the same for all agents. e50 and e95: percentiles of
-the position error of vehicles under way, from 3 s on. The last column lists the seeds in their order."""
-
-
-def overview_section(
-    environment: str, found: Mapping[str, Mapping[str, Any]], base: str | None, against: Mapping[str, Any]
-) -> str:
-    """Return the part of the page of agents on one environment.
-
-    Args:
-        environment: its name.
-        found: cards of studies by agent.
-        base: agent that others are compared with, one of these; None: it is not there.
-        against: of those others, their changes against it.
-    """
-    newest = list(found.values())[-1]
-    rows = [((name,), known, ("",)) for name, known in newest["study"]["beside"].items()]
-    for name, card in found.items():
-        errors = ", ".join(f"{100 * error:.1f}" for error in seeds_of(card, "e95_m"))
-        rows.append(((f"[`{name}`]({name}/card.md)",), card["environments"][environment]["results"], (errors,)))
-    lines = []
-    for name, card in found.items():
-        others = [f"{other} {_percent(known['e95_m'])}" for other, known in card["study"]["against"].items()]
-        lines.append(f"- `{name}`: e95 against {', '.join(others)}.")
-    for name, known in against.items():
-        change = _changes_text(known, ("e50_m", "e95_m", "travel_time_s"))
-        shares = {
-            metric: median(seeds_of(found[name], metric)) / median(seeds_of(found[str(base)], metric)) - 1
-            for metric in ("e50_m", "e95_m")
-        }
-        medians = ", ".join(f"{CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
-        lines.append(f"- `{name}` against `{base}`: {change}; median seed against median seed: {medians}.")
-    parts = [
-        f"## {environment}",
-        figure_table(("agent",), rows, ("e95 of seeds [cm]",), OVERVIEW),
-        LEGEND.format(worlds=newest["environments"][environment]["worlds"]),
-        "\n".join(lines),
-    ]
-    return "\n\n".join(parts) + "\n"
 
 
 def seeds_of(card: Mapping[str, Any], metric: str) -> list[float]:
     """Return a figure of every seed of a study."""
     return [entry["results"][metric]["mean"] for entry in card["study"]["seeds"].values()]
+
+
+def medians(card: Mapping[str, Any], base: Mapping[str, Any]) -> str:
+    """Return by how much the errors of the median seed of a study differ from those of another's, in words."""
+    shares = {m: median(seeds_of(card, m)) / median(seeds_of(base, m)) - 1 for m in ("e50_m", "e95_m")}
+    return ", ".join(f"{CHANGES[metric]} {100 * share:+.0f} %" for metric, share in shares.items())
+
+
+def headings(metrics: Iterable[str] | None) -> list[str]:
+    """Return the headings of metrics (None: all) on one line each."""
+    return [COLUMNS[metric][0].strip().replace("\n", " ") for metric in metrics or COLUMNS]
+
+
+def cells(results: Mapping[str, Any], metrics: Iterable[str] = COLUMNS) -> str:
+    """Return the figures of a card as cells of a row in Markdown."""
+    return " | ".join(cell(results[metric], COLUMNS[metric][1]) for metric in metrics)
+
+
+def rendered(template: str, **values: Any) -> str:
+    """Return a text of `coopenv/bench/text`, in Markdown."""
+    texts = Environment(
+        loader=PackageLoader("coopenv.bench", "text"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    texts.globals |= {"headings": headings, "cells": cells, "percent": percent, "seeds_of": seeds_of}
+    texts.globals |= {"medians": medians, "overview": OVERVIEW, "explanations": EXPLANATIONS, "within": WITHIN}
+    texts.globals["changes"] = lambda found, metrics: ", ".join(f"{CHANGES[m]} {percent(found[m])}" for m in metrics)
+    return texts.get_template(template).render(values)

@@ -1,10 +1,8 @@
 """`coopenv evaluate`: from the options to tables and files."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -15,15 +13,12 @@ from coopenv.base.installation import version, versions
 from coopenv.bench.cards import (
     COLUMNS,
     EXPLANATIONS,
-    Entrant,
+    Contest,
     Evaluation,
     changes,
-    contest,
-    enter,
     figures,
     shown,
     signed,
-    values_of,
 )
 from coopenv.evaluation import METRICS
 from coopenv.runs.command import REPLAY_FILE
@@ -38,40 +33,14 @@ WIDTH = 100
 """Width of the tables without a terminal, characters."""
 
 
-class Request(NamedTuple):
-    """An evaluation, and where its results go."""
-
-    environment: str
-    agents: Sequence[str]
-    worlds: int
-    block: int
-    overrides: Mapping[str, Any]
-    ideal: bool
-    command: str
-    """The command line that gives the same figures again."""
-    out: Path | None = None
-    """Folder of the files, which is replaced as a whole; None: no files."""
-    figures: str | None = None
-    """Format of the figures; None: no figures and no replay."""
-    film: bool = False
-    force: bool = False
-    """Whether an earlier evaluation in the folder is replaced."""
-    width: str | None = None
-    """Column of `coopenv.viz.figures` that figures are drawn for; None: a page's."""
-
-    def entrants(self) -> list[Entrant]:
-        """Return the drivers, built."""
-        return enter(self.environment, self.overrides, self.agents, self.ideal)
-
-
-def document(request: Request, evaluation: Evaluation) -> dict[str, Any]:
-    """Return the content of `evaluation.json`."""
+def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
+    """Return the content of `evaluation.json`; `command` is the line that gives the same figures again."""
     return {
-        "command": request.command,
+        "command": command,
         "coopenv": version(),
         "versions": versions("numpy", "warp-lang"),
         "environment": evaluation.environment,
-        "overrides": dict(request.overrides),
+        "overrides": dict(evaluation.overrides),
         "worlds": evaluation.worlds,
         "seed_block": evaluation.block,
         "metrics": {name: {"unit": metric.unit, "meaning": metric.meaning} for name, metric in METRICS.items()},
@@ -81,42 +50,55 @@ def document(request: Request, evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def run(request: Request, entrants: Sequence[Entrant], log: Console) -> Evaluation:
+def run(
+    contest: Contest,
+    command: str,
+    log: Console,
+    *,
+    out: Path | None = None,
+    figures: str | None = None,
+    width: str | None = None,
+    film: bool = False,
+    force: bool = False,
+) -> Evaluation:
     """Evaluate, with progress shown, and write the files.
+
+    Args:
+        contest: what is evaluated.
+        command: the command line that gives the same figures again.
+        log: console of the progress.
+        out: folder of the files, which is replaced as a whole; None: no files.
+        figures: their format; None: no figures and no replay.
+        width: column of `coopenv.viz.figures` that figures are drawn for; None: a page's.
+        film: whether a film is written.
+        force: whether an earlier evaluation in the folder is replaced.
 
     Raises:
         OutputError: the folder holds an earlier evaluation that is not to be replaced, or it cannot be written.
     """
-    folder = request.out
-    if folder is None:
-        return _driven(request, entrants, log)
-    if (folder / JSON_FILE).exists() and not request.force:
-        raise OutputError(f"{folder / JSON_FILE}: exists already; --force replaces it")
+
+    def driven() -> Evaluation:
+        with Progress(log, "driving", total=len(contest.entrants)) as progress, compile_notice(log):
+            return contest.drive(lambda done, name: progress.update(done, f"driving: {name}"))
+
+    if out is None:
+        return driven()
+    if (out / JSON_FILE).exists() and not force:
+        raise OutputError(f"{out / JSON_FILE}: exists already; --force replaces it")
     names = [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS, REPLAY_FILE]
-    with replacing_folder(folder, [*names, *(path.name for path in folder.glob("replay_*.html"))]) as new:
-        evaluation = _driven(request, entrants, log)
-        replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
-        if request.figures is not None or request.film:
+    with replacing_folder(out, [*names, *(path.name for path in out.glob("replay_*.html"))]) as new:
+        evaluation = driven()
+        replace_text(new / JSON_FILE, json_text(document(evaluation, command)))
+        if figures is not None or film:
             from coopenv.bench import evaluate_figures
 
-        if request.figures is not None:
+        if figures is not None:
             with Progress(log, "drawing figures"):
-                evaluate_figures.save_figures(evaluation, new, request.figures, request.width)
+                evaluate_figures.save_figures(evaluation, new, figures, width)
             evaluate_figures.write_replays(evaluation, new, log)
-        if request.film:
+        if film:
             evaluate_figures.write_film(evaluation, new, log)
     return evaluation
-
-
-def _driven(request: Request, entrants: Sequence[Entrant], log: Console) -> Evaluation:
-    with Progress(log, "driving", total=len(entrants)) as progress, compile_notice(log):
-        return contest(
-            request.environment,
-            entrants,
-            request.worlds,
-            request.block,
-            lambda done, name: progress.update(done, f"driving: {name}"),
-        )
 
 
 def report(evaluation: Evaluation, out: Console) -> None:
@@ -138,8 +120,7 @@ def _results_table(evaluation: Evaluation) -> Table:
     table = number_table(("agent",), [heading for heading, _ in COLUMNS.values()], gap=0)
     for name, results in evaluation.results.items():
         found = figures(results)
-        texts = [shown(*values_of(found[metric], factor)) for metric, (_, factor) in COLUMNS.items()]
-        table.add_row(name, *(mean if low == NONE else f"{mean}\n{low}..{high}" for mean, low, high in texts))
+        table.add_row(name, *(_cell(*shown(found[metric], factor)) for metric, (_, factor) in COLUMNS.items()))
     return table
 
 
@@ -150,8 +131,9 @@ def _differences_table(evaluation: Evaluation) -> Table:
     table = number_table((f"against {evaluation.reference}",), [f"{heading}\n[%]" for heading in headings], gap=0)
     for name, differences in evaluation.differences.items():
         found = changes(differences, COMPARED)
-        texts = [[signed(text) for text in shown(*values_of(found[metric], 100.0, "relative"))] for metric in COMPARED]
-        known = [np.isfinite(found[metric]["ci_low"]) for metric in COMPARED]
-        pairs = zip(texts, known, strict=True)
-        table.add_row(name, *(f"{mean}\n{low}..{high}" if both else mean for (mean, low, high), both in pairs))
+        table.add_row(name, *(_cell(*map(signed, shown(found[metric], 100.0, "relative"))) for metric in COMPARED))
     return table
+
+
+def _cell(mean: str, low: str, high: str) -> str:
+    return mean if low == NONE else f"{mean}\n{low}..{high}"

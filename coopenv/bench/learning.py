@@ -1,7 +1,9 @@
 """`coopenv bench learning`: train what a study lacks, side by side, and write a card as each run ends."""
 
+import json
 import tomllib
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -160,8 +162,17 @@ def perform(folder: Path, logs: Path, plan: Plan) -> None:
 REPORTED, CHOSEN = 0, 1
 """Blocks of held-out seeds: figures on cards are of the first; which seed is the best is decided in the second."""
 
-Key = tuple[str, ...]
-"""Environment, agent, overrides, and when its weights were written."""
+
+class Driven(NamedTuple):
+    """What episodes depend on."""
+
+    environment: str
+    agent: str
+    overrides: str
+    """As JSON."""
+    block: int
+    weights: tuple[int, ...]
+    """When they were written: weights that are trained anew are another agent."""
 
 
 class Judge:
@@ -170,32 +181,25 @@ class Judge:
     def __init__(self, worlds: int) -> None:
         """Take so many worlds of either block."""
         self.worlds = worlds
-        self._environment = ""
-        self._episodes: dict[Key, Episodes] = {}
+        self._episodes: dict[Driven, Episodes] = {}
         self._known: dict[Hashable, Any] = {}
 
-    def results(self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None) -> list[Result]:
-        """Return the figures of an agent in the reported worlds, under overrides of the environment."""
-        key = _key(environment, agent, overrides or {})
-        return self._once(key, lambda: score(self._reported(environment, agent, overrides or {})))
+    def results(
+        self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None, block: int = REPORTED
+    ) -> list[Result]:
+        """Return the figures of an agent in the worlds of a block, under overrides of the environment."""
+        driven = _driven(environment, agent, overrides or {}, block)
+        return self._once(driven, lambda: score(self._drive(driven)))
 
     def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
         """Return how much an agent's figures differ from another's in the same worlds."""
-
-        def compared() -> list[Difference]:
-            own, others = (self._reported(environment, each, {}) for each in (agent, other))
-            return compare_paired(own, others)
-
-        return self._once((_key(environment, agent, {}), _key(environment, other, {})), compared)
+        pair = tuple(_driven(environment, each, {}, REPORTED) for each in (agent, other))
+        return self._once(pair, lambda: compare_paired(*map(self._drive, pair)))
 
     def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
         """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""
-
-        def driven() -> float:
-            results = score(self._drive(environment, agent, overrides, CHOSEN))
-            return {result.metric: result.mean for result in results}["return"]
-
-        return self._once(("merit", _key(environment, agent, overrides)), driven)
+        results = self.results(environment, agent, overrides, CHOSEN)
+        return {result.metric: result.mean for result in results}["return"]
 
     def _once(self, key: Hashable, make: Callable[[], T]) -> T:
         """Return what is known of a key, or make it."""
@@ -204,28 +208,23 @@ class Judge:
         found: T = self._known[key]
         return found
 
-    def _reported(self, environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> Episodes:
-        if environment != self._environment:  # episodes are large, and those of one environment are wanted together
-            self._environment = environment
+    def _drive(self, driven: Driven) -> Episodes:
+        """Return episodes; large ones stay only as long as others of their environment are wanted for comparison."""
+        if any(other.environment != driven.environment for other in self._episodes):
             self._episodes.clear()
-        key = _key(environment, agent, overrides)
-        if key not in self._episodes:
-            self._episodes[key] = self._drive(environment, agent, overrides, REPORTED)
-        return self._episodes[key]
-
-    def _drive(self, environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Episodes:
-        scenario = open_simulation(environment, overrides)
-        engine = Engine(scenario, self.worlds)
-        try:
-            return drive(engine, load_agent(agent, scenario), held_out_seeds(block, self.worlds))
-        finally:
-            engine.close()
+        if driven in self._episodes:
+            return self._episodes[driven]
+        scenario = open_simulation(driven.environment, json.loads(driven.overrides))
+        with closing(Engine(scenario, self.worlds)) as engine:
+            found = drive(engine, load_agent(driven.agent, scenario), held_out_seeds(driven.block, self.worlds))
+        if driven.block == REPORTED:
+            self._episodes[driven] = found
+        return found
 
 
-def _key(environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> Key:
-    """Return what episodes depend on: weights that are trained anew are another agent."""
-    weights = sorted(str(path.stat().st_mtime_ns) for path in Path(agent).glob("*.safetensors"))
-    return (environment, str(agent), repr(sorted(overrides.items())), *weights)
+def _driven(environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Driven:
+    weights = sorted(path.stat().st_mtime_ns for path in Path(agent).glob("*.safetensors"))
+    return Driven(environment, str(agent), json.dumps(overrides, sort_keys=True), block, tuple(weights))
 
 
 BASELINES = ("route_follower", "peek", "look_ahead")
@@ -297,7 +296,7 @@ def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> 
 
 def write_overview(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
     """Write the page of agents, each of which has a card; those that are to be trained anew are left out of it."""
-    parts = [cards.INTRODUCTION]
+    sections = {}
     for environment in dict.fromkeys(group.environment for group in groups):
         own = {group.name: group.arm for group in groups if group.environment == environment}
         found = {name: cards.read(folder / name) for name in own}
@@ -306,8 +305,8 @@ def write_overview(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
         others = [name for name in own if base is not None and name != base]
         against = {name: judge.against(environment, best[name], best[str(base)]) for name in others}
         relative = {name: cards.changes(found, cards.OVERVIEW) for name, found in against.items()}
-        parts.append(cards.overview_section(environment, found, base, relative))
-    replace_text(folder / PAGE_FILE, "\n".join(parts))
+        sections[environment] = {"cards": found, "base": base, "against": relative}
+    replace_text(folder / PAGE_FILE, cards.rendered("agents.md.j2", sections=sections))
 
 
 WIDTH = 100

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.base.files import check_file, replace_text, replacing_file, writing
 from coopenv.base.format import json_text
 from coopenv.base.installation import version
-from coopenv.bench.cards import OVERVIEW, Entrant, contest, enter, figure_table
+from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
 from coopenv.policies import agents_for
 from coopenv.runs.page import index_text, page_text
 from coopenv.runs.scenes import driver_of, scene_of, write_film
@@ -72,13 +73,13 @@ def has_value_of_sensing(name: str) -> bool:
     return {*DRIVERS} <= {*agents_for(name)}
 
 
-def entrants(environment: str, sensing: str = "sensed") -> list[Entrant]:
+def contest(environment: str, worlds: int, sensing: str = "sensed") -> Contest:
     """Return the drivers at a setting of `sensing`, built.
 
     Raises:
         CoopenvError: one cannot drive here, or nothing is driven.
     """
-    return enter(environment, {"sensing": sensing}, DRIVERS)
+    return Contest.of(environment, {"sensing": sensing}, DRIVERS, worlds)
 
 
 def write_figures(
@@ -101,7 +102,7 @@ def write_figures(
         def report(done: float, name: str, place: int = place, how: str = how) -> None:
             on_progress((place + done / len(DRIVERS)) / len(SETTINGS), f"{how}: {name}")
 
-        found = contest(environment, entrants(environment, how), worlds, 0, report).rows()
+        found = contest(environment, worlds, how).drive(report).rows()
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]
     value = {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
     replace_text(folder / f"{Path(environment).stem}.json", json_text(value))
@@ -117,7 +118,7 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
         return None
     try:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _value_table(value)
+        _rows(value)
         return {key: value[key] for key in ("coopenv", "worlds", "scenario", "rows")}
     except (OSError, ValueError, KeyError, TypeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
@@ -126,32 +127,24 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
 
 def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[str, Any]) -> str:
     """Return the figures in Markdown, with the commands that give them."""
-    worlds = value["worlds"]
-    contest = f"coopenv evaluate {environment} --agents {','.join(DRIVERS)} --worlds {worlds} --set sensing=blind"
-    changed = "*The environment has changed since these figures were measured.*"
-    return "\n\n".join(
-        [
-            *([changed] if value["scenario"] != fingerprint(scenario) else []),
-            "Everything else being equal, `sensing` says whether every target is measured in every frame (`ideal`), "
-            "what the camera sees (`sensed`), or nothing (`blind`).",
-            _value_table(value),
-            f"Over {worlds} held-out worlds, with 95 % intervals (bootstrap over worlds); e50 and e95 of the position "
-            "error of vehicles under way, from 3 s on.",
-            f"```\ncoopenv page {environment} --measure --worlds {worlds}  # coopenv {value['coopenv']}\n"
-            f"{contest}  # a third of it\n```",
-        ]
-    )
+    return rendered(
+        "sensing.md.j2",
+        environment=environment,
+        drivers=DRIVERS,
+        rows=_rows(value),
+        worlds=value["worlds"],
+        coopenv=value["coopenv"],
+        changed=value["scenario"] != fingerprint(scenario),
+    ).strip()
 
 
-def _value_table(value: Mapping[str, Any]) -> str:
-    """Return the table by sensing and agent."""
+def _rows(value: Mapping[str, Any]) -> dict[tuple[str, str], str]:
+    """Return the cells of the table by sensing and agent."""
     found = {(row["sensing"], row["agent"], row["metric"]): row for row in value["rows"]}
-    rows = [
-        ((how, agent), {metric: found[how, agent, metric] for metric in OVERVIEW}, ())
-        for how in SETTINGS
-        for agent in DRIVERS
-    ]
-    return figure_table(("sensing", "agent"), rows, metrics=OVERVIEW)
+    return {
+        (how, agent): cells({metric: found[how, agent, metric] for metric in OVERVIEW}, OVERVIEW)
+        for how, agent in product(SETTINGS, DRIVERS)
+    }
 
 
 def fingerprint(scenario: Scenario) -> str:

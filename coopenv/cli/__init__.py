@@ -167,7 +167,7 @@ def page(
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
     measured = [name for name in stems if measure and (pages.has_value_of_sensing(name) or not everything)]
     for name in measured:
-        pages.entrants(stems[name])
+        pages.contest(stems[name], worlds)
     pages.prepare(out, list(stems))
     log = options.console(stderr=True)
     with Progress(log, "pages", total=len(stems)) as progress:

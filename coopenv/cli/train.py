@@ -186,28 +186,16 @@ def evaluate(given: EvaluateOptions) -> None:
     names = options.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
-    request = evaluate.Request(
-        environment,
-        names,
-        given.worlds,
-        given.seed_block,
-        options.parse_overrides(given.overrides),
-        given.ideal,
-        options.command_text("evaluate", given, OF_THE_OUTPUT),
-        out,
-        None if given.no_figures else given.figures.value,
-        given.film,
-        given.force,
-        given.width and given.width.value,
-    )
     with options.warned():
-        entrants = request.entrants()
-    if given.write_card:
-        cards.check(entrants)
-    result = evaluate.run(request, entrants, log)
-    written = cards.write(result, request.command) if given.write_card else []
+        changes = options.parse_overrides(given.overrides)
+        contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal)
+    carded = cards.carded(contest) if given.write_card else []
+    command = options.command_text("evaluate", given, OF_THE_OUTPUT)
+    drawn = {"figures": None if given.no_figures else given.figures.value, "width": given.width and given.width.value}
+    result = evaluate.run(contest, command, log, out=out, film=given.film, force=given.force, **drawn)
+    written = cards.write(result, carded, command)
     if given.as_json:
-        options.print_json(evaluate.document(request, result))
+        options.print_json(evaluate.document(result, command))
         return
     printed = options.console(least=evaluate.WIDTH)
     evaluate.report(result, printed)

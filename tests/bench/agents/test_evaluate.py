@@ -127,7 +127,7 @@ def test_a_card_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_figures_have_the_digits_that_their_interval_allows(values: tuple[float, ...], expected: object) -> None:
-    assert shown(*values) == expected
+    assert shown(dict(zip(("mean", "ci_low", "ci_high"), values, strict=True)), 1.0) == expected
 
 
 def test_pictures_stand_in_rows_of_three() -> None:
