@@ -98,7 +98,7 @@ class Ray:
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task; Ray repeats those whose node was lost."""
         ray = self.connect()
-        remote = ray.remote(num_cpus=1, max_retries=3)(function)
+        remote = ray.remote(num_cpus=1, max_retries=3)(lambda task: function(task))  # Ray takes no `partial`
         work = {remote.remote(task): n for n, task in enumerate(tasks)}
         results: dict[int, R] = {}
         waiting = list(work)

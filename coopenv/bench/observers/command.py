@@ -10,7 +10,6 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -25,7 +24,7 @@ from coopenv.bench.observers.convergence import RADIUS, basin_failures, study_ba
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard, Row, spread
-from coopenv.bench.observers.tables import csv_text, failures, headline, honest_line, quality
+from coopenv.bench.observers.tables import csv_text, environment, failures, headline, honest_line, quality
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
@@ -155,13 +154,11 @@ def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
         "columns": [f.name for f in fields(Row) if f.name not in ("environment", "failure")],
         "definitions": {f.name: f.metadata["meaning"] for f in fields(Row)},
     }
-    environment = Environment(
-        loader=PackageLoader("coopenv.bench.observers", "page"), autoescape=True, undefined=StrictUndefined
-    )
-    environment.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
-    environment.globals["spread"] = spread
-    environment.filters["append"] = lambda text, more: text + more
-    template = environment.get_template("report.html.j2")
+    texts = environment(autoescape=True)
+    texts.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
+    texts.globals["spread"] = spread
+    texts.filters["append"] = lambda text, more: text + more
+    template = texts.get_template("report.html.j2")
     text = template.render(values, with_rows=True)
     return text if len(text.encode()) < MOST_BYTES else template.render(values, with_rows=False)
 
@@ -173,14 +170,7 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
         "summary": board.variants[name],
         "bounds": {BOUNDS[column]: values for column, values in board.bounds_in(name).items()},
         "paper_noise": board.samples[0].scene.paper_noise,
-        "observers": {
-            observer: {
-                "rows": board.rows_in(name, observer),
-                "total": board.totals[name, observer],
-                **quality(board, name, observer),
-            }
-            for observer in board.ranked
-        },
+        "observers": {observer: quality(board, name, observer) for observer in board.ranked},
     }
 
 

@@ -3,6 +3,7 @@
 Of initial estimates the attitude is uniform over SO(3), the position uniform in a ball.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -140,21 +141,19 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
         vehicles = len({draw.vehicle for draw in own})
         converged = np.array([draw.converged for draw in own]).reshape(-1, vehicles)
         times = np.array([draw.convergence_time_s for draw in own]).reshape(-1, vehicles)
-        all_vehicles = converged.all(axis=1)
+        successes = converged.all(axis=1)
         failures = [draw.failure for draw in own[::vehicles] if draw.failure]
         basins.append(
             Basin(
                 environment=environment,
                 observer=name,
                 draws=len(converged),
-                converged_fraction=float(all_vehicles.mean()),
-                interval=wilson_interval(int(all_vehicles.sum()), len(converged)),
+                converged_fraction=float(successes.mean()),
+                interval=wilson_interval(int(successes.sum()), len(converged)),
                 by_vehicle=tuple(converged.mean(axis=0).tolist()),
-                convergence_time_s=float(np.median(times[all_vehicles].max(axis=1)))
-                if all_vehicles.any()
-                else float("nan"),
+                convergence_time_s=float(np.median(times[successes].max(axis=1))) if successes.any() else math.nan,
                 failed=len(failures),
-                failure=failures[0] if failures else "",
+                failure=next(iter(failures), ""),
             )
         )
     return basins
@@ -188,12 +187,10 @@ def basin_failures(basins: Sequence[Basin]) -> list[str]:
 
 def by_angle(draws: Sequence[Draw]) -> list[tuple[int, int]]:
     """Return (converged, all) vehicles in each bin of `ANGLE_BINS` of their own initial angle."""
-    angle = [draw.initial_orientation_error_deg for draw in draws]
-    every, converged = (
-        np.histogram(angle, ANGLE_BINS, weights=weights)[0].astype(int).tolist()
-        for weights in (np.ones(len(draws)), np.array([draw.converged for draw in draws], float))
-    )
-    return list(zip(converged, every, strict=True))
+    angle = np.array([draw.initial_orientation_error_deg for draw in draws])
+    converged = np.array([draw.converged for draw in draws], bool)
+    counts = (np.histogram(some, ANGLE_BINS)[0].tolist() for some in (angle[converged], angle))
+    return list(zip(*counts, strict=True))
 
 
 @dataclass(frozen=True)

@@ -83,14 +83,9 @@ def with_lie(recording: Recording, fault: Fault) -> Recording:
     senders = [names.index(name) for name in fault.vehicles] or [usual_sender(recording)]
     since = np.arange(K) - math.ceil(fault.start_in(float(recording.t[-1])) / recording.dt - 1e-6)
     lying = since >= 0
+    none = (np.zeros((K, N, 3)), np.zeros((K, N, 3)), np.zeros((K, N)), np.zeros((K, N), np.int64))
     false = deepcopy(recording.interference) or Interference(
-        shift=np.zeros((K, N, 3)),
-        turn=np.zeros((K, N, 3)),
-        std=np.zeros((K, N)),
-        replay=np.zeros((K, N), np.int64),
-        clock=np.zeros(N, np.int64),
-        restarts=np.zeros((K, N), bool),
-        kept=np.zeros(N, np.int64),
+        *none, clock=np.zeros(N, np.int64), restarts=np.zeros((K, N), bool), kept=np.zeros(N, np.int64)
     )
     for sender in senders:
         if fault.word == "replay":

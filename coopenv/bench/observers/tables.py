@@ -7,6 +7,7 @@ from io import StringIO
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.table import Table
 
 from coopenv.base.format import in_parentheses, jsonable, number, with_error
@@ -32,7 +33,7 @@ FAILED = "failed"
 
 
 def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
-    """Return shares in %, costs and NIS with standard errors, the worst figures, and rows with an ANEES, lowest first.
+    """Return rows and total, shares in %, costs and NIS with standard errors, the worst figures, and rows by ANEES.
 
     Vehicles of one seed may depend on one another: errors are those of the means of each seed.
     """
@@ -46,6 +47,8 @@ def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:
     rows = board.rows_in(variant, observer)
     dof = each("nis_dof").sum(axis=1)
     return {
+        "rows": rows,
+        "total": board.totals[variant, observer],
         "settled": measured(100.0 * np.isfinite(each("settle_time")).mean(axis=1)),
         "diverged": measured(100.0 * each("diverged").mean(axis=1)),
         "sent": measured(each("bytes_per_s").mean(axis=1)),
@@ -313,42 +316,21 @@ def latex(board: Leaderboard, variant: str) -> str:
 
     Five vehicles fit a column of 3.5 in.
     """
-    vehicles = _headings(board)
-    bounds = [[BOUNDS[c], *(number(v, 3) for v in values)] for c, values in board.bounds_in(variant).items()]
-    observers = [[_latex_name(name), *map(_latex_cell, board.rows_in(variant, name))] for name in board.ranked]
-    return "\n".join(
-        [
-            f"% {board.title}, {variant}: position RMSE in m",
-            "% 0.0123(4) is 0.0123 with a standard error of 0.0004 over the seeds. Needs booktabs.",
-            r"\begingroup\footnotesize\setlength{\tabcolsep}{3pt}%",
-            rf"\begin{{tabular}}{{@{{}}l{'r' * len(vehicles)}@{{}}}}",
-            r"\toprule",
-            _latex_line(["", *vehicles]),
-            r"\midrule",
-            *map(_latex_line, bounds),
-            *([r"\midrule"] if bounds else []),
-            *map(_latex_line, observers),
-            r"\bottomrule",
-            r"\end{tabular}\endgroup",
-            "",
-        ]
-    )
+    texts = environment(trim_blocks=True, keep_trailing_newline=True)
+    texts.filters["cell"] = lambda r: FAILED if r.failure else compact(r.position_rmse_m, r.position_rmse_se_m)
+    texts.globals["stacked"] = _latex_name
+    bounds = {BOUNDS[c]: [number(v, 3) for v in values] for c, values in board.bounds_in(variant).items()}
+    values = {"board": board, "variant": variant, "headings": _headings(board), "bounds": bounds}
+    return texts.get_template("leaderboard.tex.j2").render(values)
 
 
-def _latex_line(cells: Sequence[str]) -> str:
-    return " & ".join(cells) + r" \\"
-
-
-def _escaped(text: str) -> str:
-    """Return a text in which LaTeX's special characters stand for themselves."""
-    return re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", "/"))
+def environment(**options: Any) -> Environment:
+    """Return what renders the templates beside the report's."""
+    loader = PackageLoader("coopenv.bench.observers", "page")
+    return Environment(loader=loader, undefined=StrictUndefined, **options)
 
 
 def _latex_name(name: str) -> str:
-    lines = [_escaped(line) for line in short_name(name).splitlines()]
-    stacked = r"\\".join(lines)
-    return stacked if len(lines) == 1 else rf"\shortstack[l]{{{stacked}}}"
-
-
-def _latex_cell(row: Row) -> str:
-    return FAILED if row.failure else compact(row.position_rmse_m, row.position_rmse_se_m)
+    """Return an observer's name, stacked where it is long; LaTeX's special characters stand for themselves."""
+    stacked = re.sub(r"([&%$#_{}])", r"\\\1", short_name(name).replace("\\", "/")).replace("\n", r"\\")
+    return rf"\shortstack[l]{{{stacked}}}" if r"\\" in stacked else stacked
