@@ -2,11 +2,11 @@
 
 import json
 import tomllib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import compress, groupby, product
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -26,7 +26,7 @@ from coopenv.evaluation import Difference, Episodes, Result, compare_paired, dri
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.runs.console import Progress, number_table
-from coopenv.training.settings import SETTINGS_FILE, Plan, Settings, read_settings
+from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
 
 T = TypeVar("T")
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
@@ -43,34 +43,30 @@ class StudyFile(Section):
     seeds: tuple[Seed, ...] = Field(min_length=1)
 
 
-class Group(NamedTuple):
-    """The runs that differ in nothing but their seed; one agent comes of them."""
+def agent_of(plan: Plan) -> str:
+    """Return the name of the agent that comes of all trainings which differ in nothing but their seed."""
+    return f"{plan.environment}_{plan.arm}"
 
-    environment: str
-    arm: str
 
-    @property
-    def name(self) -> str:
-        """Of the agent and its folder."""
-        return f"{self.environment}_{self.arm}"
+def place_of(plan: Plan) -> Path:
+    """Return where the agent of a training goes, in the study's folder."""
+    return Path(agent_of(plan), f"seed_{plan.seed}")
 
 
 @dataclass(frozen=True)
 class Study:
     """What is to be trained."""
 
-    settings: dict[Group, Settings]
-    """Of every agent, by environment and then by arm."""
-    seeds: tuple[int, ...]
+    plans: tuple[Plan, ...]
+    """All trainings; every agent's first one before any agent's second."""
 
     @property
-    def plans(self) -> Iterator[Plan]:
-        """All trainings; every agent's first one before any agent's second."""
-        return (self.plan(group, seed) for seed in self.seeds for group in self.settings)
-
-    def plan(self, group: Group, seed: int) -> Plan:
-        """Return what exactly is trained for an agent with a seed."""
-        return Plan(group.environment, self.settings[group], seed, group.arm)
+    def agents(self) -> dict[str, list[Plan]]:
+        """The trainings of every agent."""
+        found: dict[str, list[Plan]] = {}
+        for plan in self.plans:
+            found.setdefault(agent_of(plan), []).append(plan)
+        return found
 
     def only(self, words: Sequence[str]) -> "Study":
         """Return the part of the study that names of environments and arms and numbers of seeds choose.
@@ -78,16 +74,16 @@ class Study:
         Raises:
             CoopenvError: it has nothing of such a name.
         """
-        environments, arms = ({*names} for names in zip(*self.settings, strict=True))
-        seeds = {str(seed): seed for seed in self.seeds}
-        known = (*environments, *arms, *seeds)
+        keys = [(plan.environment, str(plan.arm), str(plan.seed)) for plan in self.plans]
+        names = [set(column) for column in zip(*keys, strict=True)]
+        known = set().union(*names)
         for word in words:
             if word not in known:
                 known_names = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
                 raise CoopenvError(f"--only: the study has no '{word}'{known_names}")
-        chosen = [{*words} & {*names} or {*names} for names in (environments, arms, seeds)]
-        kept = {g: s for g, s in self.settings.items() if g.environment in chosen[0] and g.arm in chosen[1]}
-        return Study(kept, tuple(seed for text, seed in seeds.items() if text in chosen[2]))
+        chosen = [{*words} & column or column for column in names]
+        fits = [all(word in column for word, column in zip(key, chosen, strict=True)) for key in keys]
+        return Study(tuple(compress(self.plans, fits)))
 
 
 def read_study(path: Path) -> Study:
@@ -97,14 +93,10 @@ def read_study(path: Path) -> Study:
         CoopenvError: one of the files is not valid; one line that names file and field.
     """
     file = validated(StudyFile, read_toml(path), str(path))
-    groups = [Group(environment, arm) for environment in file.environments for arm in file.arms]
-    settings = {group: read_settings(path.parent / file.settings, group.arm, group.environment) for group in groups}
-    return Study(settings, file.seeds)
-
-
-def place_of(plan: Plan) -> Path:
-    """Return where the agent of a training goes, in the study's folder."""
-    return Path(Group(plan.environment, str(plan.arm)).name, f"seed_{plan.seed}")
+    groups = list(product(file.environments, file.arms))
+    settings = [read_settings(path.parent / file.settings, arm, environment) for environment, arm in groups]
+    pairs = list(zip(groups, settings, strict=True))
+    return Study(tuple(Plan(place, own, seed, arm) for seed in file.seeds for (place, arm), own in pairs))
 
 
 def is_finished(plan: Plan, folder: Path) -> bool:
@@ -233,9 +225,9 @@ BASE_ARM = "plain"
 """The arm that others are compared with."""
 
 
-def is_reported(group: Group, plans: Sequence[Plan], folder: Path) -> bool:
-    """Return whether a group has a card that tells of just these finished runs."""
-    seeds = cards.read(folder / group.name).get("study", {}).get("seeds", {})
+def is_reported(agent: str, plans: Sequence[Plan], folder: Path) -> bool:
+    """Return whether an agent has a card that tells of just these finished runs."""
+    seeds = cards.read(folder / agent).get("study", {}).get("seeds", {})
     found = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
     return found == {plan.seed: _trained(folder / place_of(plan))["sha256"] for plan in plans}
 
@@ -248,18 +240,18 @@ def _trained(place: Path) -> dict[str, Any]:
     return {"sha256": document["network"]["sha256"], **found}
 
 
-def write_card(group: Group, finished: Sequence[Plan], folder: Path, judge: Judge) -> None:
-    """Write the agent and the card of a group of which some runs are finished.
+def write_card(finished: Sequence[Plan], folder: Path, judge: Judge) -> None:
+    """Write an agent of which some runs are finished, and its card.
 
     Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
     """
-    environment, place = group.environment, folder / group.name
+    environment, place = finished[0].environment, folder / agent_of(finished[0])
     agents = {plan.seed: folder / place_of(plan) for plan in finished}
     overrides = finished[0].settings.scenario
     merits = {seed: judge.merit(environment, agent, overrides) for seed, agent in agents.items()}
     best = max(merits, key=lambda seed: merits[seed])
     results = {seed: cards.figures(judge.results(environment, agent)) for seed, agent in agents.items()}
-    description = _write_agent(place, agents[best].name, group, sorted(agents))
+    description = _write_agent(place, agents[best].name, finished)
     against = {name: judge.against(environment, agents[best], name) for name in BASELINES}
     beside = {name: judge.results(environment, name) for name in BASELINES}
     beside[cards.IDEAL] = judge.results(environment, BASELINES[0], cards.IDEAL_SENSING)
@@ -268,7 +260,7 @@ def write_card(group: Group, finished: Sequence[Plan], folder: Path, judge: Judg
         f"coopenv evaluate {environment} --agents {driven} --worlds {judge.worlds} --seed-block {REPORTED} --ideal"
     )
     study = {
-        "arm": group.arm,
+        "arm": finished[0].arm,
         "best": best,
         "seeds": {
             str(seed): {"runs": _trained(agent), "merit": merits[seed], "results": results[seed]}
@@ -278,27 +270,28 @@ def write_card(group: Group, finished: Sequence[Plan], folder: Path, judge: Judg
         "against": {name: cards.changes(found, cards.OVERVIEW) for name, found in against.items()},
     }
     entry = cards.measured(command, judge.worlds, REPORTED, results[best])
-    card = {"agent": group.name, "kind": "learned", "environments": {environment: entry}, "study": study}
+    card = {"agent": place.name, "kind": "learned", "environments": {environment: entry}, "study": study}
     cards.save(place, description, card)
 
 
-def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:
+def _write_agent(place: Path, best: str, finished: Sequence[Plan]) -> str:
     """Write the agent that drives as one seed of it does, with its settings, and return its description."""
     document = tomlkit.parse((place / best / AGENT_FILE).read_text(encoding="utf-8"))
-    names = ", ".join(map(str, seeds))
-    description = f"PPO in {group.environment}, arm {group.arm}: {best.replace('_', ' ')}, the best of {names}."
-    document["title"], document["description"] = f"{group.environment}, {group.arm}", description
+    environment, arm = finished[0].environment, finished[0].arm
+    names = ", ".join(str(seed) for seed in sorted(plan.seed for plan in finished))
+    description = f"PPO in {environment}, arm {arm}: {best.replace('_', ' ')}, the best of {names}."
+    document["title"], document["description"] = f"{environment}, {arm}", description
     document["network"]["weights"] = f"{best}/{document['network']['weights']}"
     replace_text(place / AGENT_FILE, tomlkit.dumps(document))
     replace_text(place / SETTINGS_FILE, (place / best / SETTINGS_FILE).read_text(encoding="utf-8"))
     return description
 
 
-def write_overview(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
-    """Write the page of agents, each of which has a card; those that are to be trained anew are left out of it."""
+def write_overview(agents: Iterable[Plan], folder: Path, judge: Judge) -> None:
+    """Write the page of agents that have a card, of each a training; others are to be trained anew."""
     sections = {}
-    for environment in dict.fromkeys(group.environment for group in groups):
-        own = {group.name: group.arm for group in groups if group.environment == environment}
+    for environment, plans in groupby(agents, lambda plan: plan.environment):
+        own = {agent_of(plan): plan.arm for plan in plans}
         found = {name: cards.read(folder / name) for name in own}
         best = {name: folder / name / f"seed_{card['study']['best']}" for name, card in found.items()}
         base = next((name for name, arm in own.items() if arm == BASE_ARM), None)
@@ -332,20 +325,18 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
         OutputError: something cannot be written.
     """
     judge, missing = Judge(worlds), unfinished(part, folder)
-    total = len(list(part.plans))
+    total = len(part.plans)
     before = total - len(missing)
     folder.mkdir(parents=True, exist_ok=True)
 
     def judge_finished() -> None:
-        finished: dict[Group, list[Plan]] = {}
-        for group, seed in product(study.settings, study.seeds):
-            if is_finished(plan := study.plan(group, seed), folder):
-                finished.setdefault(group, []).append(plan)
-        stale = {group: plans for group, plans in finished.items() if not is_reported(group, plans, folder)}
-        for group, plans in stale.items():
-            write_card(group, plans, folder, judge)
+        of_agents = ([plan for plan in plans if is_finished(plan, folder)] for plans in study.agents.values())
+        finished = [plans for plans in of_agents if plans]
+        stale = [plans for plans in finished if not is_reported(agent_of(plans[0]), plans, folder)]
+        for plans in stale:
+            write_card(plans, folder, judge)
         if stale or not (folder / PAGE_FILE).exists():
-            write_overview(list(finished), folder, judge)
+            write_overview([plans[0] for plans in finished], folder, judge)
 
     with Progress(log, f"{before} of {total} trainings were done", total=len(missing) or None) as progress:
 
@@ -363,11 +354,11 @@ def results_table(study: Study, folder: Path) -> Table:
     columns = {metric: cards.COLUMNS[metric] for metric in cards.OVERVIEW}
     headings = [*(heading for heading, _ in columns.values()), "e95 of\nseeds [cm]"]
     table = number_table(("agent", "seeds"), headings, gap=0)
-    for group in study.settings:
-        card = cards.read(folder / group.name)
+    for agent, plans in study.agents.items():
+        card = cards.read(folder / agent)
         if "study" not in card:
             continue
-        results, errors = card["environments"][group.environment]["results"], cards.seeds_of(card, "e95_m")
+        results, errors = card["environments"][plans[0].environment]["results"], cards.seeds_of(card, "e95_m")
         figures = [cards.cell(results[m], factor).replace(" ", "\n", 1) for m, (_, factor) in columns.items()]
-        table.add_row(group.name, str(len(errors)), *figures, " ".join(f"{100 * error:.0f}" for error in errors))
+        table.add_row(agent, str(len(errors)), *figures, " ".join(f"{100 * error:.0f}" for error in errors))
     return table

@@ -177,8 +177,8 @@ def bench_learning(
     whole, log = learning.read_study(study), options.console(stderr=True)
     chosen, folder = whole.only(options.words(only)), out or study.parent
     with options.warned():
-        for group in chosen.settings:
-            options.load(group.environment, chosen.settings[group].scenario)
+        for plans in chosen.agents.values():
+            options.load(plans[0].environment, plans[0].settings.scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
     printed = options.console(least=learning.WIDTH)
     printed.print(learning.results_table(chosen, folder))

@@ -85,26 +85,25 @@ def drive_vehicles(
             if view("over").all():
                 break
     engine.close()
-    record = {name: kept[name] for name in KEPT}
-    terminated, truncated = (record[name][1:].astype(bool) for name in ("terminated", "truncated"))
-    driven, ended, episodes = np.stack(actions), terminated | truncated, []
+    observations, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
+    driven, ended, episodes = np.stack(actions), ((terminated + truncated) > 0)[1:], []
     for world, vehicle in product(range(worlds), driven_vehicles(scenario)):
-        if there[world, vehicle]:
-            ends = np.flatnonzero(ended[:, world, vehicle])
-            length = int(ends[0]) + 1 if len(ends) else len(actions)
-            part, whole = ((slice(None, count), world, vehicle) for count in (length, length + 1))
-            episodes.append(
-                DrivenEpisode(
-                    world=world,
-                    vehicle=scenario.vehicle_names[vehicle],
-                    observations=record["observation"][whole],
-                    actions=driven[part],
-                    rewards=record["reward"][1:][part].astype(float),
-                    terminations=terminated[part],
-                    truncations=truncated[part],
-                    position_error=record["position_error"][whole].astype(float),
-                )
+        if not there[world, vehicle]:
+            continue
+        length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(actions) - 1)) + 1
+        chosen, result, whole = slice(length), slice(1, length + 1), slice(length + 1)
+        episodes.append(
+            DrivenEpisode(
+                world=world,
+                vehicle=scenario.vehicle_names[vehicle],
+                observations=observations[whole, world, vehicle],
+                actions=driven[chosen, world, vehicle],
+                rewards=rewards[result, world, vehicle].astype(float),
+                terminations=terminated[result, world, vehicle].astype(bool),
+                truncations=truncated[result, world, vehicle].astype(bool),
+                position_error=errors[whole, world, vehicle].astype(float),
             )
+        )
     return episodes
 
 
@@ -158,8 +157,8 @@ def write_dataset(
     Raises:
         OutputError: it cannot be written.
     """
-    arrays = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
-    needed = 2 * arrays + PER_EPISODE * len(episodes)
+    size = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
+    needed = 2 * size + PER_EPISODE * len(episodes)
     with writing(place):  # HDF5 ends the process where the disk has no room (seen with h5py 3.16)
         free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
         if free < needed:
@@ -176,16 +175,13 @@ def write_dataset(
         from minari.data_collector import EpisodeBuffer
 
         register_all()
+        arrays = ("observations", "actions", "rewards", "terminations", "truncations")
         buffers: list[Any] = [
             EpisodeBuffer(
                 id=number,
                 options={"world": episode.world, "vehicle": int(episode.vehicle.rpartition("_")[2])},
-                observations=episode.observations,
-                actions=episode.actions,
-                rewards=episode.rewards,
-                terminations=episode.terminations,
-                truncations=episode.truncations,
                 infos={"position_error": episode.position_error},
+                **{name: getattr(episode, name) for name in arrays},
             )
             for number, episode in enumerate(episodes)
         ]

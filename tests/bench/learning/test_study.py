@@ -10,7 +10,7 @@ from weakref import ref
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.learning import Group, Judge, Study, place_of, read_study
+from coopenv.bench.learning import Judge, Study, place_of, read_study
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, score
 
 STUDY = """
@@ -36,7 +36,7 @@ def study(tmp_path: Path) -> Study:
 
 
 def test_every_agent_has_its_first_run_before_any_has_its_second(study: Study) -> None:
-    plans = list(study.plans)
+    plans = study.plans
     assert [plan.seed for plan in plans] == [1] * 4 + [7] * 4
     assert {place_of(plan).parent.name for plan in plans[:4]} == {
         *("open_square_quality", "open_square_plain"),
@@ -45,18 +45,17 @@ def test_every_agent_has_its_first_run_before_any_has_its_second(study: Study) -
 
 
 def test_arms_differ_in_what_they_say(study: Study) -> None:
-    plain = study.plan(Group("facade", "plain"), 7)
+    quality, plain = study.agents["facade_quality"][1], study.agents["facade_plain"][1]
     assert (plain.environment, plain.arm, plain.seed) == ("facade", "plain", 7)
     assert plain.all_overrides == {"reward.weights.position_uncertainty": 0.0}
-    quality = study.plan(Group("facade", "quality"), 7)
     assert (plain.settings.ppo.gamma, quality.settings.ppo.gamma) == (0.9, 0.99)
     assert quality.settings.steps == plain.settings.steps == 1000
 
 
 def test_parts(study: Study) -> None:
     assert [place_of(plan) for plan in study.only(["facade", "7", "plain"]).plans] == [Path("facade_plain/seed_7")]
-    assert len(list(study.only(["quality"]).plans)) == 4
-    assert list(study.only([]).plans) == list(study.plans)
+    assert len(study.only(["quality"]).plans) == 4
+    assert study.only([]) == study
     with pytest.raises(
         CoopenvError, match=r"the study has no 'facde' \(did you mean 'facade'\?\); known: 1, 7, facade"
     ):
