@@ -24,6 +24,7 @@ from coopenv.cli import main
 from coopenv.runs.page import index_text
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
+from tests.helpers.commands import refused
 
 PAGES = Path(__file__).parents[2] / "docs" / "environments"
 SMALL = """
@@ -154,14 +155,10 @@ def made_up_value_of_sensing(scenario: Scenario) -> dict[str, object]:
 
 
 def test_figures_that_are_older_than_the_environment_are_marked() -> None:
-    scenario = load_scenario("facade")
-    value = made_up_value_of_sensing(scenario)
-    assert "has changed since" not in value_of_sensing_text("facade", scenario, value)
-    assert "| sensed | peek | 50 [25, 75] |" in value_of_sensing_text("facade", scenario, value)
-    assert "has changed since" not in value_of_sensing_text(
-        "facade", load_scenario("facade", {"title": "Another"}), value
-    )
-    assert "has changed since" in value_of_sensing_text("facade", load_scenario("facade", {"camera.range": 5.0}), value)
+    value = made_up_value_of_sensing(load_scenario("facade"))
+    for changes, marked in (({}, False), ({"title": "Another"}, False), ({"camera.range": 5.0}, True)):
+        text = value_of_sensing_text("facade", load_scenario("facade", changes), value)
+        assert ("has changed since" in text) == marked and "| sensed | peek | 50 [25, 75] |" in text
 
 
 @pytest.mark.parametrize(
@@ -174,17 +171,12 @@ def test_figures_that_are_older_than_the_environment_are_marked() -> None:
         (["page", "busy_intersection", "--measure"], "all motion here is prescribed"),
     ],
 )
-def test_mistakes_are_one_line(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*arguments, "--out", str(tmp_path / "pages")]) == 2
-    error = capsys.readouterr().err
-    assert words in error and len(error.strip().splitlines()) == 1
+def test_mistakes_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
+    assert words in refused(*arguments, "--out", str(tmp_path / "pages"))
     assert not list(tmp_path.rglob("*.*"))
 
 
-def test_figures_that_cannot_be_read_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     (tmp_path / "facade.json").write_text('{"rows": []}')
-    assert main(["page", "facade", "--out", str(tmp_path)]) == 2
-    assert "facade.json: no figures of a page" in capsys.readouterr().err
+    assert "facade.json: no figures of a page" in refused("page", "facade", "--out", str(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["facade.json"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import tomllib
 from pathlib import Path
@@ -11,28 +10,24 @@ from typing import Any
 
 import jsonschema
 import pytest
-from rich.console import Console
 
 import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.installation import data_directory
 from coopenv.cli import main
 from coopenv.runs import scenario_text as words
-from coopenv.runs.scenario_text import settings
+from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
 from coopenv.runs.summary import describe_scenario
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario, schema_text
+from tests.helpers.commands import printed
 from tests.helpers.four_way import FOUR_WAY
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"
 
 
 def described(name: str, width: int, **overrides: Any) -> str:
-    stream = io.StringIO()
-    console = Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
-    for part in describe_scenario(coopenv.load_scenario(name, overrides)):
-        console.print(part)
-    return stream.getvalue()
+    return printed(*describe_scenario(coopenv.load_scenario(name, overrides)), width=width)
 
 
 @pytest.mark.parametrize("width", [80, 100])
@@ -69,12 +64,11 @@ def test_the_sections_of_the_busy_intersection() -> None:
 
 
 def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
-    fields = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
     keys = {name: [key for key, *_ in settings(coopenv.load_scenario(name).camera)] for name in coopenv.list_envs()}
     assert coopenv.load_scenario("busy_intersection").camera.model == "omnidirectional"
-    assert not set(fields) & set(keys["busy_intersection"])
+    assert not set(IMAGE_FIELDS) & set(keys["busy_intersection"])
     assert {"model", "position", "orientation", "miss_probability"} <= set(keys["busy_intersection"])
-    assert set(fields) <= set(keys["crossing_path"])
+    assert set(IMAGE_FIELDS) <= set(keys["crossing_path"])
     assert "principal_point" not in described("busy_intersection", 100)
 
 
@@ -231,11 +225,7 @@ def test_what_is_drawn_is_described() -> None:
         "vehicles": [{"routes": ["left", "ahead"], "motion": {"kind": "driven"}}],
         "randomisation": {"camera_range": [0.8, 1.2]},
     }
-    stream = io.StringIO()
-    console = Console(file=stream, width=160, markup=False, highlight=False, emoji=False)
-    for part in describe_scenario(parse_scenario(raw, "test")):
-        console.print(part)
-    text = stream.getvalue()
+    text = printed(*describe_scenario(parse_scenario(raw, "test")), width=160)
     for said in (
         *("end of its route: left or ahead", "(-8, 0), (0, 0), (0, 8)", "radius 1.5", "shifted by +- 0.1"),
         *("wanders by 0.2", "begun along the first 1", "there with 80 %", "+- (0.5, 0.5, 0)", "drawn by group posts"),

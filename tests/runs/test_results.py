@@ -17,6 +17,7 @@ from coopenv.cli import main
 from coopenv.runs.command import Results
 from coopenv.runs.recorder import write_tum
 from coopenv.viz import FIGURE_NAMES
+from tests.helpers.commands import refused
 from tests.helpers.synthetic import make_trajectory
 
 
@@ -59,12 +60,9 @@ def test_trajectories_are_exported(folder: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(rows[:, 1:4], trajectory.position_estimate[:, 1], atol=1e-9)
 
 
-def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
     def said(change: str) -> str:
-        assert main(["figures", str(tmp_path / change)]) == 2
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1
-        return error
+        return refused("figures", str(tmp_path / change))
 
     assert "no folder of `coopenv run` (metrics.json: No such file" in said("nothing")
     for name, text, why in (

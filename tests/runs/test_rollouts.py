@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import coopenv
 from coopenv.base.errors import CoopenvError, DeviceError
@@ -22,6 +20,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
+from tests.helpers.commands import printed
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.synthetic import make_trajectory
 
@@ -156,21 +155,22 @@ def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
     assert np.array_equal(Trajectory.load(tmp_path / "run.npz").position, trajectory.position)
 
 
-def test_metrics_are_strict_json_with_figures_of_every_vehicle() -> None:
-    recording = Rollout(coopenv.load_scenario("busy_intersection"), seed=3, steps=60)
+def played(recording: Rollout) -> Rollout:
     for _ in recording.play():
         pass
+    return recording
+
+
+def test_metrics_are_strict_json_with_figures_of_every_vehicle() -> None:
+    recording = played(Rollout(coopenv.load_scenario("busy_intersection"), seed=3, steps=60))
     trajectory = recording.trajectory()
     vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 35.0)
     metrics = run_metrics("busy_intersection", {"a.b": [1]}, recording, vehicles, 35.0)
     text = json_text(metrics)
     assert "NaN" not in text
     read = json.loads(text)
-    assert read["seed"] == 3
-    assert read["overrides"] == {"a.b": [1]}
-    assert read["versions"]["coopenv"] == coopenv.__version__
-    assert read["simulated_time_s"] == 6.0
-    assert read["real_time_factor"] > 1.0
+    assert (read["seed"], read["overrides"], read["simulated_time_s"]) == (3, {"a.b": [1]}, 6.0)
+    assert read["versions"]["coopenv"] == coopenv.__version__ and read["real_time_factor"] > 1.0
     assert [vehicle["vehicle"] for vehicle in read["vehicles"]] == [f"vehicle_{i}" for i in range(1, 6)]
     first, last = read["vehicles"][0], read["vehicles"][4]
     assert first["steady_position_rmse_m"] is None  # the run ends before
@@ -189,9 +189,7 @@ def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
 
 
 def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Rollout, list[dict[str, Any]]]:
-    recording = Rollout(coopenv.load_scenario(name, overrides), seed=1, policy=policy)
-    for _ in recording.play():
-        pass
+    recording = played(Rollout(coopenv.load_scenario(name, overrides), seed=1, policy=policy))
     run = recording.trajectory()
     return recording, vehicle_metrics(run, analyse_observability(run), recording.endings(), 5.0)
 
@@ -256,9 +254,7 @@ def test_what_odometry_carries_is_told_apart() -> None:
 def test_rates_of_the_theory_are_those_of_the_papers_observer() -> None:
     _, vehicles = vehicles_of("overtaking", **{"horizon": 12.0, "observer.name": "robust"})
     assert all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles) and list(rates(vehicles)) == []
-    recording = Rollout(coopenv.load_scenario("busy_intersection", {"noise.enabled": False, "horizon": 12.0}))
-    for _ in recording.play():
-        pass
+    recording = played(Rollout(coopenv.load_scenario("busy_intersection", {"noise.enabled": False, "horizon": 12.0})))
     run = recording.trajectory()
     theory = theory_rates(recording, run)
     assert theory is not None and theory.guaranteed.shape == (721, 5)
@@ -268,7 +264,5 @@ def test_rates_of_the_theory_are_those_of_the_papers_observer() -> None:
     for i, row in enumerate(rows):
         assert row["guaranteed_rate_per_s"] == theory.guaranteed[:, i].min()
         assert row["frozen_rate_per_s"] <= row["frozen_rate_window_per_s"]
-    printed = StringIO()
-    for part in rates(rows):
-        Console(file=printed, width=80).print(part)
-    assert "vehicle_5" in printed.getvalue() and "…" not in printed.getvalue()
+    text = printed(*rates(rows))
+    assert "vehicle_5" in text and "…" not in text

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from rich.console import Console
 from scipy.stats import chi2
 
 import coopenv
@@ -33,6 +32,7 @@ from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs.recorder import record
 from coopenv.viz.figures import COLUMNS
 from coopenv.viz.style import LEAST, contrast
+from tests.helpers.commands import printed
 
 SHORT = {"horizon": 1.5}
 
@@ -134,10 +134,8 @@ def test_tables(comparison: coopenv.Comparison) -> None:
     lines = [line.split()[0] for line in text.splitlines() if line.startswith(("riccati", "Mine", "Raises"))]
     assert lines[:3] == ["riccati", "Mine", "Raises"]
     assert "ratio" not in text and "bound (ancestors)" in text and "0.0123(4): 0.0123 with a standard error" in text
-    printed = StringIO()
-    Console(file=printed, width=80).print(comparison.table("v2x_loss"))
     row = comparison.rows_in("v2x_loss", "riccati")[0]
-    assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in printed.getvalue()
+    assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in printed(comparison.table("v2x_loss"))
 
 
 def test_csv_and_latex(comparison: coopenv.Comparison, tmp_path: Path) -> None:
@@ -160,13 +158,8 @@ def test_the_table_fits_a_column_of_a_paper(tmp_path: Path) -> None:
     style = shutil.which("kpsewhich") and subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True).stdout
     if not (style and shutil.which("pdflatex")):
         pytest.skip("LaTeX with booktabs is not installed")
-    found = coopenv.compare(
-        ["split_covariance_intersection", "dead_reckoning"],
-        "busy_intersection_tracking",
-        2,
-        overrides={"horizon": 1.0},
-        steady_from=0.5,
-    )
+    names, short = ["split_covariance_intersection", "dead_reckoning"], {"horizon": 1.0}
+    found = coopenv.compare(names, "busy_intersection_tracking", 2, overrides=short, steady_from=0.5)
     found.to_latex(tmp_path / "rows.tex")
     paper = r"\documentclass{article}\usepackage{booktabs}\begin{document}\noindent"
     paper += r"\begin{minipage}{3.5in}\input{rows}\end{minipage}\end{document}"

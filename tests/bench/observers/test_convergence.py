@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from functools import cache
-from io import StringIO
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
@@ -33,6 +31,7 @@ from coopenv.observers import Estimate, Recording, Tick, find, run
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs import rollout
 from coopenv.runs.recorder import record
+from tests.helpers.commands import printed, refused
 
 
 @cache
@@ -102,9 +101,7 @@ def test_failures_are_counted_and_told() -> None:
     assert line.startswith(f"raises (basin): failed in {raises.failed} of 6 draws, first of vehicle_")
     assert "ZeroDivisionError" in line
     assert {draw.failure for draw in draws if draw.observer == "mekf"} == {""}
-    printed = StringIO()
-    Console(file=printed, width=80).print(basin_table([raises, mekf]))
-    assert printed.getvalue().splitlines()[3].split()[:3] == ["raises", "6", str(raises.failed)]
+    assert printed(basin_table([raises, mekf])).splitlines()[3].split()[:3] == ["raises", "6", str(raises.failed)]
 
 
 def test_draws_are_reproducible() -> None:
@@ -143,12 +140,12 @@ def test_all_vehicles_settle_under_the_papers_noise() -> None:
 def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["bench", "seeds", "overtaking", "--seeds", "2", "--set", "horizon=2.0"]
     assert main(words) == 0
-    printed = capsys.readouterr().out
-    assert "vehicle_2" in printed and "2/2" in printed
+    told = capsys.readouterr().out
+    assert "vehicle_2" in told and "2/2" in told
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["seeds"] == [0, 1]
     assert [vehicle["vehicle"] for vehicle in found["vehicles"]] == ["vehicle_1", "vehicle_2"]
     assert all(len(vehicle["position_rmse_m"]) == 2 for vehicle in found["vehicles"])
-    assert main(["bench", "seeds", "overtaking", "--steady-from", "99"]) == 2
-    assert "steady_from 99 is not within the run of 45 s" in capsys.readouterr().err
+    told = refused("bench", "seeds", "overtaking", "--steady-from", "99")
+    assert "steady_from 99 is not within the run of 45 s" in told
