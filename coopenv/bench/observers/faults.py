@@ -30,23 +30,23 @@ DIRECTION = np.array([0.6, 0.8, 0.0])
 """Of a false position, map axes: horizontal, and along no road."""
 
 
-def with_loss(recording: Recording, probability: float, seed: int = 0) -> Recording:
+def with_loss(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Lose each message, per receiver, with a probability in [0, 1]; the last received message stays known."""
     inbox = recording.inbox_tick
     news = np.diff(inbox, axis=0, prepend=-1) > 0
-    kept = news & (np.random.default_rng([seed, 1]).random(inbox.shape) >= probability)
+    kept = news & (np.random.default_rng([seed, 1]).random(inbox.shape) >= fault.value)
     return changed(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
 
 
-def with_delay(recording: Recording, seconds: float) -> Recording:
+def with_delay(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Deliver every message later, by a time that is rounded to whole ticks."""
-    ticks = min(round(seconds / recording.dt), recording.ticks)
+    ticks = min(round(fault.value / recording.dt), recording.ticks)
     inbox = np.full_like(recording.inbox_tick, -1)
     inbox[ticks:] = recording.inbox_tick[: recording.ticks - ticks]
     return changed(recording, inbox_tick=inbox)
 
 
-def with_wrong_association(recording: Recording, share: float, seed: int = 0) -> Recording:
+def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Swap bearings within frames so that a share of all bearings carry the identity of another visible target.
 
     Every bearing starts a swap with another one of its frame, drawn at random, with half that probability, so that
@@ -54,7 +54,7 @@ def with_wrong_association(recording: Recording, share: float, seed: int = 0) ->
     """
     bearings = recording.bearings.copy()
     generator = np.random.default_rng([seed, 2])
-    starts = recording.visible & (generator.random(recording.visible.shape) < share / 2)
+    starts = recording.visible & (generator.random(recording.visible.shape) < fault.value / 2)
     partners = generator.random(recording.visible.shape)
     for k, i, target in np.argwhere(starts):
         others = np.flatnonzero(recording.visible[k, i])
@@ -65,16 +65,17 @@ def with_wrong_association(recording: Recording, share: float, seed: int = 0) ->
     return changed(recording, bearings=bearings)
 
 
-def without_landmarks(recording: Recording, start: float, duration: float) -> Recording:
-    """Hide all landmarks from a time on, for a duration, s."""
-    lost = (recording.t >= start) & (recording.t < start + duration)
+def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Hide all landmarks from a time on, for a duration."""
+    start = fault.start_in(float(recording.t[-1]))
+    lost = (recording.t >= start) & (recording.t < start + fault.duration)
     landmarks = np.arange(recording.visible.shape[2]) < recording.landmarks.shape[1]
     hidden = lost[:, None, None] & landmarks
     bearings = np.where(hidden[..., None], np.nan, recording.bearings)
     return changed(recording, visible=recording.visible & ~hidden, bearings=bearings)
 
 
-def with_lie(recording: Recording, fault: Fault) -> Recording:
+def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Let vehicles broadcast another pose, as `[faults.lie]` of a scenario does; default: the usual sender."""
     from coopenv.observers.mailbox import Interference
 
@@ -148,18 +149,14 @@ class WorldFault(FaultKind):
 
 
 FAULTS: dict[str, RecordFault | WorldFault] = {
-    "v2x_loss": RecordFault(
-        "SHARE", "of the messages that is lost", 0.3, high=1.0, change=lambda r, f, seed: with_loss(r, f.value, seed)
-    ),
-    "v2x_delay": RecordFault(
-        "SECONDS", "by which messages arrive later", 0.2, change=lambda r, f, seed: with_delay(r, f.value)
-    ),
+    "v2x_loss": RecordFault("SHARE", "of the messages that is lost", 0.3, high=1.0, change=with_loss),
+    "v2x_delay": RecordFault("SECONDS", "by which messages arrive later", 0.2, change=with_delay),
     "wrong_association": RecordFault(
         "SHARE",
         "of the bearings that carries the identity of another target in view",
         0.05,
         high=1.0,
-        change=lambda r, f, seed: with_wrong_association(r, f.value, seed),
+        change=with_wrong_association,
     ),
     "landmarks_lost": RecordFault(
         "",
@@ -167,7 +164,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         0.0,
         start=True,
         duration=True,
-        change=lambda r, f, seed: without_landmarks(r, f.start_in(float(r.t[-1])), f.duration),
+        change=without_landmarks,
     ),
     "lie": RecordFault(
         "KIND[:AMOUNT]",
@@ -176,7 +173,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         start=True,
         options=("std",),
         vehicles=True,
-        change=lambda r, f, seed: with_lie(r, f),
+        change=with_lie,
     ),
     "odometry_scale": WorldFault("STD", "of the odometry's scale error", key="noise.odometry_scale"),
     "gyro_bias": WorldFault("STD", "of the gyro's bias per axis, rad/s", key="noise.gyro_bias"),
