@@ -185,8 +185,8 @@ class Judge:
 
     def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
         """Return how much an agent's figures differ from another's in the same worlds."""
-        pair = tuple(_driven(environment, each, {}, REPORTED) for each in (agent, other))
-        return self._once(pair, lambda: compare_paired(*map(self._drive, pair)))
+        own, others = (_driven(environment, each, {}, REPORTED) for each in (agent, other))
+        return self._once((own, others), lambda: compare_paired(self._drive(own), self._drive(others)))
 
     def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
         """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""

@@ -95,32 +95,23 @@ def scene(
             help="Kind of scene and how many vehicles, such as lane:20, lane:8,seen=2 or random:12,seed=3.",
         ),
     ],
-    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
+    out: options.TextFile = None,
 ) -> None:
     """Write a parametric scene as a scenario file, to be kept or changed.
 
     Scenes stand wherever an environment does: coopenv bench observers lane:20. `coopenv list scenes` lists them.
     """
-    from coopenv.base.files import replace_text
     from coopenv.scenario.scenes import scene_text
 
-    text = scene_text(name)
-    if out is None:
-        sys.stdout.write(text)
-    else:
-        replace_text(out, text)
+    options.write_text(scene_text(name), out)
 
 
 @app.command()
-def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:
+def schema(out: options.TextFile = None) -> None:
     """Write the JSON schema of scenario files, for editors."""
-    from coopenv.base.files import replace_text
     from coopenv.scenario.files import schema_text
 
-    if out is None:
-        sys.stdout.write(schema_text())
-    else:
-        replace_text(out, schema_text())
+    options.write_text(schema_text(), out)
 
 
 for command in (run, figures, export, record, import_, dataset, train, evaluate, watch, play, view, film):

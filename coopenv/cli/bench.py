@@ -148,9 +148,18 @@ def bench_observers(given: ObserverOptions) -> None:
         if given.basin:
             check_source(plan.source)
         plan.source.check()
-    executor, command = find_executor(given.engine, given.jobs, given.address), given.command_of(plan)
-    output = {"out": given.out, "figures": given.figures, "width": given.width and given.width.value}
-    perform(plan, command, executor, printed, log, basin=given.basin, as_json=given.as_json, **output)
+    perform(
+        plan,
+        given.command_of(plan),
+        find_executor(given.engine, given.jobs, given.address),
+        printed,
+        log,
+        basin=given.basin,
+        out=given.out,
+        figures=given.figures,
+        width=given.width and given.width.value,
+        as_json=given.as_json,
+    )
     if given.open_report and given.out is not None:
         options.show(given.out / REPORT_FILE)
 

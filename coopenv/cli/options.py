@@ -220,6 +220,7 @@ LogScene = Annotated[
     bool,
     typer.Option("--scene/--no-scene", help="Also write what Foxglove and Lichtblick show: scene, cameras, estimates."),
 ]
+TextFile = Annotated[Path | None, typer.Option(help="File to write (default: standard output).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[
     float | None,
@@ -319,6 +320,16 @@ def print_json(result: Any) -> None:
     from coopenv.base.format import json_text
 
     sys.stdout.write(json_text(result))
+
+
+def write_text(text: str, out: Path | None) -> None:
+    """Write a text to a file, or to standard output without one."""
+    from coopenv.base.files import replace_text
+
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        replace_text(out, text)
 
 
 def show(path: Path) -> None:

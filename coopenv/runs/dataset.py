@@ -91,16 +91,16 @@ def drive_vehicles(
         if not there[world, vehicle]:
             continue
         length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(actions) - 1)) + 1
-        chosen, result, whole = slice(length), slice(1, length + 1), slice(length + 1)
+        before, after, whole = slice(length), slice(1, length + 1), slice(length + 1)
         episodes.append(
             DrivenEpisode(
                 world=world,
                 vehicle=scenario.vehicle_names[vehicle],
                 observations=observations[whole, world, vehicle],
-                actions=driven[chosen, world, vehicle],
-                rewards=rewards[result, world, vehicle].astype(float),
-                terminations=terminated[result, world, vehicle].astype(bool),
-                truncations=truncated[result, world, vehicle].astype(bool),
+                actions=driven[before, world, vehicle],
+                rewards=rewards[after, world, vehicle].astype(float),
+                terminations=terminated[after, world, vehicle].astype(bool),
+                truncations=truncated[after, world, vehicle].astype(bool),
                 position_error=errors[whole, world, vehicle].astype(float),
             )
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -356,7 +356,7 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
     return replace(variant, scenario=load_scenario(text, {**overrides, **found})) if found else variant
 
 
-def check_vehicles(fault: Fault, known: Collection[str]) -> None:
+def check_vehicles(fault: Fault, known: Sequence[str]) -> None:
     """Refuse unknown vehicles. Raises CoopenvError: it names the known ones."""
     for name in fault.vehicles:
         if name not in known:
@@ -365,7 +365,7 @@ def check_vehicles(fault: Fault, known: Collection[str]) -> None:
             )
 
 
-def check_recorded(variant: FaultVariant, vehicles: Collection[str]) -> None:
+def check_recorded(variant: FaultVariant, vehicles: Sequence[str]) -> None:
     """Refuse faults that a finished record of these vehicles cannot have. Raises CoopenvError."""
     for fault in variant.faults:
         if isinstance(FAULTS[fault.name], WorldFault):

@@ -237,13 +237,14 @@ def find_source(
     bag, path = is_bag(text, topics), Path(text)
     if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
         scenario = load_scenario(text, overrides)
-        worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
+        worlds = tuple(with_world(made, str(text), scenario, overrides or {}) for made in added)
         if policy is not None:
             if not scenario.driven:
                 raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
             load_policy(policy, scenario, 0)
         return Simulated(path.stem, scenario, policy or "zero", added=worlds)
     robots = sort is SourceKind.DATASET
+    folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
         f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
         f"--fault {next(iter(faults), '')}: recorded robots have variants of their own, {', '.join(Robots.named)}": (
@@ -260,8 +261,8 @@ def find_source(
         if holds:
             raise CoopenvError(reason)
     if bag:
-        return Bags(path.stem, path, topics and Path(topics), dict(overrides or {}), added=added)
-    return Robots(str(text), data and Path(data)) if robots else LogFile(path.stem, path, added=added)
+        return Bags(path.stem, path, topic_map, dict(overrides or {}), added=added)
+    return Robots(str(text), folder) if robots else LogFile(path.stem, path, added=added)
 
 
 def variants_of(source: Source, asked: str | Iterable[str] | None) -> tuple[str, ...]:
