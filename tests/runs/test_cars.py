@@ -94,14 +94,8 @@ def test_what_gates_refused_before_does_not_count() -> None:
 
     def say(state: str, session: str, stale: int) -> None:
         counts = {"rejections": ["stale", "session"], "counts": np.array([stale, 3], dtype=np.uint64)}
-        about: dict[str, Any] = {
-            "header": header(time.time_ns()),
-            "session": session,
-            "nonce": "n",
-            "state": state,
-            **counts,
-        }
-        message = make(SVEA.topics[Role.GATE].type, **about, accepted=0, last_sequence=0)
+        about: dict[str, Any] = {"header": header(time.time_ns()), "session": session, "nonce": "n", "state": state}
+        message = make(SVEA.topics[Role.GATE].type, **about, **counts, accepted=0, last_sequence=0)
         gate.publish(SVEA.topic_of("svea7", Role.GATE), encode(message))
 
     assert gates.refused("svea7") == {}
@@ -133,10 +127,7 @@ def test_what_no_camera_can_tell_is_told(tmp_path: Path) -> None:
     [
         (('"svea_overtaking"', '"gone.toml"'), r"^fleet\.toml: environment: no such scenario file: .*gone\.toml$"),
         (('"svea_overtaking"', '"svea_overtakin"'), r"^fleet\.toml: environment: unknown environment .*did you mean"),
-        (
-            ("fakes", 'overrides = { "noise.velosity" = 1 }\nfakes'),
-            r"^fleet\.toml: overrides: noise\.velosity: unknown",
-        ),
+        (("fakes", 'overrides = { "noise.velosity" = 1 }\nfakes'), r"^fleet\.toml: overrides: noise\.velosity: unkn"),
         (("fakes", 'overrides = { "vehicles.9.yaw" = 1 }\nfakes'), r"^fleet\.toml: override 'vehicles\.9\.yaw'"),
         (("fakes", 'security.keys = "nokeys"\nfakes'), r"^fleet\.toml: security\.keys: there is no folder '.*nokeys'"),
     ],

@@ -38,18 +38,32 @@ scenario.reward.weights.position_uncertainty = 0.0
 COMMAND = (*COOPENV, "bench", "learning", "study.toml", "--worlds", "4", "--jobs", "2", "--logs", "logs")
 
 
-def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path) -> None:
+@pytest.fixture(autouse=True)
+def study(tmp_path: Path) -> None:
     (tmp_path / "train.toml").write_text(SETTINGS)
     (tmp_path / "study.toml").write_text(STUDY)
-    first = start(COMMAND, tmp_path)
-    wait_until(lambda: (tmp_path / "open_square_quality" / "card.md").is_file() or first.poll() is not None)
-    os.killpg(first.pid, signal.SIGKILL)
-    first.communicate()
+
+
+def killed_as_soon_as(path: Path, folder: Path, *more: str) -> None:
+    """Kill the command as soon as a file is there."""
+    process = start((*COMMAND, *more), folder)
+    wait_until(lambda: path.is_file() or process.poll() is not None)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def trained(folder: Path, *more: str) -> str:
+    """Return what the command prints."""
+    process = start((*COMMAND, *more), folder)
+    printed, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return printed
+
+
+def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path) -> None:
+    killed_as_soon_as(tmp_path / "open_square_quality" / "card.md", tmp_path)
     early = (tmp_path / "open_square_quality" / "seed_1" / "weights.safetensors").stat().st_mtime_ns
-    second = start(COMMAND, tmp_path)
-    printed, errors = second.communicate(timeout=300)
-    assert second.returncode == 0, errors
-    assert "open_square_plain" in printed
+    assert "open_square_plain" in trained(tmp_path)
     assert (tmp_path / "open_square_quality" / "seed_1" / "weights.safetensors").stat().st_mtime_ns == early
     for arm in ("quality", "plain"):
         folder = tmp_path / f"open_square_{arm}"
@@ -72,13 +86,9 @@ def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path
 
 
 def test_settings_that_changed_train_anew_what_was_finished(tmp_path: Path) -> None:
-    (tmp_path / "train.toml").write_text(SETTINGS)
-    (tmp_path / "study.toml").write_text(STUDY)
     for steps, only in (("2000", "1"), ("2400", "plain,1")):
         (tmp_path / "train.toml").write_text(SETTINGS.replace("2000", steps))
-        process = start((*COMMAND, "--only", only), tmp_path)
-        _, errors = process.communicate(timeout=300)
-        assert process.returncode == 0, errors
+        trained(tmp_path, "--only", only)
         assert read_settings(tmp_path / "open_square_plain" / "train.toml").steps == int(steps)
         page = (tmp_path / "README.md").read_text()
         assert "`open_square_plain`" in page
@@ -86,18 +96,11 @@ def test_settings_that_changed_train_anew_what_was_finished(tmp_path: Path) -> N
 
 
 def test_settings_that_changed_train_anew_what_was_interrupted(tmp_path: Path) -> None:
-    (tmp_path / "train.toml").write_text(SETTINGS)
-    (tmp_path / "study.toml").write_text(STUDY)
-    first = start((*COMMAND, "--only", "plain,1"), tmp_path)
     agent = tmp_path / "open_square_plain"
     kept = agent / "seed_1" / "checkpoint.safetensors"
-    wait_until(lambda: kept.is_file() or first.poll() is not None)
-    os.killpg(first.pid, signal.SIGKILL)
-    first.communicate()
+    killed_as_soon_as(kept, tmp_path, "--only", "plain,1")
     (tmp_path / "train.toml").write_text(SETTINGS.replace("2000", "3000"))
-    second = start((*COMMAND, "--only", "plain,1"), tmp_path)
-    _, errors = second.communicate(timeout=300)
-    assert second.returncode == 0, errors
+    trained(tmp_path, "--only", "plain,1")
     assert read_settings(agent / "train.toml").steps == 3000
     assert not kept.exists()
 
@@ -107,7 +110,6 @@ def test_what_cannot_be_trained_is_told_before_anything_is(tmp_path: Path) -> No
         SETTINGS
         + '[environments.open_square.arms.plain]\nscenario.observation.exclude = ["map"]\nclone.agent = "peek"\n'
     )
-    (tmp_path / "study.toml").write_text(STUDY)
     process = start(COMMAND, tmp_path)
     _, errors = process.communicate(timeout=100)
     assert process.returncode == 2

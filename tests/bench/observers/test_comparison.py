@@ -25,7 +25,7 @@ from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.faults import VARIANTS
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import failures
-from coopenv.observers import Setup, registry, run
+from coopenv.observers import registry, run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Estimate, Tick
 from coopenv.observers.single_frame import DeadReckoning
@@ -217,20 +217,15 @@ def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:
         comparison.table("v2x_delay")
 
 
-def makes(offset: float) -> type:
-    class Moved(DeadReckoning):
-        def __init__(self, setup: Setup) -> None:
-            super().__init__(setup)
-            self.offset = offset
-
-    return Moved
+def makes() -> type:
+    return type("Moved", (DeadReckoning,), {})
 
 
 @pytest.mark.parametrize(
     ("observers", "options", "message"),
     [
         ("riccati", {}, r"expected a list such as \['riccati'\]"),
-        ([makes(1.0), makes(2.0)], {}, "two observers are named 'Moved'"),
+        ([makes(), makes()], {}, "two observers are named 'Moved'"),
         ([3], {}, "expected a name"),
         (["riccati"], {"seeds": 0}, "at least one"),
         (["riccati"], {"seeds": [1, -1]}, "must not be negative"),

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import coopenv
-from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import Local
 from coopenv.bench.observers import find_source
 from coopenv.bench.observers.convergence import (
@@ -109,11 +108,6 @@ def test_draws_are_reproducible() -> None:
     one, two = (study_basin(source, ["riccati"], 3, Local(1)) for _ in range(2))
     assert [d.draw for d in one] == [0, 0, 1, 1, 2, 2]
     assert str(one) == str(two) and all(d.initial_position_error_m <= 15.0 for d in one)
-
-
-def test_recorded_robots_have_no_basin() -> None:
-    with pytest.raises(CoopenvError, match="recorded"):
-        study_basin(find_source("mrclam_6"), ["riccati"], 1, Local(1))
 
 
 def test_study_equals_single_runs() -> None:

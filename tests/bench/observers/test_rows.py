@@ -6,6 +6,7 @@ import csv
 import json
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edge
 from coopenv.cli import main
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
-from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record
 
 SHORT = {"horizon": 3.0, "rates.camera": 20.0, "rates.odometry": 20.0}
@@ -87,18 +87,13 @@ def test_the_worst_anees_is_the_farthest_from_one() -> None:
 
 def test_seeds_share_one_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """It depends on what was true and seen, not on the noise: of many vehicles it takes minutes."""
-    calls = []
-
-    def counted(recording: Recording) -> object:
-        calls.append(recording)
-        return cramer_rao_ancestors(recording)
-
+    counted = Mock(side_effect=cramer_rao_ancestors)
     monkeypatch.setattr(judge, "cramer_rao_ancestors", counted)
     monkeypatch.setattr(judge, "_kept", type(judge._kept)())
     compare(["dead_reckoning"], "lane:2", 3, overrides={"horizon": 0.5})
-    assert len(calls) == 1
+    assert counted.call_count == 1
     compare(["dead_reckoning"], "lane:2", 2, overrides={"horizon": 0.5, "noise.bearing.scale": 0.01})
-    assert len(calls) == 2
+    assert counted.call_count == 2
 
 
 def test_the_command_writes_and_prints_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
