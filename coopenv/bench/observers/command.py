@@ -68,10 +68,10 @@ def perform(
         raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
     names = [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in FORMATS for name in figure_files(tuple(plan.source.variants), form)]
-    for name, reason in plan.left_out.items():
-        log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
+            for name, reason in plan.left_out.items():
+                log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
             with Progress(log, plan.work, total=1.0) as progress:
                 found = plan.run(executor, progress.update)
             if basin:
