@@ -151,15 +151,16 @@ COLUMNS = (
 )
 """Key of a vehicle's metrics, heading, and how a column of them is written."""
 
-RATE_COLUMNS = (
-    "rate_per_s",
-    "slowest_rate_per_s",
-    "slowest_rate_from_s",
-    "guaranteed_rate_per_s",
-    "guaranteed_rate_at_s",
-    "frozen_rate_window_per_s",
-    "frozen_rate_window_from_s",
-)
+RATE_COLUMNS = {
+    "rate_per_s": "fitted\n[1/s]",
+    "slowest_rate_per_s": "slowest 5 s\n[1/s]",
+    "slowest_rate_from_s": "from\n[s]",
+    "guaranteed_rate_per_s": "guaranteed\n[1/s]",
+    "guaranteed_rate_at_s": "at\n[s]",
+    "frozen_rate_window_per_s": "frozen, 5 s\n[1/s]",
+    "frozen_rate_window_from_s": "from\n[s]",
+}
+"""Key of a vehicle's metrics and heading."""
 
 VERDICTS = {
     "not_observable_s": "not observable",
@@ -190,11 +191,9 @@ def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
     """Yield the measured rates beside those of the theory and what they mean; nothing where there is no theory."""
     if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
         return
-    headings = ["fitted\n[1/s]", "slowest 5 s\n[1/s]", "from\n[s]", "guaranteed\n[1/s]", "at\n[s]"]
-    table = number_table(["rate\nvehicle"], [*headings, "frozen, 5 s\n[1/s]", "from\n[s]"])
+    table = number_table(["rate\nvehicle"], [*RATE_COLUMNS.values()])
     for vehicle in vehicles:
-        figures = [number(vehicle[key], 3) for key in RATE_COLUMNS]
-        table.add_row(vehicle["vehicle"], *figures)
+        table.add_row(vehicle["vehicle"], *(number(vehicle[key], 3) for key in RATE_COLUMNS))
     yield table
     yield "Guaranteed: the least of the run, in the norm of P. Frozen: k lambda_min(P M)."
     yield ""

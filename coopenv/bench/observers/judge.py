@@ -63,14 +63,18 @@ class Scene:
     """Properties of the record, the same for all observers; NaN where unknown."""
 
     vehicles: tuple[str, ...]
-    windows: tuple[Window, ...]  # W stretches that are judged one by one, the steady state last
-    bounds: Array  # (3, N, W) m^2, those of `BOUNDS` in each window
-    gramians: (
-        Array  # (2, N) least eigenvalues over the run: about the map origin, mixed units; about the vehicle, no unit
-    )
-    t: Array  # (S,) s
-    bound: Array  # (S, N) m, joint
-    paper_noise: bool  # bearings are noisy on the image plane, and so less than the bound assumes off the optical axis
+    windows: tuple[Window, ...]
+    """W stretches that are judged one by one, the steady state last."""
+    bounds: Array
+    """(3, N, W) m^2, those of `BOUNDS` in each window."""
+    gramians: Array
+    """(2, N) least eigenvalues over the run: about the map origin, mixed units; about the vehicle, no unit."""
+    t: Array
+    """(S,) s, instants that figures show."""
+    bound: Array
+    """(S, N) m, joint."""
+    paper_noise: bool
+    """Whether bearings are noisy on the image plane, and so less than the bound assumes off the optical axis."""
 
     @property
     def steady_from(self) -> float:
