@@ -186,13 +186,9 @@ def _together(films: list[Iterator[np.ndarray]]) -> Iterator[list[np.ndarray]]:
 
 def tiled(pictures: list[np.ndarray]) -> np.ndarray:
     """Return pictures of one size beside and below each other, at most `COLUMNS` in a row and `WIDEST` wide."""
-    height, width, _ = pictures[0].shape
     columns = min(COLUMNS, len(pictures))
-    rows = -(-len(pictures) // columns)
-    whole = np.full((rows * height, columns * width, 3), 255, np.uint8)
-    for i, picture in enumerate(pictures):
-        y, x = divmod(i, columns)
-        whole[y * height : (y + 1) * height, x * width : (x + 1) * width] = picture
+    padded = [*pictures, *[np.full_like(pictures[0], 255)] * (-len(pictures) % columns)]
+    whole = np.vstack([np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)])
     if whole.shape[1] <= WIDEST:
         return whole
     size = WIDEST, round(whole.shape[0] * WIDEST / whole.shape[1])

@@ -92,18 +92,18 @@ class Progress:
 
     def line(self) -> str:
         """Return how far the work is, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
-        elapsed, left = monotonic() - self._begin, self._left()
-        share = self._completed / self._total if self._total else 0.0
-        if share == 0.0:
-            return f"{self._description}: {elapsed:.0f} s"
-        if isnan(left):
-            return f"{self._description}: {100 * share:.0f} % after {elapsed:.0f} s"
-        return f"{self._description}: {100 * share:.0f} % after {elapsed:.0f} s, about {left:.0f} s left"
+        elapsed, left, share = monotonic() - self._begin, self._left(), self._share
+        done = f"{100 * share:.0f} % after " if share else ""
+        rest = "" if isnan(left) else f", about {left:.0f} s left"
+        return f"{self._description}: {done}{elapsed:.0f} s{rest}"
+
+    @property
+    def _share(self) -> float:
+        return self._completed / self._total if self._total else 0.0
 
     def _left(self) -> float:
         """Return the time that the rest will take at the pace so far, s; NaN where that is not known yet."""
-        share = self._completed / self._total if self._total else 0.0
-        elapsed = monotonic() - self._begin
+        share, elapsed = self._share, monotonic() - self._begin
         if not 0.0 < share <= 1.0:
             return nan
         if self._rate is not None:
