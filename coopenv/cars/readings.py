@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Self
 
@@ -14,6 +14,8 @@ from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.profile import CarProfile, Role
 from coopenv.estimation.lens import undistort
 from coopenv.estimation.poses import Array, log_so3
+from coopenv.observers.contract import Message
+from coopenv.scenario import base
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +45,6 @@ class CarPose:
 
 
 @dataclass(frozen=True, slots=True)
-class RobustReport:
-    """Report of the observer `robust`, see `coopenv.observers.robust.messages`."""
-
-    position: Array | None  # None: the sender has no position
-    rotation: Array | None
-    covariance: Array | None
-    extra: dict[str, NDArray[np.float64] | NDArray[np.uint64]]
-
-
-@dataclass(frozen=True, slots=True)
 class Calibration:
     """Intrinsics of a camera: plumb-bob model."""
 
@@ -77,7 +69,7 @@ class CarStatus:
     battery: float | None = None  # share that is left
 
 
-Value = Detections | Twist | CarPose | RobustReport | Calibration | CarStatus
+Value = Detections | Twist | CarPose | Message | Calibration | CarStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,18 +112,11 @@ UNIT = 1e-3
 
 def rotation_of(quaternion: Any, field: str) -> Array:
     """Return the rotation matrix (3, 3) of a message's quaternion. Raises CoopenvError: its length is not 1."""
-    w, x, y, z = (float(getattr(quaternion, part)) for part in "wxyz")
-    length = math.sqrt(w * w + x * x + y * y + z * z)
+    wxyz = [float(getattr(quaternion, part)) for part in "wxyz"]
+    length = math.hypot(*wxyz)
     if not abs(length - 1.0) <= UNIT:
         raise CoopenvError(f"{field}: no unit quaternion, its length is {length:.6g}")
-    w, x, y, z = w / length, x / length, y / length, z / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return base.rotation_of(None, wxyz)
 
 
 def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
@@ -206,10 +191,8 @@ def bearings(message: Any, calibration: Calibration | None, known: Collection[in
             pixels = flat * calibration.focal_length + np.asarray(calibration.principal_point)
             rays_, imaged = rays(np.round(pixels, 3), calibration)  # of single precision
             there &= imaged
-    found = zip(
-        table[:, 0].astype(int).tolist(), range(0, -len(table), -1), rays_.tolist(), there.tolist(), strict=True
-    )
-    return _largest([(marker, size, ray) for marker, size, ray, valid in found if valid], len(table), known)
+    found = [(int(marker), 0, ray) for marker, ray in zip(table[there, 0], rays_[there], strict=True)]
+    return _largest(found, len(table), known)
 
 
 def _few(entries: Any, field: str) -> Any:
@@ -219,7 +202,7 @@ def _few(entries: Any, field: str) -> Any:
 
 
 def _largest(found: list[tuple[int, int, Any]], total: int, known: Collection[int] | None) -> Detections:
-    """Return the largest entry (marker, size, ray or None) of each known marker, of so many entries in all."""
+    """Return the first largest entry (marker, size, ray or None) of each known marker, of so many entries in all."""
     best: dict[int, tuple[int, Any]] = {}
     for marker, size, ray in found:
         counts = ray is not None and (known is None or marker in known)
@@ -331,19 +314,18 @@ def _turning(message: Any) -> Twist:
 
 def _pose_with_covariance(message: Any) -> CarPose:
     """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros means unknown."""
-    pose = _placed(message.pose.pose)
     covariance = covariance_of(message.pose.covariance, "pose.covariance")
-    return CarPose(pose.position, pose.rotation, covariance if covariance.any() else None)
+    return replace(_placed(message.pose.pose), covariance=covariance if covariance.any() else None)
 
 
 def _placed(pose: Any) -> CarPose:
     return CarPose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
-def _report(message: Any) -> RobustReport:
-    """Return what `robust` sent; `extra` as its messages have it."""
+def _report(message: Any) -> Message:
+    """Return the message of the observer `robust`, see `coopenv.observers.robust.messages`; none: no position."""
     if not message.valid:
-        return RobustReport(None, None, None, {})
+        return Message()
     pose, odometry = _placed(message.pose), message.odometry
     moved = vector(odometry.position, "odometry.position", FARTHEST)
     turned = log_so3(rotation_of(odometry.orientation, "odometry.orientation"))
@@ -354,7 +336,7 @@ def _report(message: Any) -> RobustReport:
         "ages": np.zeros(0, np.float32),
         "correlations": np.zeros((0, 6, 6), np.int8),
     }
-    return RobustReport(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
+    return Message(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
 
 
 POSES: dict[str, Callable[[Any], Value]] = {

@@ -8,8 +8,8 @@ tick's `bearing_age`.
 """
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,10 @@ from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import VELOCITY, Role
-from coopenv.cars.readings import Calibration, CarPose, Detections, RobustReport, Sample, Twist, read
+from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.poses import Array
-from coopenv.observers.contract import sealed
+from coopenv.observers.contract import Message, sealed
 from coopenv.observers.recording import Sensed, Truth, is_due
 
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
@@ -34,60 +34,88 @@ class _Car:
     """The samples of one car."""
 
     def __init__(self, refused: Counter[str]) -> None:
-        self.odometer, self.frames, self.track = Odometer(refused), Frames(refused), PoseTrack()
-        self.moment: int | None = None
+        self.odometer, self.frames, self.track = Odometer(), Frames(refused), PoseTrack()
+        self.moment = 0
         self.lag = 0  # ns by which the last frame was behind its tick
-        self.exposed: int | None = None  # when the last frame was
+        self.exposed = 0  # when the last frame was; the begin of the episode before there is one
+
+    def advance(self, now: int, half: int) -> Detections | None:
+        """Move the moment to that of the next frame, or on with the clock; return the frame.
+
+        Args:
+            now: time of the tick.
+            half: ns of half a period more behind the clock, so that the frame that comes too late for this tick is
+                after the moment.
+        """
+        if (taken := self.frames.take(self.moment, now)) is None:
+            self.moment = max(self.moment, now - self.lag - half)
+            return None
+        self.moment, frame = taken
+        self.lag, self.exposed = now - self.moment, self.moment
+        return frame
+
+
+KINDS = {
+    Role.TRUTH: "motion capture",
+    **dict.fromkeys((Role.WHEEL, Role.IMU, Role.ODOMETRY), "odometry"),
+    **dict.fromkeys((Role.DETECTIONS, Role.BEARINGS), "frame"),
+}
+"""By role, the kind of a sample in counts of refused ones; others are messages between cars."""
 
 
 class Assembler:
     """Makes ticks of samples; the result depends on the order of calls alone."""
 
-    def __init__(self, binding: Binding, offsets: Mapping[str, int] | None = None) -> None:
-        """Begin with nothing.
-
-        Args:
-            binding: vehicles and markers of the cars.
-            offsets: ns to add to a car's stamps to have them on the receiver's clock (none: they are on it).
-        """
+    def __init__(self, binding: Binding) -> None:
+        """Begin with nothing; `binding` are vehicles and markers of the cars."""
         self.binding = binding
-        self._offsets = dict(offsets or {})
         scenario, topics = binding.scenario, binding.profile.topics
         self._late, self._silent = topics[Role.DETECTIONS].max_age_ns, topics[Role.ODOMETRY].max_age_ns
-        self._period = round(1e9 / scenario.rates.camera)
+        self._half = round(1e9 / scenario.rates.camera) // 2
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
         self._to_body = [camera.to_body() for camera in scenario.cameras]
+        self._origin = np.array(scenario.map.origin)
         self._begin = 0
+        self._newest: dict[tuple[str, Role], int] = {}
         self.refused: Counter[str] = Counter()
         """Samples that were not used, by reason."""
         self._cars = [_Car(self.refused) for _ in scenario.vehicles]
         self._inbox = NeighbourInbox(binding, self.refused)
 
-    def put(self, sample: Sample) -> None:
-        """Take a sample."""
-        stamp, value = sample.stamp + self._offsets.get(sample.car, 0), sample.value
-        if stamp > sample.received + FUTURE:
-            self.refused["stamp in the future"] += 1
-        elif sample.car in self.binding.leaders:
-            if isinstance(value, CarPose) and sample.role in (Role.ESTIMATE, Role.POINT):
-                landmark = self.binding.leaders[sample.car]
-                self._inbox.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
-        elif sample.car not in self.binding.cars:
-            self.refused["unknown car"] += 1
-        else:
-            self._put_vehicle(self.binding.cars[sample.car], sample.role, stamp, value)
+    def put(self, sample: Sample) -> bool:
+        """Take a sample; return whether it is of a known car, not of the future, and newer than all before of it."""
+        key = car, role = sample.car, sample.role
+        why = ""
+        if car not in self.binding.leaders and car not in self.binding.cars:
+            why = "unknown car"
+        elif sample.stamp > sample.received + FUTURE:
+            why = "stamp in the future"
+        elif sample.stamp <= self._newest.get(key, -1):
+            why = f"{KINDS.get(role, 'message')} out of order"
+        if why:
+            self.refused[why] += 1
+            return False
+        self._newest[key] = sample.stamp
+        value = sample.value
+        if isinstance(value, CarPose | Message) and value.position is not None:
+            value = replace(value, position=value.position - self._origin)
+        if car in self.binding.cars:
+            self._put_vehicle(self.binding.cars[car], role, sample.stamp, value)
+        elif isinstance(value, CarPose) and role in (Role.ESTIMATE, Role.POINT):
+            self._inbox.put_landmark(self.binding.leaders[car], sample.stamp, sample.received, value)
+        return True
 
-    def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: object) -> None:
+    def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: Value) -> None:
         car = self._cars[vehicle]
         if isinstance(value, Twist):
             car.odometer.put(stamp, value)
         elif isinstance(value, Detections):
             self.refused["detections left out"] += value.dropped
             car.frames.put(stamp, value)
-        elif role is Role.TRUTH and isinstance(value, CarPose):
-            if not car.track.put(stamp, self._inbox.on_map(value)):
-                self.refused["motion capture out of order"] += 1
-        elif isinstance(value, CarPose | RobustReport) and vehicle not in self.binding.local:
+        elif role is Role.TRUTH:
+            if isinstance(value, CarPose) and value.rotation is not None:
+                car.track.put(stamp, value.rotation, value.position)
+        elif isinstance(value, CarPose | Message) and vehicle not in self.binding.local:
             self._inbox.put_vehicle(vehicle, role, stamp, value)
 
     def begin(self, now: int) -> Sensed:
@@ -95,19 +123,13 @@ class Assembler:
         self._begin = now
         for car in self._cars:
             car.frames.forget(now)  # no tick took frames since the last episode
-            car.moment, car.lag, car.exposed = now - self._period, 0, None
-            car.odometer.increment(now - self._period, now - self._period)
+            car.moment, car.lag, car.exposed = now - self._half, 0, now
         self._inbox.forget()
         return self.tick(0, now)
 
     def moment(self, vehicle: int) -> int:
         """Return the time in ns for which the present tick of a vehicle holds, on the receiver's clock."""
-        moment = self._cars[vehicle].moment
-        return self._begin if moment is None else moment
-
-    def _middle(self) -> int:
-        """Return the mean of the moments of the vehicles estimated here: when their frames were exposed."""
-        return sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
+        return self._cars[vehicle].moment
 
     def tick(self, index: int, now: int) -> Sensed:
         """Return tick number `index` at a time in ns."""
@@ -119,20 +141,22 @@ class Assembler:
         missing, late = np.zeros(N, bool), np.zeros(N, bool)
         truth = Truth(np.full((N, 3, 3), np.nan), np.full((N, 3), np.nan))
         for i, car in enumerate(self._cars):
-            frame = self._advance(car, index, now, i, rotation, translation)
-            truth.rotation[i], truth.position[i] = car.track.at(car.moment or now)
+            before = car.moment
+            frame = car.advance(now, self._half)
+            rotation[i], translation[i] = car.odometer.increment(before, car.moment)
+            truth.rotation[i], truth.position[i] = car.track.at(car.moment)
             if i not in self.binding.local:
                 missing[i] = True
                 continue
             stamp = car.odometer.stamp
-            age = now - stamp if stamp is not None else None
-            missing[i] = age is None or age > self._silent
-            odometry_age[i] = np.inf if age is None else max(age, 0) * NS
+            age = np.inf if stamp is None else max(now - stamp, 0)
+            missing[i], odometry_age[i] = age > self._silent, age * NS
             velocity[i], angular_velocity[i] = car.odometer.twist
-            bearing_age[i] = (now - car.exposed) * NS if car.exposed is not None else (now - self._begin) * NS
+            bearing_age[i] = (now - car.exposed) * NS
             if frame is not None:
                 late[i] = car.lag > self._late
                 self._see(i, frame, now, bearings[i], visible[i])
+        exposed = sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
         return Sensed(
             index=index,
             dt=1.0 / self.binding.scenario.rates.camera,
@@ -144,7 +168,7 @@ class Assembler:
             angular_velocity=angular_velocity,
             bearings=bearings,
             visible=visible,
-            landmarks=sealed(self._inbox.places(now, self._middle())),
+            landmarks=sealed(self._inbox.places(now, exposed)),
             odometry_age=odometry_age,
             bearing_age=bearing_age,
             missing=missing,
@@ -153,22 +177,6 @@ class Assembler:
             inbox_tick=np.full((N, N), -1, dtype=np.int64) if self.binding.remote else None,
             messages=self._inbox.messages(now),
         )
-
-    def _advance(
-        self, car: _Car, index: int, now: int, i: int, rotation: Array, translation: Array
-    ) -> Detections | None:
-        """Move a car's moment to that of its next frame, or on with the clock; return the frame."""
-        before = car.moment if car.moment is not None else now
-        taken = car.frames.take(before, now) if index > 0 else None
-        if taken is not None:
-            moment, frame = taken
-            car.lag, car.exposed = now - moment, moment
-        else:  # half a period more, so that the frame that comes too late for this tick is after it
-            moment, frame = max(before, now - car.lag - self._period // 2), None
-        if index > 0:
-            rotation[i], translation[i] = car.odometer.increment(before, moment)
-        car.moment = moment
-        return frame
 
     def _see(self, i: int, frame: Detections, now: int, bearings: Array, visible: NDArray[np.bool_]) -> None:
         """Write a frame's bearings into a car's row, (T, 3) and (T,)."""
@@ -214,7 +222,8 @@ class Intake:
 
     def __init__(self, binding: Binding, sensors: Sensors) -> None:
         """Collect the topics that are read."""
-        self._topics: dict[str, tuple[str, Role, Calibration | None]] = {}
+        self.topics: dict[str, tuple[str, Role, Calibration | None]] = {}
+        """Car, role and camera of the topics that are read, by name."""
         self._sensors, self._profile = sensors, binding.profile
         self.offsets = {name: ClockOffset() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
@@ -225,19 +234,14 @@ class Intake:
         own = (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
         for name, vehicle in binding.cars.items():
             for role in own if vehicle in binding.local else (*truth, *BROADCAST):
-                self._topics[binding.profile.topic_of(name, role)] = name, role, self.calibrations[name]
+                self.topics[binding.profile.topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
             for role in (Role.ESTIMATE, Role.POINT, *truth):
-                self._topics[binding.profile.topic_of(name, role)] = name, role, None
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Names of the topics that are read."""
-        return tuple(self._topics)
+                self.topics[binding.profile.topic_of(name, role)] = name, role, None
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
         """Yield the sample of a message, or none if the message is malformed."""
-        found = self._topics.get(arrival.topic)
+        found = self.topics.get(arrival.topic)
         if found is None:
             return
         car, role, calibration = found

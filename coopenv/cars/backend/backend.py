@@ -2,8 +2,9 @@
 
 import gc
 import threading
+import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, VehicleBroadcast
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.base.installation import scenario_path
-from coopenv.cars.backend.assembler import Assembler
+from coopenv.cars.backend.assembler import BROADCAST, Assembler, Intake
 from coopenv.cars.backend.binding import (
     Binding,
     bind,
@@ -23,13 +24,13 @@ from coopenv.cars.backend.binding import (
     reset_options,
 )
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
-from coopenv.cars.backend.start import ROLES, Links
-from coopenv.cars.backend.station import Pacer
-from coopenv.cars.backend.watchdog import Trip
-from coopenv.cars.codec import encode, warm_up
+from coopenv.cars.backend.station import Gates, Pacer, Station
+from coopenv.cars.backend.status import ROLES, StatusBoard
+from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, misplaced, silent, since
+from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
-from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
+from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.zenoh import open_transport
 from coopenv.observers.recording import Sensed
@@ -48,7 +49,13 @@ class LinkHealth(Health):
     refused: dict[str, int] = field(default_factory=dict)  # samples that were not used, by reason
 
 
-class Svea(Links):
+FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
+CAMERA_INFO_TIME = 1.5  # s to wait for the calibration of a camera; some publish none
+READY_TIME = 2.0  # s to wait until all conditions of arming hold at once; cars publish theirs once a second
+SETTLE = 0.5  # s for fakes to settle at their start
+
+
+class Svea:
     """Cars as a source of ticks.
 
     `reset(options={"arm": True})` lets them drive; without it everything happens but that commands are sent. An episode
@@ -74,7 +81,8 @@ class Svea(Links):
             verifier: knows the cars' keys (None: signatures do not count).
             recorder: records the messages of the ticks, and the reasons of stops.
         """
-        self.recorder = recorder
+        self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
+        self._transport, self._signer, self.recorder = transport, signer, recorder
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
@@ -85,14 +93,29 @@ class Svea(Links):
         )
         self.link = LinkHealth()
         self.health: Health = self.link
-        self.pacer = Pacer(1.0 / binding.scenario.rates.camera, binding.scenario.ticks_per_decision)
-        self._assembler = Assembler(binding)
-        self._origin = np.array(binding.scenario.map.origin)
-        self._armed, self._began, self._index = False, 0, 0
+        self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision)
+        self._origin = np.array(self.scenario.map.origin)
+        self._armed, self._received_once, self._began, self._index = False, False, 0, 0
         self._key, self._episode = 0, 0
         self._closed = threading.Lock()
-        super().__init__(deployment, binding, transport, signer, verifier, self._write_down)
-        warm_up(binding.profile)
+        profile, safety, fleet = binding.profile, deployment.safety, (*binding.cars, *binding.leaders)
+        self._local = {binding.names[i]: i for i in binding.local}
+        self._others = tuple(name for name in fleet if name not in self._local)
+        self._odometry, cars = VELOCITY[deployment.sensors.odometry], tuple(self._local)
+        self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
+        identity = deployment.security.identity
+        signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
+        self.station = Station(transport, self.intake.topics, verifier, signers)
+        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile)
+        self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
+        self.monitor = LinkMonitor(safety.judge)
+        self.watchdog = Watchdog(
+            *(safety, self.station, self.gates, self.monitor, cars, self._others, self._odometry),
+            *(1.0 / self.scenario.rates.decision, self.board.happened, self._write_down),
+        )
+        transport.watch(presence_of("*"), self.watchdog.set_present)
+        transport.announce(presence_of(identity))
+        warm_up(profile)
 
     @property
     def clock(self) -> float:
@@ -107,19 +130,72 @@ class Svea(Links):
         """
         self.stop("reset")
         arm, release = reset_options(options)
-        self.prepare(0 if seed is None else seed)
+        gc.unfreeze()
+        gc.collect()  # now, as that would take longer than a decision may
+        gc.freeze()  # what is left is not looked through again while cars drive
+        if self.deployment.fakes:
+            signed = ((seed or 0) + 2**63) % 2**64 - 2**63  # the same 64 bits
+            self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
+            time.sleep(SETTLE)  # they go to the start of the seed
         self.monitor.begin(self.pacer.now())
-        self.listen(arm)
+        self._listen(arm)
         self.station.dropped.clear()
         if arm:
-            self.arm(release)
-            self._armed = True
+            self._arm(release)
         self.drain()
         self._began, self._index = self.pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
         if self.recorder is not None:
             self.recorder.tick(0, self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
+
+    def _listen(self, arm: bool) -> None:
+        """Wait a limited time for messages of the cars: only driving needs them."""
+        topics = [self.binding.profile.topic_of(name, role) for name in self._local for role in self._odometry]
+        patience = 0.0 if self._received_once else FIRST_MESSAGES_TIME
+        _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), patience)
+        if arm:
+            _wait(lambda: self.board.calibrations.keys() >= self._local.keys(), CAMERA_INFO_TIME)
+        self._received_once = True
+        self.drain()
+
+    def _arm(self, release: bool) -> None:
+        """Open the gates, those of cars that another station has stopped with `release`, and watch the cars.
+
+        Raises:
+            CoopenvError: a condition of arming does not hold.
+        """
+        _wait(lambda: self._obstacle() is None, READY_TIME)
+        if found := self._obstacle():
+            raise CoopenvError(f"not armed: {found}")
+        self.watchdog.forget()
+        self.board.begin()
+        self.gates.begin(release or self.deployment.fakes)
+        self.watchdog.arm()
+        self._armed = True
+
+    def _obstacle(self) -> str | None:
+        """Return the most basic condition of arming that is violated; None: all hold."""
+        self.drain()
+        return next((f"{car}: {why}" for car, why in self._obstacles()), None)
+
+    def _obstacles(self) -> Iterator[tuple[str, str]]:
+        safety, profile = self.deployment.safety, self.binding.profile
+        for car in self._local:
+            offset = self.intake.offsets[car].seconds  # other ages depend on it
+            if offset is not None and abs(offset) > safety.max_clock_offset:
+                where = f"{abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'}"
+                allowed = f"{safety.max_clock_offset * 1e3:.0f} ms are allowed"
+                yield car, f"its clock is {where} this computer's, {allowed}: let chrony or PTP synchronise them"
+            for why in silent(self.station, self.monitor, profile, car, self._odometry, safety.odometry_age):
+                yield car, why
+            camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
+            if (age := self.station.silence(camera)) > safety.odometry_age:
+                yield car, f"no camera frames on {camera} {since(age)}"
+            for why in self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car]):
+                yield car, why
+        if safety.judge == "truth":  # estimates are not known before cars drive
+            yield from misplaced(safety, self.monitor, self._local, self._others)
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
@@ -150,8 +226,8 @@ class Svea(Links):
             if self.recorder is not None:
                 self.recorder.write(arrival.topic, arrival.payload, arrival.received)
             for sample in self.intake.samples(arrival):
-                self._assembler.put(sample)
-                self.monitor.put(sample)
+                if self._assembler.put(sample):
+                    self.monitor.put(sample)
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
@@ -194,7 +270,7 @@ class Svea(Links):
             "name": name,
             "armed": self._armed,
             "stopped": "" if trip is None else trip.reason,
-            "stopped_by": "" if trip is None else trip.car or "",
+            "stopped_by": "" if trip is None else trip.car,
             "gate": "unknown" if gate is None else gate.state,
             "gate_rejections": {} if gate is None else self.gates.refused(name),
             "rejections": dict(self.link.refused),
@@ -205,7 +281,7 @@ class Svea(Links):
 
     def _write_down(self, trip: Trip) -> None:
         if self.recorder is not None:
-            self.recorder.stopped(trip.reason, trip.car or "", self.pacer.now())
+            self.recorder.stopped(trip.reason, trip.car, self.pacer.now())
 
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""
@@ -228,6 +304,13 @@ class Svea(Links):
         finally:
             self._transport.close()
             gc.unfreeze()
+
+
+def _wait(ready: Callable[[], bool], patience: float) -> None:
+    """Wait for something to become true, s at most."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until and not ready():
+        time.sleep(0.02)
 
 
 def open_svea(

@@ -2,8 +2,8 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar, cast
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make, pose
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import CarPose, RobustReport, check_types
+from coopenv.cars.readings import CarPose, check_types
 from coopenv.estimation.poses import Array, left_covariance, skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.messages import from_six
@@ -131,21 +131,22 @@ def reset_options(options: Mapping[str, Any]) -> tuple[bool, bool]:
     return options.get("arm", False), options.get("release", False)
 
 
-def message_of(value: CarPose | RobustReport, marker: Array) -> Message:
-    """Return the message of a sender for an observer; its marker is at `marker` (3,) in the body frame, m.
+def arm_of(pose: CarPose, marker: Array) -> Array:
+    """Return the vector (3,) in the map from a body to its marker, which is at `marker` (3,) in the body frame, m.
 
     A position without an orientation gives the marker's height alone.
     """
-    if isinstance(value, RobustReport):
-        return Message(value.position, value.rotation, value.covariance, cast(dict[str, Array], value.extra))
-    if value.rotation is None:
-        return Message(value.position + np.array([0.0, 0.0, marker[2]]))
-    arm = value.rotation @ marker
-    covariance = None
-    if value.covariance is not None:
+    arm: Array = np.array([0.0, 0.0, marker[2]]) if pose.rotation is None else pose.rotation @ marker
+    return arm
+
+
+def message_of(pose: CarPose, marker: Array) -> Message:
+    """Return the message of a sender for an observer; `marker` as for `arm_of`."""
+    arm, covariance = arm_of(pose, marker), None
+    if pose.covariance is not None:
         J = np.hstack([np.eye(3), -skew(arm)])  # of the marker's place by those of position and rotation
-        covariance = J @ value.covariance @ J.T
-    return Message(value.position + arm, value.rotation, covariance)
+        covariance = J @ pose.covariance @ J.T
+    return Message(pose.position + arm, pose.rotation, covariance)
 
 
 def estimate_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any:
@@ -190,8 +191,6 @@ def is_finite(sent: VehicleBroadcast) -> bool:
 
 NS = 1e-9
 
-Placed = TypeVar("Placed", bound=CarPose | RobustReport)
-
 
 class NeighbourInbox:
     """Received messages of other cars; times in ns on the receiver's clock, positions on the scenario's map."""
@@ -205,40 +204,24 @@ class NeighbourInbox:
         """
         self._binding, self._refused, scenario = binding, refused, binding.scenario
         self._max_age = binding.profile.topics[Role.ESTIMATE].max_age_ns
-        self._origin = np.array(scenario.map.origin)
         places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
-        self._landmarks = np.array(places).reshape(-1, 3) - self._origin
+        self._landmarks = np.array(places).reshape(-1, 3) - np.array(scenario.map.origin)
         self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
         self._receives_from = neighbour_sets(scenario)  # targets by vehicle
         markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]
         self._markers = [np.array(marker) for marker in markers]
-        self._received: dict[int, dict[Role, tuple[int, CarPose | RobustReport]]] = {}  # since the last tick
-        self._stamps: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
+        self._received: dict[int, dict[Role, tuple[int, CarPose | Message]]] = {}  # since the last tick
 
-    def on_map(self, value: Placed) -> Placed:
-        """Return a value in the coordinates of the scenario's file in those of its map."""
-        return value if value.position is None else replace(value, position=value.position - self._origin)
-
-    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, value: CarPose) -> None:
-        """Take a message of a moving landmark; `age` is its age at reception, ns."""
-        position = message_of(self.on_map(value), self._markers[landmark]).position
-        if age > self._max_age:
+    def put_landmark(self, landmark: int, stamp: int, received: int, pose: CarPose) -> None:
+        """Take a message of a moving landmark, by its stamp and the time of its reception."""
+        if received - stamp > self._max_age:
             self._refused["stale message"] += 1
-        elif position is not None and self._is_new(landmark, role, stamp):
-            self._led[landmark].put(stamp, position)  # older than the same position in another role: not kept
+        else:
+            self._led[landmark].put(stamp, pose.position + arm_of(pose, self._markers[landmark]))
 
-    def put_vehicle(self, vehicle: int, role: Role, stamp: int, value: CarPose | RobustReport) -> None:
+    def put_vehicle(self, vehicle: int, role: Role, stamp: int, value: CarPose | Message) -> None:
         """Take a message of a vehicle that is estimated elsewhere."""
-        if self._is_new(len(self._landmarks) + vehicle, role, stamp):
-            self._received.setdefault(vehicle, {})[role] = stamp, self.on_map(value)
-
-    def _is_new(self, target: int, role: Role, stamp: int) -> bool:
-        """Return whether a message is newer than the last one of a target; count it where it is older, or replayed."""
-        if stamp <= self._stamps.get((target, role), 0):
-            self._refused["message out of order"] += 1
-            return False
-        self._stamps[target, role] = stamp
-        return True
+        self._received.setdefault(vehicle, {})[role] = stamp, value
 
     def forget(self) -> None:
         """Drop all messages of vehicles."""
@@ -271,7 +254,7 @@ class NeighbourInbox:
             if now - stamp > self._max_age:
                 self._refused["stale message"] += 1
                 continue
-            message = message_of(value, self._markers[L + sender])
+            message = message_of(value, self._markers[L + sender]) if isinstance(value, CarPose) else value
             found.update({(i, sender): Received(message, max(0, now - stamp) * NS) for i in receivers})
         self._received.clear()
         return found

@@ -192,10 +192,10 @@ class Gates:
     ) -> None:
         """Listen to the gates; with a verifier only to what they have signed."""
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self._profile, self._lock = profile, threading.Lock()
+        self.profile, self._lock = profile, threading.Lock()
         self._states = {car: GateState() for car in cars}
         self._before: dict[str, dict[str, int]] = {}
-        self._cars = {self._profile.topic_of(car, Role.GATE): car for car in cars}
+        self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
         self._stamps = dict.fromkeys(cars, 0)
         self._stopping = False
         self.stopped_by_others: set[str] = set()
@@ -293,7 +293,7 @@ class Gates:
             if dropped := self.dropped[car] - known[car]:
                 why = ", ".join(f"{reason} {count}" for reason, count in dropped.items())
                 raise CoopenvError(f"{car}: the status of its gate is dropped ({why}): are keys and clocks the same?")
-            topic = self._profile.topic_of(car, Role.GATE)
+            topic = self.profile.topic_of(car, Role.GATE)
             raise CoopenvError(f"{car}: no gate status on {topic}: is `coopenv svea gate` running there?")
         return self.states
 
@@ -335,9 +335,9 @@ class Gates:
         self._sequence += 1
 
     def _send(self, car: str, role: Role, message: Any) -> None:
-        topic, payload = self._profile.topic_of(car, role), encode(message)
+        topic, payload = self.profile.topic_of(car, role), encode(message)
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
-        kind = self._profile.topics[role]
+        kind = self.profile.topics[role]
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
 
 

@@ -6,22 +6,26 @@ from itertools import islice
 
 import numpy as np
 
-from coopenv.cars.readings import CarPose, Detections, Twist
+from coopenv.cars.readings import Detections, Twist
 from coopenv.estimation.poses import Array, exp_so3, exp_translation, log_so3
 
 MOST_SAMPLES = 512
 """Samples that wait for a tick: five seconds of an IMU."""
 
 
+Velocities = tuple[Array, Array]
+"""Velocity, m/s, and turn rate, rad/s, of a body, each (3,)."""
+
+
 class Odometer:
     """Held twists of one car; times in ns on one clock."""
 
-    def __init__(self, refused: Counter[str]) -> None:
-        """Begin with nothing; samples that are older than one of the same kind before are counted in `refused`."""
-        self._refused = refused
-        self._samples: deque[tuple[int, Array, Array]] = deque()  # since when, v m/s, omega rad/s
-        self._now: tuple[Array, Array] = (np.zeros(3), np.zeros(3))  # held at the last time asked for
-        self._newest: tuple[Array | None, Array | None] = (None, None)
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._samples: deque[tuple[int, Velocities]] = deque()  # since when
+        self._now: Velocities = (np.zeros(3), np.zeros(3))  # held at the last time asked for
+        self.twist: Velocities = self._now
+        """The newest velocity and turn rate; zero where none has come."""
         self._stamps: dict[str, int] = {}
 
     @property
@@ -29,49 +33,32 @@ class Odometer:
         """When the older one of the last velocity and the last turn rate was taken; None: one has never come."""
         return min(self._stamps.values()) if len(self._stamps) == 2 else None
 
-    @property
-    def twist(self) -> tuple[Array, Array]:
-        """The newest velocity, m/s, and turn rate, rad/s; zero where none has come."""
-        v, w = self._newest
-        return np.zeros(3) if v is None else v, np.zeros(3) if w is None else w
-
     def put(self, stamp: int, twist: Twist) -> None:
-        """Take a sample of the velocity, of the turn rate, or of both."""
-        parts = {"linear": twist.linear, "angular": twist.angular}
-        known = [name for name, part in parts.items() if part is not None]
-        if any(stamp <= self._stamps.get(name, -1) for name in known):
-            self._refused["odometry out of order"] += 1
-            return
-        self._stamps.update(dict.fromkeys(known, stamp))
-        v, w = self._newest
-        self._newest = (v if twist.linear is None else twist.linear, w if twist.angular is None else twist.angular)
-        self._insert(stamp, twist)
-        if len(self._samples) > MOST_SAMPLES:
-            _, v, w = self._samples.popleft()
-            self._now = v, w
+        """Take a sample of the velocity, of the turn rate, or of both, newer than all before of the same sensor.
 
-    def _insert(self, stamp: int, twist: Twist) -> None:
-        """Keep the samples in order: those of two sensors come interleaved, later ones hold the new part as well."""
+        Samples are kept in order. Those of two sensors come interleaved: later ones hold the new part as well.
+        """
+        self._stamps |= {part: stamp for part in ("linear", "angular") if getattr(twist, part) is not None}
+        self.twist = _replaced(self.twist, twist)
         later = []
         while self._samples and self._samples[-1][0] > stamp:
             later.append(self._samples.pop())
-        _, v, w = self._samples[-1] if self._samples else (0, *self._now)
-        v, w = (v if twist.linear is None else twist.linear), (w if twist.angular is None else twist.angular)
-        self._samples.append((stamp, v, w))
-        for since, v, w in reversed(later):  # the other sensor's: its own part stands, this one's is the new one
-            part = (v if twist.linear is None else twist.linear), (w if twist.angular is None else twist.angular)
-            self._samples.append((since, *part))
+        before = self._samples[-1][1] if self._samples else self._now
+        for since, held in ((stamp, before), *reversed(later)):
+            self._samples.append((since, _replaced(held, twist)))
+        if len(self._samples) > MOST_SAMPLES:
+            _, self._now = self._samples.popleft()
 
     def increment(self, begin: int, end: int) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and translation (3,) in m from `begin` to `end`, and forget what was before."""
         R, p = np.eye(3), np.zeros(3)
         now = begin
         while self._samples and self._samples[0][0] <= end:
-            since, v, w = self._samples.popleft()
+            since, held = self._samples.popleft()
             if since > now:
                 R, p = self._go(R, p, since - now)
                 now = since
-            self._now = v, w
+            self._now = held
         if end > now:
             R, p = self._go(R, p, end - now)
         return R, p
@@ -81,6 +68,12 @@ class Odometer:
         seconds = duration * 1e-9
         turn, step = exp_so3(w * seconds), exp_translation(w * seconds, v * seconds)
         return R.dot(turn), p + R.dot(step)
+
+
+def _replaced(held: Velocities, twist: Twist) -> Velocities:
+    """Return velocities with the parts of a twist that were measured in place of the held ones."""
+    v, w = held
+    return v if twist.linear is None else twist.linear, w if twist.angular is None else twist.angular
 
 
 MOST_POSES = 256
@@ -94,17 +87,9 @@ class PoseTrack:
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Array, Array]] = deque(maxlen=MOST_POSES)
 
-    @property
-    def stamp(self) -> int | None:
-        """When the last one was taken; None: there is none."""
-        return self._poses[-1][0] if self._poses else None
-
-    def put(self, stamp: int, pose: CarPose) -> bool:
-        """Take a pose; return False where it is older than one before, or has no rotation."""
-        if pose.rotation is None or (self._poses and stamp <= self._poses[-1][0]):
-            return False
-        self._poses.append((stamp, pose.rotation, pose.position))
-        return True
+    def put(self, stamp: int, rotation: Array, position: Array) -> None:
+        """Take a pose, newer than all before: the rotation (3, 3), body to map, and the position (3,), m."""
+        self._poses.append((stamp, rotation, position))
 
     def at(self, time: int) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and position (3,) at a time, NaN where too little is known about it."""
@@ -145,12 +130,10 @@ class PlaceTrack:
         """Time of the last position; -1: none was received."""
         return self._places[-1][0] if self._places else -1
 
-    def put(self, stamp: int, position: Array) -> bool:
-        """Take a position (3,); return False where it is older than one before."""
-        if stamp <= self.stamp:
-            return False
-        self._places.append((stamp, position))
-        return True
+    def put(self, stamp: int, position: Array) -> None:
+        """Take a position (3,), m; one that is not newer than all before is left out."""
+        if stamp > self.stamp:
+            self._places.append((stamp, position))
 
     def at(self, time: int) -> Array:
         """Return the position (3,) at a time: between two on the straight line, and for a while beyond the last one.
@@ -180,15 +163,10 @@ class Frames:
         """Begin with nothing; frames that are not used are counted in `refused`."""
         self._refused = refused
         self._waiting: deque[tuple[int, Detections]] = deque()
-        self._newest = -1
         self._skipped = 0  # because too many waited, since the last one was taken
 
     def put(self, stamp: int, frame: Detections) -> None:
-        """Take a frame."""
-        if stamp <= self._newest:
-            self._refused["frame out of order"] += 1
-            return
-        self._newest = stamp
+        """Take a frame, newer than all before."""
         self._waiting.append((stamp, frame))
         while len(self._waiting) > MOST_WAITING + 1:
             self._waiting.popleft()

@@ -1,5 +1,6 @@
 """The watchdog: a thread of its own that stops the cars whatever the driving program does."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -12,11 +13,10 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
-from coopenv.cars.profile import SVEA, CarProfile, Role, inside
-from coopenv.cars.readings import CarPose, RobustReport, Sample
+from coopenv.cars.profile import CarProfile, Role, inside, presence_of
+from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import Array
-
-AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
+from coopenv.observers.contract import Message
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,12 @@ class Place:
 class LinkMonitor:
     """Kept by the step loop, read by the watchdog's thread; times are in ns on the receiver's clock.
 
-    Received bytes alone do not count: a message must be readable, with a stamp newer than all before.
+    Received bytes alone do not count: a message must be readable, with a stamp newer than all before (`Assembler.put`).
     """
 
     def __init__(self, judge: Literal["truth", "estimate"]) -> None:
         """Choose the source of the judged positions: motion capture, or the cars' estimates."""
-        self._judge = judge
-        self._stamps: dict[tuple[str, Role], int] = {}
+        self._judging = (Role.TRUTH,) if judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
         self._known_at: dict[tuple[str, Role], int] = {}
         self.places: Mapping[str, Place] = {}
         """Replaced as a whole whenever one changes."""
@@ -49,20 +48,13 @@ class LinkMonitor:
         self.places, self.looked, self._begun = {}, now, now
 
     def put(self, sample: Sample) -> None:
-        """Take a sample."""
-        key = sample.car, sample.role
-        if sample.stamp > sample.received + AHEAD or sample.stamp <= self._stamps.get(key, -1):
-            return
-        self._stamps[key] = sample.stamp
+        """Take a sample that is newer than all before of its car and role."""
         # Motion capture has a clock of its own with an unknown delay.
-        self._known_at[key] = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
-        judging = (Role.TRUTH,) if self._judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
-        if (
-            sample.role in judging
-            and isinstance(sample.value, CarPose | RobustReport)
-            and sample.value.position is not None
-        ):
-            self.place(sample.car, sample.value.position, self._known_at[key])
+        known_at = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
+        self._known_at[sample.car, sample.role] = known_at
+        value = sample.value
+        if sample.role in self._judging and isinstance(value, CarPose | Message) and value.position is not None:
+            self.place(sample.car, value.position, known_at)
 
     def place(self, car: str, position: Array, time: int) -> None:
         """Set the position of a car, m, and the time at which it was known, ns."""
@@ -113,6 +105,22 @@ def misplaced(
             yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"
 
 
+def silent(
+    station: Station, monitor: LinkMonitor, profile: CarProfile, car: str, odometry: Collection[Role], longest: float
+) -> Iterator[str]:
+    """Yield the topics of a car's odometry without a message, or without a usable one, for longer than s, in words."""
+    for role in odometry:
+        topic = profile.topic_of(car, role)
+        for what, age in (("odometry", station.silence(topic)), ("usable new message", monitor.age(car, role))):
+            if age > longest:
+                yield f"no {what} on {topic} {since(age)}"
+
+
+def since(age: float) -> str:
+    """Return the time since a last message, s, in words."""
+    return "(none was received)" if math.isinf(age) else f"for {age:.2f} s"
+
+
 PERIOD = 0.01  # s between looks
 REPEAT = 0.2  # s between emergency stops that are sent again
 STALL = 0.05  # s by which a look may come late: messages may still wait to be received then
@@ -123,7 +131,7 @@ class Trip:
     """Why the cars were stopped."""
 
     reason: str
-    car: str | None = None  # that caused it; None: no single car
+    car: str = ""  # that caused it; empty: no single car
     time: float = 0.0  # monotonic, s
 
 
@@ -140,7 +148,6 @@ class Watchdog:
         others: Collection[str],
         odometry: Collection[Role],
         decision: float,
-        profile: CarProfile = SVEA,
         happened: Callable[[str], str] = lambda car: "",
         stopped: Callable[[Trip], None] = lambda trip: None,
     ) -> None:
@@ -155,19 +162,18 @@ class Watchdog:
             others: the other ones of the fleet.
             odometry: what each car has to measure.
             decision: s between decisions.
-            profile: make of the cars.
             happened: returns the reason to stop a car by its own conditions; empty: none.
             stopped: called when the cars are stopped.
         """
         self._safety, self._station, self._gates, self._monitor = safety, station, gates, monitor
         self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
-        self._profile, self._happened, self._stopped = profile, happened, stopped
+        self._happened, self._stopped = happened, stopped
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
-        self._present: dict[str, bool] = {}
+        self._present = dict.fromkeys(map(presence_of, cars), True)
         self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
         self._thread.start()
 
@@ -192,11 +198,12 @@ class Watchdog:
         """Note a decision, after `missed` late ones in a row."""
         self._beat, self._missed = time.monotonic(), missed
 
-    def set_present(self, car: str, there: bool) -> None:
-        """Note that a car's token has appeared or disappeared."""
-        self._present[car] = there
+    def set_present(self, token: str, there: bool) -> None:
+        """Note that a token of presence has appeared or disappeared; those of other ends do not count."""
+        if token in self._present:
+            self._present[token] = there
 
-    def stop(self, reason: str, car: str | None = None) -> None:
+    def stop(self, reason: str, car: str = "") -> None:
         """Stop all cars at once; the first reason stands."""
         with self._lock:
             if not self._armed:
@@ -226,45 +233,39 @@ class Watchdog:
                     try:
                         found = next(self._problems(), None)
                     except Exception as error:  # a watchdog that fails has to stop the cars
-                        found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
+                        found = "", f"the watchdog failed: {type(error).__name__}: {error}"
                     if found is not None:
-                        self.stop(found.reason, found.car)
+                        car, why = found
+                        self.stop(f"{car}: {why}" if car else why, car)
                 elif self.trip is not None and looked - repeated > REPEAT:
                     repeated = looked
                     self._gates.stop()
             except Exception:  # of the network, during a stop: it is repeated
                 continue
 
-    def _problems(self) -> Iterator[Trip]:
+    def _problems(self) -> Iterator[tuple[str, str]]:
+        """Yield the car and the reason of each violated rule; a car is empty where it is no single one."""
         for car in self._cars:
-            yield from self._of_car(car)
+            yield from ((car, why) for why in self._of_car(car))
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
-                yield Trip(f"{car}: its gate is silent for {gate.age:.2f} s", car)
+                yield car, f"its gate is silent for {gate.age:.2f} s"
             elif gate.state not in OPEN:
-                yield Trip(f"{car}: its gate is {gate.state}", car)
+                yield car, f"its gate is {gate.state}"
             elif gate.session != self._gates.session:
-                yield Trip(f"{car}: another station has armed its gate", car)
+                yield car, "another station has armed its gate"
         missed, beat = self._safety.missed_deadlines, self._beat
         if self._missed >= missed:
-            yield Trip(f"{self._missed} decisions in a row came too late")
-        if beat is None:
-            return
-        if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
-            yield Trip(f"no decision for {age:.2f} s")
-        for car, wrong in misplaced(self._safety, self._monitor, self._cars, self._others):
-            yield Trip(f"{car}: {wrong}", car)
+            yield "", f"{self._missed} decisions in a row came too late"
+        if beat is not None:
+            if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
+                yield "", f"no decision for {age:.2f} s"
+            yield from misplaced(self._safety, self._monitor, self._cars, self._others)
 
-    def _of_car(self, car: str) -> Iterator[Trip]:
-        longest = self._safety.odometry_age
-        for role in self._odometry:
-            topic = self._profile.topic_of(car, role)
-            if (age := self._station.silence(topic)) > longest:
-                yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
-            # Only the step loop reads messages, so that this means nothing before the first step.
-            if self._beat is not None and (age := self._monitor.age(car, role)) > longest:
-                yield Trip(f"{car}: no usable new message on {topic} for {age:.2f} s", car)
-        if self._present.get(car) is False:
-            yield Trip(f"{car}: is gone", car)
+    def _of_car(self, car: str) -> Iterator[str]:
+        longest, profile = self._safety.odometry_age, self._gates.profile
+        yield from silent(self._station, self._monitor, profile, car, self._odometry, longest)
+        if not self._present[presence_of(car)]:
+            yield "is gone"
         if why := self._happened(car):
-            yield Trip(f"{car}: {why}", car)
+            yield why

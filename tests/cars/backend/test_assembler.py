@@ -15,7 +15,8 @@ from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.tracks import LONGEST_GAP, PoseTrack
 from coopenv.cars.deployment import Car
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import CarPose, Detections, RobustReport, Sample, Twist, Value
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value
+from coopenv.observers.contract import Message
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -234,7 +235,7 @@ def test_the_observers_own_message_counts_before_the_pose() -> None:
     assembler = Assembler(binding(2, only="car1"))
     assembler.begin(START)
     assembler.put(sample(Role.ESTIMATE, START + MS, CarPose(np.zeros(3), np.eye(3)), "car0"))
-    report = RobustReport(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
+    report = Message(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
     assembler.put(sample(Role.REPORT, START + MS, report, "car0"))
     assert set(assembler.tick(1, START + 5 * MS).messages[1, 0].message.extra) == {"odometry"}
 
@@ -329,7 +330,7 @@ def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearin
 def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:
     track = PoseTrack()
     for k in (0, 1, 30, 31):
-        assert track.put(START + k * 10 * MS, CarPose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3)))
+        track.put(START + k * 10 * MS, np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
     known = [np.isfinite(track.at(START + t * MS)[1]).all() for t in (5, 150, 305, 310)]
     assert known == [True, False, True, True]
     np.testing.assert_allclose(track.at(START + 5 * MS)[1], [0.05, 0.0, 0.0])

@@ -229,7 +229,7 @@ def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
 
 def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for patience in ("FIRST_MESSAGES_TIME", "CAMERA_INFO_TIME", "READY_TIME"):
-        monkeypatch.setattr(f"coopenv.cars.backend.start.{patience}", 0.1)
+        monkeypatch.setattr(f"coopenv.cars.backend.backend.{patience}", 0.1)
     refuses(write_fleet(tmp_path), Hub(), r"not armed: svea7: no odometry on fleet/svea7/mavros/wheel_odometry")
 
 

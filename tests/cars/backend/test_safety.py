@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
 from coopenv.cars.codec import MOST_BYTES, encode, make
@@ -19,6 +20,7 @@ from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.readings import CarPose, Sample, Twist
 from coopenv.cars.transport.base import Arrival
+from tests.cars.backend.test_assembler import binding
 from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
 
@@ -36,27 +38,31 @@ def at(x: float, y: float = 0.0) -> CarPose:
 
 
 def test_only_newer_messages_are_signs_of_life() -> None:
-    monitor, still = LinkMonitor("truth"), Twist(np.zeros(3), np.zeros(3))
-    assert monitor.age("a", Role.WHEEL) == float("inf")
-    monitor.put(sample("a", Role.WHEEL, BEGIN, still))
-    for k in range(1, 20):  # the same bytes again and again, and one from far in the future
-        monitor.put(sample("a", Role.WHEEL, BEGIN, still, received=BEGIN + 10 * k * MS))
-    monitor.put(sample("a", Role.WHEEL, BEGIN + 10_000 * MS, still, received=BEGIN + 200 * MS))
+    monitor, still, assembler = LinkMonitor("truth"), Twist(np.zeros(3), np.zeros(3)), Assembler(binding())
+
+    def put(stamp: int, received: int) -> None:
+        given = sample("car0", Role.WHEEL, BEGIN + stamp * MS, still, received=BEGIN + received * MS)
+        if assembler.put(given):
+            monitor.put(given)
+
+    assert monitor.age("car0", Role.WHEEL) == float("inf")
+    for k in range(20):  # the same bytes again and again, and one from far in the future
+        put(0, 10 * k)
+    put(10_000, 200)
     monitor.looked = BEGIN + 200 * MS
-    assert monitor.age("a", Role.WHEEL) == pytest.approx(0.2)
-    monitor.put(sample("a", Role.WHEEL, BEGIN + 190 * MS, still, received=BEGIN + 195 * MS))
-    assert monitor.age("a", Role.WHEEL) == pytest.approx(0.01)
-    assert monitor.age("a", Role.IMU) == float("inf") and monitor.age("b", Role.WHEEL) == float("inf")
+    assert monitor.age("car0", Role.WHEEL) == pytest.approx(0.2)
+    put(190, 195)
+    assert monitor.age("car0", Role.WHEEL) == pytest.approx(0.01)
+    assert monitor.age("car0", Role.IMU) == float("inf") and monitor.age("b", Role.WHEEL) == float("inf")
 
 
 def test_places_come_from_what_judges() -> None:
-    for judge, role in (("truth", Role.TRUTH), ("estimate", Role.ESTIMATE)):
+    for judge, x in (("truth", 1.0), ("estimate", 2.0)):
         monitor = LinkMonitor(judge)  # type: ignore[arg-type]
         monitor.begin(BEGIN)
         monitor.put(sample("a", Role.TRUTH, BEGIN + MS, at(1.0)))
         monitor.put(sample("a", Role.ESTIMATE, BEGIN + MS, at(2.0)))
-        monitor.put(sample("a", role, BEGIN, at(9.0)))  # older
-        assert monitor.places["a"].position[0] == (1.0 if role is Role.TRUTH else 2.0)
+        assert monitor.places["a"].position[0] == x
         monitor.place("a", np.array([np.nan, 0.0, 0.0]), BEGIN + 400 * MS)
         monitor.looked = BEGIN + 401 * MS
         assert monitor.lost("a") == pytest.approx(0.4), "not a number is no place"
@@ -245,6 +251,7 @@ def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, LinkMo
     yard, dog, monitor = guard
     yard.gates.begin()
     yard.hub.connect().publish(WHEEL, b"whatever")
+    monitor.put(sample("a", Role.WHEEL, time.time_ns(), Twist(np.zeros(3), None)))
     dog.arm()
     live(yard, dog, monitor, 0.6, usable=True)
     assert dog.trip is None

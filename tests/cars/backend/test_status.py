@@ -7,14 +7,16 @@ from typing import Any
 
 import pytest
 
-from coopenv.cars.backend import start
-from coopenv.cars.backend.start import StatusBoard
+from coopenv.cars.backend import status
+from coopenv.cars.backend.status import StatusBoard
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.readings import Calibration
 from tests.helpers.hub import Hub
 
 CAR = "svea7"
+CAMERA = Calibration((316, 208), (213.0, 213.5), (155.0, 115.0), (0.0,) * 5)
 
 
 class Talk:
@@ -29,6 +31,9 @@ class Talk:
         stamp = time.time_ns() - round(age * 1e9)
         message = make(SVEA.topics[role].type, header=header(stamp), **fields)
         self.network.publish(SVEA.topic_of(CAR, role), encode(message))
+
+    def obstacle(self) -> str:
+        return next(self.board.obstacles(CAR, 0.5, CAMERA), "")
 
     def remote(self, *pulses: int, rssi: int = 200, age: float = 0.0) -> None:
         self.say(Role.REMOTE, age, rssi=rssi, channels=pulses or (1500,) * 8)
@@ -49,7 +54,7 @@ class Talk:
 def armed() -> Talk:
     talk = Talk()
     talk.all_is_well()
-    assert talk.board.obstacle(CAR) == ""
+    assert talk.obstacle() == ""
     talk.board.begin()
     return talk
 
@@ -63,17 +68,17 @@ def test_a_car_that_has_not_told_of_itself_is_not_armed(left_out: Role) -> None:
                 say()
             elif old:
                 say(**old)
-        assert SVEA.topic_of(CAR, left_out) in talk.board.obstacle(CAR)
+        assert SVEA.topic_of(CAR, left_out) in talk.obstacle()
 
 
 def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     talk, now = Talk(), time.monotonic()
     talk.all_is_well()
     talk.board.begin()
-    monkeypatch.setattr(start.time, "monotonic", lambda: now + 1.5)
-    assert talk.board.obstacle(CAR) == talk.board.happened(CAR) == ""
-    monkeypatch.setattr(start.time, "monotonic", lambda: now + 2.5)
-    assert talk.board.obstacle(CAR).endswith(SVEA.topic_of(CAR, Role.STATE))
+    monkeypatch.setattr(status.time, "monotonic", lambda: now + 1.5)
+    assert talk.obstacle() == talk.board.happened(CAR) == ""
+    monkeypatch.setattr(status.time, "monotonic", lambda: now + 2.5)
+    assert talk.obstacle().endswith(SVEA.topic_of(CAR, Role.STATE))
     assert talk.board.happened(CAR)
 
 
@@ -91,7 +96,7 @@ def test_a_car_in_another_state_is_not_armed(change: Any, why: str) -> None:
     talk = Talk()
     talk.all_is_well()
     change(talk)
-    assert why in talk.board.obstacle(CAR)
+    assert why in talk.obstacle()
 
 
 @pytest.mark.parametrize(
@@ -124,7 +129,7 @@ def test_old_words_neither_stop_a_car_nor_keep_it_going(armed: Talk) -> None:
 
 def test_cars_that_cannot_tell_are_armed_all_the_same() -> None:
     talk = Talk(needed=False)
-    assert talk.board.obstacle(CAR) == ""
+    assert talk.obstacle() == ""
     talk.board.begin()
     talk.remote(rssi=0)
     assert talk.board.happened(CAR) == ""
