@@ -11,7 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 FORMAT = "coopenv drive 1"
 NAME = "coopenv-drive"
 ATTACHMENT = "drive.json"
+MARKS = {TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
+"""Types of the messages of ticks and stops, by topic."""
 
 FLUSH = 0.5
 """s after which at the latest the system has what was written: so much is lost if the process is killed."""
@@ -63,7 +65,7 @@ class DriveRecorder:
             raise OutputError(f"{path}: the name must end in .mcap")
         if path.exists():
             raise OutputError(f"{path}: exists already")
-        self._path, self._types = path, {**types, TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
+        self._path, self._types = path, {**types, **MARKS}
         self.begun = False
         """Whether an episode has begun: without one there is nothing to replay."""
         self._channels: dict[str, int] = {}
@@ -194,22 +196,17 @@ class Drive(TickGenerator):
         from coopenv.backends.mcap.container import Container
 
         self._where = str(path)
-        try:
+        with _reading(self._where):
             container = Container(Path(path), forgiving=True)
             metadata, attachments = container.extras()
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
-        except DataError:
-            raise
-        except Exception as error:  # whatever the libraries raise at bytes that make no sense
-            raise DataError(f"{path}: damaged MCAP file ({type(error).__name__})") from None
         nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
         if container.cut_off and ATTACHMENT not in attachments:
             raise DataError(nothing)
         if metadata.get(NAME, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
-        self._messages = list(self._read(container))
+        with _reading(self._where):
+            self._messages = list(_messages(container))
         indices = [m.index for m in self._messages if not isinstance(m, Arrival) and m.__msgtype__ == TICK]
         if 0 not in indices:
             raise DataError(nothing)
@@ -239,20 +236,6 @@ class Drive(TickGenerator):
         deployment = parse_deployment(given, Path(self._where))
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
 
-    def _read(self, container: "Container") -> Iterator[Any]:
-        """Yield the arrivals, and decoded marks of ticks and stops among them."""
-        try:
-            for channel, _, message in container.messages():
-                topic = channel.topic.lstrip("/")
-                if kind := {TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}.get(topic):
-                    yield decode(message.data, kind)
-                else:
-                    yield Arrival(topic, bytes(message.data), message.log_time)
-        except CoopenvError as error:
-            raise DataError(f"{self._where}: {error}") from None
-        except Exception as error:
-            raise DataError(f"{self._where}: damaged MCAP file ({type(error).__name__})") from None
-
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the messages from the begin, yielding the ticks of one episode; `arm` has no effect."""
         reset_options(options)
@@ -277,6 +260,27 @@ class Drive(TickGenerator):
                 tick = assembler.tick(message.index, stamp_of(message))
             if number == wanted:
                 yield tick
+
+
+def _messages(container: "Container") -> Iterator[Any]:
+    """Yield the arrivals, and decoded marks of ticks and stops among them."""
+    for channel, _, message in container.messages():
+        topic = channel.topic.lstrip("/")
+        kind = MARKS.get(topic)
+        yield decode(message.data, kind) if kind else Arrival(topic, bytes(message.data), message.log_time)
+
+
+@contextmanager
+def _reading(where: str) -> Iterator[None]:
+    """Turn whatever is raised about a file into a DataError that begins with `where`."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
+    except CoopenvError as error:
+        raise error if isinstance(error, DataError) else DataError(f"{where}: {error}") from None
+    except Exception as error:  # whatever the libraries raise at bytes that make no sense
+        raise DataError(f"{where}: damaged MCAP file ({type(error).__name__})") from None
 
 
 PRESENCE = "std_msgs/msg/Bool"

@@ -2,13 +2,14 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
 from coopenv.cars.backend.assembler import Assembler
-from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
+from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import NS, read_log
 from coopenv.cars.bags.topic_map import TopicMap, load_map
@@ -57,18 +58,16 @@ class Bag(TickGenerator):
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
-            self.binding = self._bind(load_scenario(self.map.environment_path, changes))
+            scenario = load_scenario(self.map.environment_path, changes)
+        self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None)
         self.log = read_log([Path(path) for path in paths], self.map, self.binding)
         self._begin, ticks = self._ticks()
         scenario = self._scenario(changes, ticks)
-        self.binding = self._bind(scenario)
+        self.binding = replace(self.binding, scenario=scenario)
         known = any(sample.role is Role.TRUTH for sample in self.log.samples)
         super().__init__(scenario, Capabilities(known, False, False, ticks, batched=False, recorded=True))
         for note in (*self.log.notes, *self._odd_rates()):
             warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
-
-    def _bind(self, scenario: Scenario) -> Binding:
-        return bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None)
 
     def _ticks(self) -> tuple[int, int]:
         """Return when tick 0 is, ns, and how many ticks there are."""

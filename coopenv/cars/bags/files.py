@@ -100,7 +100,7 @@ class BagFile:
                 connection, received, data = message
                 first = received if first is None else first
                 last = received
-                yield connection.topic, received, self._decoder(connection, data)
+                yield connection.topic, received, partial(self._decode, data, connection.msgtype)
         except GeneratorExit:
             raise
         except Exception as error:
@@ -113,16 +113,12 @@ class BagFile:
                 stacklevel=2,
             )
 
-    def _decoder(self, connection: Any, data: bytes) -> Callable[[], Any]:
-        """Return what decodes a message. It raises a CoopenvError: it makes no sense."""
-
-        def decode() -> Any:
-            try:
-                return self._reader.deserialize(data, connection.msgtype)
-            except Exception as error:
-                raise CoopenvError(f"{connection.msgtype}: cannot be read ({type(error).__name__})") from None
-
-        return decode
+    def _decode(self, data: bytes, kind: str) -> Any:
+        """Return a message of a type. Raises CoopenvError: it makes no sense."""
+        try:
+            return self._reader.deserialize(data, kind)
+        except Exception as error:
+            raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
 
     def _unreadable(self, error: Exception) -> DataError:
         if is_too_large(error):

@@ -11,7 +11,7 @@ recorded it. A *source* is whose clock makes the stamps: a car, or motion captur
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,9 +36,8 @@ Delays = Mapping[str, int]
 class Shift:
     """What is done to the stamps of a source."""
 
-    offset: int  # ns by which its clock is behind that of the first recorder, as far as is known
+    offset: int | None  # ns by which its clock is behind that of the first recorder; None: not known
     added: int  # ns that are added to its stamps
-    linked: bool = True  # whether it is known; False: stamps are used unchanged
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, in
             if source in stated:
                 found[source] = Shift(stated[source], stated[source])
             elif recorder is None:
-                found[source] = Shift(0, 0, linked=False)
+                found[source] = Shift(None, 0)
             else:
                 offset = delay + recorder
                 found[source] = Shift(offset, offset if abs(offset) > tolerance else 0)
@@ -88,52 +87,66 @@ def recorders(files: Sequence[Delays]) -> list[int | None]:
     return behind
 
 
-class ValueReader:
-    """Reads messages by the map."""
+ReadValue = Callable[[Chosen, Any], Value]
+"""Returns the value of a message of a topic. Raises CoopenvError: it is malformed."""
 
-    def __init__(
-        self, given: TopicMap, binding: Binding, published: Mapping[str, Calibration], chosen: Collection[Chosen]
-    ) -> None:
-        """Prepare.
 
-        Args:
-            given: the map.
-            binding: the cars and their vehicles, whose cameras are those of the environment.
-            published: calibrations that cars publish, which count first.
-            chosen: the topics that are read.
-        """
-        self._calibrations = {
-            name: published.get(name) or Calibration.of(binding.scenario.cameras[vehicle])
-            for name, vehicle in binding.cars.items()
-        }
-        self._distorted, self._known = given.distorted, frozenset(binding.targets)
-        self._frames = {role: given.frames.map for role in Role} | {Role.TRUTH: given.frames.truth or given.frames.map}
-        self._turning = {entry.car for entry in chosen if entry.role is Role.IMU}
+def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], files: Sequence[BagFile]) -> ReadValue:
+    """Return what reads messages by the map; calibrations that cars publish count before the environment's.
 
-    def read(self, chosen: Chosen, message: Any) -> Value:
-        """Return the value of a message. Raises CoopenvError: it is malformed."""
-        calibration = self._calibrations.get(chosen.car)
-        value = read(chosen.role, message, calibration, distorted=self._distorted, known=self._known)
+    Args:
+        given: the map.
+        binding: the cars and their vehicles, whose cameras are those of the environment.
+        chosen: the topics that are read.
+        files: the bags.
+
+    Raises:
+        DataError: a calibration makes no sense.
+    """
+    cameras = binding.scenario.cameras
+    calibrations = {name: Calibration.of(cameras[vehicle]) for name, vehicle in binding.cars.items()}
+    calibrations |= _published(files, chosen)
+    known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
+    frames = {Role.TRUTH: given.frames.truth or given.frames.map}
+
+    def read_value(entry: Chosen, message: Any) -> Value:
+        calibration = calibrations.get(entry.car)
+        value = read(entry.role, message, calibration, distorted=given.distorted, known=known)
         if isinstance(value, CarPose):
-            return in_frame(value, self._frames[chosen.role])
-        if isinstance(value, Twist) and chosen.role is Role.WHEEL and chosen.car in self._turning:
+            return in_frame(value, frames.get(entry.role, given.frames.map))
+        if isinstance(value, Twist) and entry.role is Role.WHEEL and entry.car in turning:
             return Twist(value.linear, None)  # the IMU knows better
         return value
+
+    return read_value
+
+
+def _published(files: Sequence[BagFile], chosen: Collection[Chosen]) -> dict[str, Calibration]:
+    """Return the first calibration of each car that publishes one."""
+    found: dict[str, Calibration] = {}
+    for file in files:
+        for entry in chosen:
+            if entry.role is not Role.CAMERA_INFO or entry.car in found:
+                continue
+            for _, _, decode in file.messages([entry.topic]):
+                try:
+                    value = read(Role.CAMERA_INFO, decode())
+                except CoopenvError as error:
+                    raise DataError(f"{file.path}: topic {entry.topic}: {error}") from None
+                if isinstance(value, Calibration):
+                    found[entry.car] = value
+                break
+    return found
 
 
 def in_frame(pose: CarPose, frame: MapFrame) -> CarPose:
     """Return a pose of a frame in the environment's coordinates."""
-    if frame == MapFrame():
-        return pose
-    R = rotation_of(frame.yaw, None)
-    covariance = pose.covariance
+    R, covariance = rotation_of(frame.yaw, None), pose.covariance
     if covariance is not None:
         both = np.kron(np.eye(2), R)
         covariance = both @ covariance @ both.T
     rotation = None if pose.rotation is None else R @ pose.rotation
-    return replace(
-        pose, position=R @ pose.position + np.array(frame.position), rotation=rotation, covariance=covariance
-    )
+    return CarPose(R @ pose.position + np.array(frame.position), rotation, covariance)
 
 
 WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its topic before it is left out
@@ -141,57 +154,56 @@ WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its t
 
 @dataclass
 class Track:
-    """The messages of one topic, and why some were left out."""
+    """The messages of one topic in one file, and why some were left out."""
 
+    file: int  # its number
     chosen: Chosen
     entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
-    @property
     def delays(self) -> list[int]:
-        """By how many ns its messages were received after their stamps."""
+        """Return by how many ns its messages were received after their stamps."""
         return [entry.received - entry.stamp for entry in self.entries if entry.stamp]
 
+    def leave_out_wild(self) -> None:
+        """Drop messages whose stamps are far ahead of those of the others."""
+        if not (delays := self.delays()):
+            return
+        least = float(np.median(delays)) - WILD
+        kept = [entry for entry in self.entries if not entry.stamp or entry.received - entry.stamp >= least]
+        if left_out := len(self.entries) - len(kept):
+            self.refused["its stamp is far in the future"] += left_out
+            self.entries = kept
 
-def tracks_of(file: BagFile, chosen: Mapping[str, Chosen], values: ValueReader, stamped: bool) -> dict[str, Track]:
-    """Return what a file has on the chosen topics, by topic; `stamped`: whether stamps count."""
-    wanted = {name for name, entry in chosen.items() if entry.role is not Role.CAMERA_INFO and name in file.topics}
-    tracks = {name: Track(chosen[name]) for name in sorted(wanted)}
-    for topic, received, decode in file.messages(wanted):
+
+def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, stamped: bool) -> list[Track]:
+    """Return what a file of that number has on the chosen topics; `stamped`: whether stamps count."""
+    wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
+    tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
+    for topic, received, decode in file.messages(tracks):
         track = tracks[topic]
+        entry = track.chosen
         try:
             message = decode()
             stamp = stamp_of(message) if stamped else 0
-            value, entry = values.read(track.chosen, message), track.chosen
-            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, value))
+            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, value(entry, message)))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        _leave_out_wild(track)
-    return tracks
+        track.leave_out_wild()
+    return list(tracks.values())
 
 
-def delays_of(tracks: Mapping[str, Track]) -> Delays:
-    """Return by how many ns each source is behind the recorder of a file."""
-    least: dict[str, int] = {}
-    for track in tracks.values():
-        for delay in track.delays:
-            source = track.chosen.source
-            least[source] = min(delay, least.get(source, delay))
-    return least
-
-
-def _leave_out_wild(track: Track) -> None:
-    """Drop messages whose stamps are far ahead of those of the others."""
-    if not (delays := track.delays):
-        return
-    least = float(np.median(delays)) - WILD
-    kept = [entry for entry in track.entries if not entry.stamp or entry.received - entry.stamp >= least]
-    if len(kept) < len(track.entries):
-        track.refused["its stamp is far in the future"] += len(track.entries) - len(kept)
-        track.entries = kept
+def delays_of(tracks: Sequence[Track], files: int) -> list[Delays]:
+    """Return by how many ns each source is behind the recorder, for each of so many files."""
+    found: list[dict[str, int]] = [{} for _ in range(files)]
+    for track in tracks:
+        if delays := track.delays():
+            least, source = found[track.file], track.chosen.source
+            least[source] = min(*delays, least.get(source, delays[0]))
+    return [*found]
 
 
 @dataclass(frozen=True)
@@ -212,14 +224,13 @@ class TopicRow:
 
 def rows_of(
     files: Sequence[BagFile],
-    chosen: Mapping[str, Chosen] | None = None,
+    chosen: Collection[Chosen] = (),
     samples: Sequence[Sample] = (),
     clocks: Clocks | None = None,
 ) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
-    names = sorted(
-        {name for file in files for name in file.topics}, key=lambda name: (name not in (chosen or {}), name)
-    )
+    read_as = {entry.topic: entry for entry in chosen}
+    names = sorted({name for file in files for name in file.topics}, key=lambda name: (name not in read_as, name))
     times: dict[tuple[str, str], list[int]] = {}
     for sample in samples:
         times.setdefault((sample.car, sample.role), []).append(sample.stamp)
@@ -228,13 +239,13 @@ def rows_of(
         kind = next(file.topics[name] for file in files if name in file.topics)
         count = sum(file.counts.get(name, 0) for file in files)
         seconds = max(file.seconds for file in files if name in file.topics)
-        entry = (chosen or {}).get(name)
+        entry = read_as.get(name)
         if entry is None or clocks is None:
             rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
         stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
         shift = clocks.shifts.get(entry.source)
-        offset = None if shift is None or not shift.linked else shift.offset * 1e-9
+        offset = None if shift is None or shift.offset is None else shift.offset * 1e-9
         rate, gap, gaps = regularity(stamps)
         rows.append(TopicRow(name, kind, count, rate, entry.car, entry.role.value, len(stamps), gap, gaps, offset))
     return tuple(rows)
@@ -280,70 +291,52 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     with ExitStack() as stack:
         files = [stack.enter_context(BagFile(path)) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
-        chosen = {entry.topic: entry for entry in select(given, topics, where)}
-        values = ValueReader(given, binding, _calibrations(files, chosen), chosen.values())
-        tracks = [tracks_of(file, chosen, values, given.clocks.mode != "received") for file in files]
-    _check(tracks, chosen, where)
+        chosen = select(given, topics, where)
+        value, stamped = value_reader(given, binding, chosen, files), given.clocks.mode != "received"
+        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
+    for entry in chosen:
+        _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
-    clocks = reconcile([delays_of(file) for file in tracks], tolerance, stated)
+    clocks = reconcile(delays_of(tracks, len(files)), tolerance, stated)
     samples = _samples(tracks, clocks)
     return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)))
 
 
-def _calibrations(files: Sequence[BagFile], chosen: Mapping[str, Chosen]) -> dict[str, Calibration]:
-    """Return the first calibration of each car that publishes one."""
-    found: dict[str, Calibration] = {}
-    for file in files:
-        for name in [n for n, entry in chosen.items() if entry.role is Role.CAMERA_INFO and n in file.topics]:
-            for _, _, decode in file.messages([name]):
-                try:
-                    value = read(Role.CAMERA_INFO, decode())
-                except CoopenvError as error:
-                    raise DataError(f"{file.path}: topic {name}: {error}") from None
-                if isinstance(value, Calibration):
-                    found.setdefault(chosen[name].car, value)
-                break
-    return found
+def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
+    """Refuse bags in which a needed topic, with such tracks in the files, has no usable message."""
+    if not entry.needed or any(track.entries for track in tracks):
+        return
+    refused: Counter[str] = sum((track.refused for track in tracks), Counter())
+    if not refused:
+        raise DataError(f"{where}: topic {entry.topic} of {entry.car} has no messages")
+    [(reason, _)], total = refused.most_common(1), refused.total()
+    raise DataError(f"{where}: topic {entry.topic} of {entry.car}: none of {total} messages is of use: {reason}")
 
 
-def _check(tracks: Sequence[Mapping[str, Track]], chosen: Mapping[str, Chosen], where: str) -> None:
-    """Refuse bags with a needed topic that has no usable message."""
-    for name, entry in chosen.items():
-        parts = [file[name] for file in tracks if name in file]
-        if not entry.needed or any(part.entries for part in parts):
-            continue
-        refused: Counter[str] = sum((part.refused for part in parts), Counter())
-        if not refused:
-            raise DataError(f"{where}: topic {name} of {entry.car} has no messages")
-        reason, _ = refused.most_common(1)[0]
-        raise DataError(f"{where}: topic {name} of {entry.car}: none of {refused.total()} messages is of use: {reason}")
-
-
-def _samples(tracks: Sequence[Mapping[str, Track]], clocks: Clocks) -> tuple[Sample, ...]:
+def _samples(tracks: Sequence[Track], clocks: Clocks) -> tuple[Sample, ...]:
     """Return the samples in the order of their stamps; one that several files have is there once."""
     found: dict[tuple[str, int], Sample] = {}
-    for file, recorder in zip(tracks, clocks.recorders, strict=True):
-        for name, track in file.items():
-            for entry in track.entries:
-                added = clocks.shifts[track.chosen.source].added if entry.stamp else recorder
-                time = (entry.stamp or entry.received) + added
-                found.setdefault((name, time), replace(entry, stamp=time, received=time))
+    for track in tracks:
+        added, recorder = clocks.shifts.get(track.chosen.source), clocks.recorders[track.file]
+        for entry in track.entries:
+            time = entry.stamp + added.added if entry.stamp and added else entry.received + recorder
+            found.setdefault((track.chosen.topic, time), replace(entry, stamp=time, received=time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
-def _notes(tracks: Sequence[Mapping[str, Track]], clocks: Clocks, given: TopicMap) -> Iterator[str]:
+def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap) -> Iterator[str]:
     """Yield what was left out, moved, or used unchanged."""
-    parts = [(name, track) for file in tracks for name, track in file.items()]
-    for name, track in parts:
+    for track in tracks:
         if track.refused:
-            (reason, _), count = track.refused.most_common(1)[0], track.refused.total()
-            yield f"topic {name}: {count} of {count + len(track.entries)} messages left out: {reason}"
+            [(reason, _)], count = track.refused.most_common(1), track.refused.total()
+            total = count + len(track.entries)
+            yield f"topic {track.chosen.topic}: {count} of {total} messages left out: {reason}"
     for source, shift in sorted(clocks.shifts.items()):
-        if shift.added and source not in given.clocks.offsets:
-            yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
-        elif not shift.linked:
+        if shift.offset is None:
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
-    for name, track in parts if given.clocks.mode != "received" else ():
+        elif shift.added and source not in given.clocks.offsets:
+            yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
+    for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
-            yield f"topic {name}: messages without stamps count when they were received"
+            yield f"topic {track.chosen.topic}: messages without stamps count when they were received"

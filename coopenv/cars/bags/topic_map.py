@@ -186,9 +186,6 @@ def load_map(path: str | Path) -> TopicMap:
     return made.model_copy(update={"path": path})
 
 
-CAMERA = (Role.DETECTIONS, Role.BEARINGS)
-PLACE = (Role.ESTIMATE, Role.POINT)
-
 TRUTH = "truth"
 """The source of motion capture, as the sources of other topics have the name of their car."""
 
@@ -229,65 +226,44 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
     Raises:
         DataError: a needed topic is absent, or holds messages that cannot be read in the role of the map.
     """
-    return [chosen for car in given.cars for chosen in _CarTopics(given, car, topics, where).chosen()]
+    return [chosen for car in given.cars for chosen in _of_car(given, car, topics, where)]
 
 
-class _CarTopics:
-    """The topics of one car in a bag."""
+def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> list[Chosen]:
+    """Return the topics of one car that are read; a moving landmark has a position alone."""
+    names, table = candidates(given, car), f"{given.path.name}: cars.{car.name}.topics"
 
-    def __init__(self, given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> None:
-        self._given, self._car, self._topics, self._where = given, car, topics, where
-        self._names = candidates(given, car)
-        self._found = self._present()
+    def absent(name: str) -> str:
+        known = listed(sorted(topics)) or "none at all"
+        return f"{where} has no topic {name}{suggest(name, topics)}; it has {known}"
 
-    def chosen(self) -> list[Chosen]:
-        """Return those that are read; a moving landmark has a position alone."""
-        car, found = self._car, self._found
-        if car.landmark:  # motion capture is its position where it publishes none
-            roles: tuple[Role, ...] = self._first("position", [(role,) for role in (*PLACE, Role.TRUTH)])
-        else:
-            twists = [VELOCITY[self._given.odometry]] if self._given.odometry != "auto" else [*VELOCITY.values()]
-            cameras = [Role(self._given.camera)] if self._given.camera != "auto" else [*CAMERA]
-            roles = (
-                *self._first("odometry", twists),
-                *self._first("camera", [(role,) for role in cameras]),
-                *(role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in found),
-            )
-        return [Chosen(found[role], car.name, role, car.landmark is not None) for role in roles]
-
-    def _present(self) -> dict[Role, str]:
-        """Return the topics that the bag has, by role; one that the map itself names has to be there."""
-        car, topics = self._car, self._topics
-        listed_names = {
-            role: next((name for name in names if name in topics), "") for role, names in self._names.items()
-        }
-        found = {role: name for role, name in listed_names.items() if name}
-        for role, name in car.topics.given.items():
-            if name not in topics:
-                hint = "; without this key the environment's calibration counts" if role is Role.CAMERA_INFO else ""
-                raise DataError(f"{self._given.path.name}: cars.{car.name}.topics.{role}: {self._absent(name)}{hint}")
-        for role, name in found.items():
-            if topics[name] not in READERS[role]:
-                kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
-                raise DataError(f"{self._where}: topic {name} of {car.name} holds {kinds}")
-        return found
-
-    def _first(self, what: str, choices: Sequence[tuple[Role, ...]]) -> tuple[Role, ...]:
+    def first(what: str, choices: Sequence[tuple[Role, ...]]) -> tuple[Role, ...]:
         """Return the first choice of roles of which the bag has all topics."""
         for roles in choices:
-            if all(role in self._found for role in roles):
+            if all(role in found for role in roles):
                 return roles
-        missing = dict.fromkeys(role for roles in choices for role in roles if role not in self._found)
-        names = [name for role in missing for name in self._names.get(role, ())]
-        if not names:
-            kinds = listed([role.value for role in missing])
-            where = f"{self._given.path.name}: cars.{self._car.name}.topics"
-            raise DataError(f"{where}: names no topic of its {what} ({kinds})")
-        raise DataError(f"{self._car.name} has no {what}: {self._absent(names[0])}")
+        missing = dict.fromkeys(role for roles in choices for role in roles if role not in found)
+        if not (wanted := [name for role in missing for name in names.get(role, ())]):
+            raise DataError(f"{table}: names no topic of its {what} ({listed([role.value for role in missing])})")
+        raise DataError(f"{car.name} has no {what}: {absent(wanted[0])}")
 
-    def _absent(self, name: str) -> str:
-        known = listed(sorted(self._topics)) or "none at all"
-        return f"{self._where} has no topic {name}{suggest(name, self._topics)}; it has {known}"
+    for role, name in car.topics.given.items():
+        if name not in topics:
+            hint = "; without this key the environment's calibration counts" if role is Role.CAMERA_INFO else ""
+            raise DataError(f"{table}.{role}: {absent(name)}{hint}")
+    found = {role: there[0] for role, some in names.items() if (there := [name for name in some if name in topics])}
+    for role, name in found.items():
+        if topics[name] not in READERS[role]:
+            kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
+            raise DataError(f"{where}: topic {name} of {car.name} holds {kinds}")
+    if car.landmark:  # motion capture is its position where it publishes none
+        chosen: tuple[Role, ...] = first("position", [(role,) for role in (Role.ESTIMATE, Role.POINT, Role.TRUTH)])
+    else:
+        twists = [VELOCITY[given.odometry]] if given.odometry != "auto" else [*VELOCITY.values()]
+        cameras = [Role(given.camera)] if given.camera != "auto" else [Role.DETECTIONS, Role.BEARINGS]
+        chosen = first("odometry", twists) + first("camera", [(role,) for role in cameras])
+        chosen += tuple(role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in found)
+    return [Chosen(found[role], car.name, role, car.landmark is not None) for role in chosen]
 
 
 def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
