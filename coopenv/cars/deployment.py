@@ -340,11 +340,6 @@ class Deployment(Section):
         """Whether cars must publish the conditions of remote control, autopilot and battery."""
         return self.network.kind == "zenoh" if self.safety.conditions is None else self.safety.conditions
 
-    @property
-    def driven(self) -> tuple[Car, ...]:
-        """The cars that are vehicles, in the order of the file."""
-        return tuple(car for car in self.cars if car.landmark is None)
-
     def car(self, name: str) -> Car:
         """Return a car by name. Raises DeploymentError: there is none."""
         names = [car.name for car in self.cars]

@@ -19,7 +19,6 @@ from coopenv.cars.backend.binding import (
     Binding,
     bind,
     estimate_message,
-    is_finite,
     report_message,
     reset_options,
 )
@@ -82,7 +81,7 @@ class Svea:
             recorder: records the messages of the ticks, and the reasons of stops.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self._signer, self.recorder = transport, signer, recorder
+        self._transport, self.recorder = transport, recorder
         self.capabilities = Capabilities(
             truth=deployment.sensors.truth,
             driven=True,
@@ -237,9 +236,7 @@ class Svea:
         self.health.late += int(np.asarray(tick.late)[local].sum())
         self.health.missing += int(missing.sum())
         self.health.empty += int((~tick.visible[local].any(axis=-1) & ~missing).sum())
-        refused = self._assembler.refused + self.station.dropped
-        for counts in self.intake.rejected.values():
-            refused += counts
+        refused = sum(self.intake.rejected.values(), self._assembler.refused + self.station.dropped)
         self.link.refused, self.health.rejected = dict(refused), sum(refused.values())
         return tick
 
@@ -247,19 +244,13 @@ class Svea:
         """Send the estimates of the vehicles estimated here at the present tick."""
         for each in sent:
             name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
-            if not is_finite(each):
+            if not all(np.isfinite(part).all() for part in (each.rotation, each.position, each.covariance)):
                 continue
             if self.deployment.safety.judge == "estimate":
                 self.monitor.place(name, each.position + self._origin, moment)
-            self._publish(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
-            report = report_message(each, moment, self._origin)
-            if report is not None:
-                self._publish(name, Role.REPORT, report)
-
-    def _publish(self, name: str, role: Role, message: Any) -> None:
-        topic, payload = self.binding.profile.topic_of(name, role), encode(message)
-        signature = b"" if self._signer is None else self._signer.sign(topic, payload)
-        self._transport.publish(topic, payload, signature)
+            self.gates.send(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
+            if (report := report_message(each, moment, self._origin)) is not None:
+                self.gates.send(name, Role.REPORT, report)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         """Return the entries of a vehicle's info about its car and the network."""
@@ -353,9 +344,9 @@ def open_svea(
         link.close()
         raise
     if recorder is not None:
-        names = [binding.names[i] for i in binding.local]
-        aside = {binding.profile.topic_of(name, role) for name in names for role in (Role.GATE, *ROLES)}
-        link = RecordedTransport(link, recorder, aside, {binding.profile.topic_of(name, Role.STOP) for name in names})
+        roles, names = (Role.GATE, Role.STOP, *ROLES), [binding.names[i] for i in binding.local]
+        aside = [binding.profile.topic_of(name, role) for name in names for role in roles]
+        link = RecordedTransport(link, recorder, aside)
     return Svea(deployment, binding, link, signer, verifier, recorder)
 
 

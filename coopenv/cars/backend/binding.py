@@ -76,24 +76,24 @@ def bind(
     """
     check_types(profile, where)
     vehicles, landmarks = scenario.vehicle_names, [landmark.name for landmark in scenario.landmarks]
-    driven, leaders = [car for car in cars if car.landmark is None], [car for car in cars if car.landmark is not None]
+    driven = [car for car in cars if car.landmark is None]
     if len(driven) != len(vehicles):
         raise CoopenvError(
             f"{where}: cars: {len(driven)} of them are vehicles, the environment has {len(vehicles)}: "
             f"{listed(vehicles)}"
         )
     left = [name for name in vehicles if name not in {car.vehicle for car in driven}]
-    chosen = {}
-    for car in driven:
-        name = left.pop(0) if car.vehicle is None else car.vehicle
-        chosen[car.name] = _index(vehicles, name, f"{where}: cars.{car.name}.vehicle")
-    for name in markers:
-        _index(landmarks, name, f"{where}: markers")
-    targets = {number: landmarks.index(name) for name, number in markers.items()}
-    led = {c.name: _index(landmarks, str(c.landmark), f"{where}: cars.{c.name}.landmark") for c in leaders}
+    targets = {number: _index(landmarks, name, f"{where}: markers") for name, number in markers.items()}
+    chosen, led = {}, {}
     for car in cars:
+        here = f"{where}: cars.{car.name}"
+        if car.landmark is not None:
+            target = led[car.name] = _index(landmarks, car.landmark, f"{here}.landmark")
+        else:
+            chosen[car.name] = _index(vehicles, left.pop(0) if car.vehicle is None else car.vehicle, f"{here}.vehicle")
+            target = len(landmarks) + chosen[car.name]
         if car.marker is not None:
-            targets[car.marker] = led[car.name] if car.name in led else len(landmarks) + chosen[car.name]
+            targets[car.marker] = target
     for i, camera in enumerate(scenario.cameras):
         if camera.model != "pinhole":
             raise CoopenvError(
@@ -181,12 +181,6 @@ def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | N
         fields = {"valid": True, "pose": placed, "covariance": m.covariance, "odometry": odometry}
         fields["depends_on"] = int(m.extra["depends_on"][0])
     return make("coopenv_msgs/msg/RobustReport", header=header(stamp, "map"), **fields)
-
-
-def is_finite(sent: VehicleBroadcast) -> bool:
-    """Return whether an estimate is finite."""
-    numbers = np.concatenate([sent.rotation.ravel(), sent.position, sent.covariance.ravel()])
-    return bool(np.isfinite(numbers).all())
 
 
 NS = 1e-9

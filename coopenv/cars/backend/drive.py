@@ -10,7 +10,7 @@ import queue
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +24,8 @@ from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, ros2, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
-from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC
-from coopenv.cars.transport.base import Arrival, Callback, Transport
+from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
+from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.scenario.files import override, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 
@@ -79,7 +79,7 @@ class DriveRecorder:
             self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
             self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
             self._stream.flush()
-        _stopped("", "", 0)  # the first message of a type takes long, and this one must not
+        encode(make(STOPPED))  # the first message of a type takes long, and this one must not
         self._queue: queue.SimpleQueue[tuple[str, bytes, int] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_all, name="coopenv recorder", daemon=True)
         self._thread.start()
@@ -100,7 +100,8 @@ class DriveRecorder:
 
     def stopped(self, reason: str, car: str, now: int) -> None:
         """Write the reason and the car for which the watchdog stopped the cars at a time in ns, and flush."""
-        self._queue.put((STOPPED_TOPIC, _stopped(reason, car, now), now))
+        message = make(STOPPED, header=header(now), reason=reason, car=car)
+        self._queue.put((STOPPED_TOPIC, encode(message), now))
 
     def close(self) -> None:
         """Write what is left and close the file; one without an episode is removed.
@@ -152,10 +153,6 @@ class DriveRecorder:
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             self._channels[topic] = self._writer.register_channel(f"/{topic}", "cdr", self._schemas[kind])
         return self._channels[topic]
-
-
-def _stopped(reason: str, car: str, now: int) -> bytes:
-    return encode(make(STOPPED, header=header(now), reason=reason, car=car))
 
 
 def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes:
@@ -288,26 +285,25 @@ PRESENCE = "std_msgs/msg/Bool"
 
 
 class RecordedTransport:
-    """A transport whose messages are recorded, in the thread that sends or receives them.
+    """A transport of which all that is sent, presence and some topics are recorded, in the thread of each message.
 
     Messages of which ticks are made are recorded by the backend, in the order in which it takes them.
     """
 
-    def __init__(
-        self, transport: Transport, recorder: DriveRecorder, aside: Collection[str] = (), unread: Collection[str] = ()
-    ) -> None:
+    def __init__(self, transport: Transport, recorder: DriveRecorder, aside: Iterable[str] = ()) -> None:
         """Wrap a transport.
 
         Args:
             transport: the network.
             recorder: records all messages that are sent, and presence.
             aside: topics of which no ticks are made: what comes on them is written at once.
-            unread: topics without a subscriber here that are recorded as well.
         """
-        self._transport, self._recorder, self._aside = transport, recorder, frozenset(aside)
-        self.announce, self.close = transport.announce, transport.close
-        for topic in unread:
-            transport.subscribe(topic, self._write)
+        self._transport, self._recorder = transport, recorder
+        self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
+        self.close = transport.close
+        for topic in aside:
+            transport.subscribe(topic, lambda arrival: recorder.write(arrival.topic, arrival.payload, arrival.received))
+        transport.watch(presence_of("*"), self._write_presence)
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -316,23 +312,5 @@ class RecordedTransport:
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
         self._recorder.write(topic, payload, time.time_ns())
 
-    def subscribe(self, pattern: str, callback: Callback) -> None:
-        """Subscribe, see `Transport`."""
-
-        def take(arrival: Arrival) -> None:
-            self._write(arrival)
-            callback(arrival)
-
-        self._transport.subscribe(pattern, take if pattern in self._aside else callback)
-
-    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
-        """Watch, see `Transport`, and record the changes."""
-
-        def change(name: str, there: bool) -> None:
-            self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())
-            callback(name, there)
-
-        self._transport.watch(pattern, change)
-
-    def _write(self, arrival: Arrival) -> None:
-        self._recorder.write(arrival.topic, arrival.payload, arrival.received)
+    def _write_presence(self, name: str, there: bool) -> None:
+        self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())

@@ -101,8 +101,7 @@ class Pacer:
         self._period = round(period * 1e9)
         self._decision = self._period * per_decision
         self._wall = time.time_ns() - time.monotonic_ns()
-        self._due = 0
-        self._begun = False
+        self._due = 0  # before the first decision
         self.missed = 0
         """Decisions that missed their deadline."""
         self.in_a_row = 0
@@ -116,15 +115,13 @@ class Pacer:
     def start(self) -> int:
         """Begin anew: time counts from the first decision on. Returns the time now."""
         self._wall = time.time_ns() - time.monotonic_ns()
-        self.missed = self.in_a_row = 0
+        self.missed = self.in_a_row = self._due = 0
         self.lateness.clear()
-        self._begun = False
         return self.now()
 
     def decide(self) -> None:
         """Begin a decision: where even its last tick is due already, count it and go on from now."""
-        if not self._begun:
-            self._begun, self._due = True, self.now()
+        self._due = self._due or self.now()
         self.in_a_row = self.in_a_row + 1 if self._leave_out() else 0
 
     def wait(self) -> int:
@@ -307,14 +304,14 @@ class Gates:
         message = make(
             GATE_TYPES[Role.ARM], header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
         )
-        self._send(car, Role.ARM, message)
+        self.send(car, Role.ARM, message)
 
     def stop(self) -> None:
         """Stop every gate at once, until the next arming."""
         with self._lock:
             self._stopping = True
         for car in self._states:
-            self._send(car, Role.STOP, make(GATE_TYPES[Role.STOP], data=True))
+            self.send(car, Role.STOP, make(GATE_TYPES[Role.STOP], data=True))
 
     def command(self, car: str, speed: float, steering: float, acceleration: float) -> None:
         """Send a command: m/s, rad, m/s^2, clipped to the limits."""
@@ -328,13 +325,14 @@ class Gates:
             "acceleration": min(acceleration, limits.acceleration),
         }
         about = header(time.time_ns(), f"{self.session}:{self._sequence}")
-        self._send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
+        self.send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
 
     def next(self) -> None:
         """Begin the commands of the next decision."""
         self._sequence += 1
 
-    def _send(self, car: str, role: Role, message: Any) -> None:
+    def send(self, car: str, role: Role, message: Any) -> None:
+        """Send a message on a topic of a car, signed."""
         topic, payload = self.profile.topic_of(car, role), encode(message)
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
         kind = self.profile.topics[role]

@@ -2,7 +2,6 @@
 
 from bisect import bisect_right
 from collections import Counter, deque
-from itertools import islice
 
 import numpy as np
 
@@ -93,23 +92,13 @@ class PoseTrack:
 
     def at(self, time: int) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and position (3,) at a time, NaN where too little is known about it."""
-        after = bisect_right(self._poses, time, key=lambda pose: pose[0])
-        if after == 0:
+        poses = self._poses
+        if not poses or not poses[0][0] <= time <= poses[-1][0] + LONGEST_GAP:
             return UNKNOWN
-        before, R, p = self._poses[after - 1]
-        if after == len(self._poses):
-            near = time - before
-            if near > LONGEST_GAP:
-                return UNKNOWN
-            if after == 1 or near == 0:
-                return R, p
-            earlier, R0, p0 = self._poses[after - 2]  # goes on as it went
-            return self._between((earlier, R0, p0), (before, R, p), time)
-        return self._between((before, R, p), next(islice(self._poses, after, None)), time)
-
-    @staticmethod
-    def _between(first: tuple[int, Array, Array], second: tuple[int, Array, Array], time: int) -> tuple[Array, Array]:
-        (t0, R0, p0), (t1, R1, p1) = first, second
+        if len(poses) == 1 or time == poses[-1][0]:
+            return poses[-1][1:]
+        after = min(bisect_right(poses, time, key=lambda pose: pose[0]), len(poses) - 1)  # beyond the last: as before
+        (t0, R0, p0), (t1, R1, p1) = poses[after - 1], poses[after]
         if t1 - t0 > LONGEST_GAP:
             return UNKNOWN
         share = (time - t0) / (t1 - t0)

@@ -182,30 +182,27 @@ def _guard_rosbags() -> None:
             "this version of rosbags would unpack without limits; pip install 'rosbags==0.11.9'"
         ) from None
 
-    def message(data: bytes) -> bytes:
-        allowance = _allowance.get()
-        return unpack_message(data) if allowance is None else allowance.unpack("zstd", data)
+    def unpacker(original: Callable[..., bytes], compression: str, *, alone: bool = False) -> Callable[..., bytes]:
+        """Return what unpacks as `original` does, within the limits; `alone`: each chunk has limits of its own."""
+
+        def unpack(data: bytes, *size: int) -> bytes:
+            if (allowance := _allowance.get()) is None:
+                return original(data, *size)
+            return (Allowance(len(data)) if alone else allowance).unpack(compression, data, *size)
+
+        return unpack
 
     def file(stream: Any, mode: str) -> Any:
         return open_file(stream, mode) if _allowance.get() is None else _Counted(open_file(stream, mode))
-
-    def chunk(original: Callable[..., bytes], compression: str, data: bytes, size: int) -> bytes:
-        allowance = _allowance.get()
-        return original(data, size) if allowance is None else allowance.unpack(compression, data, size)
-
-    def ros1_chunk(original: Callable[..., bytes], compression: str, data: bytes) -> bytes:
-        if _allowance.get() is None:
-            return original(data)
-        return Allowance(len(data)).unpack(compression, data)  # rosbags holds one at a time, and may come back to it
 
     def connected(database: Any) -> None:
         if _allowance.get() is not None:
             database.limit(apsw.SQLITE_LIMIT_LENGTH, AT_ONCE)
 
-    reader.zstd = SimpleNamespace(decompress=message, open=file)
-    tables: tuple[tuple[Any, Any], ...] = ((DECOMPRESSORS, chunk), (decompressors, ros1_chunk))
-    for table, limited_form in tables:
-        table.update({name: partial(limited_form, original, name) for name, original in table.items()})
+    reader.zstd = SimpleNamespace(decompress=unpacker(unpack_message, "zstd"), open=file)
+    tables: tuple[tuple[Any, bool], ...] = ((DECOMPRESSORS, False), (decompressors, True))
+    for table, alone in tables:  # of a bag of ROS 1, rosbags holds one chunk at a time, and may come back to it
+        table.update({name: unpacker(original, name, alone=alone) for name, original in table.items()})
     apsw.connection_hooks.append(connected)
 
 

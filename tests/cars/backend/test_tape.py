@@ -70,10 +70,9 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
         "fleet/alive/svea7": PRESENCE,
     }
     recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", types)
-    recorded = RecordedTransport(hub.connect(), recorder, {state}, {stop})
+    recorded = RecordedTransport(hub.connect(), recorder, (state, stop))
     for topic in (state, wheels):
         recorded.subscribe(topic, read.append)
-    recorded.watch("fleet/alive/*", lambda name, there: None)
     recorder.tick(0, 1)
     others = hub.connect()
     for name in ("svea7", "stranger"):

@@ -33,7 +33,7 @@ def written(folder: Path, text: str) -> Path:
 
 def test_a_good_file_is_read(tmp_path: Path) -> None:
     fleet = load_deployment(written(tmp_path, GOOD))
-    assert [car.name for car in fleet.driven] == ["svea7", "svea8"]
+    assert [car.name for car in fleet.cars] == ["svea7", "svea8", "leader"]
     assert [car.agent_number for car in fleet.cars] == [7, 8, 5]
     assert fleet.network.connect == ("tcp/127.0.0.1:7447",)
     assert fleet.folder == tmp_path
