@@ -36,8 +36,7 @@ class Binding:
     @property
     def names(self) -> tuple[str, ...]:
         """(N,) the cars' names by vehicle."""
-        by_vehicle = {vehicle: name for name, vehicle in self.cars.items()}
-        return tuple(by_vehicle[i] for i in range(len(by_vehicle)))
+        return tuple(sorted(self.cars, key=lambda name: self.cars[name]))
 
     @property
     def unmarked(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections import Counter, deque
+from operator import itemgetter
 
 import numpy as np
 
@@ -9,23 +10,19 @@ from coopenv.cars.readings import Detections, Twist
 from coopenv.estimation.poses import Array, exp_so3, exp_translation, log_so3
 
 MOST_SAMPLES = 512
-"""Samples that wait for a tick: five seconds of an IMU."""
-
-
-Velocities = tuple[Array, Array]
-"""Velocity, m/s, and turn rate, rad/s, of a body, each (3,)."""
+"""Velocities and turn rates that wait for a tick: five seconds of an IMU."""
 
 
 class Odometer:
-    """Held twists of one car; times in ns on one clock."""
+    """Held velocities (m/s) and turn rates (rad/s) of one car, each (3,); times in ns on one clock."""
 
     def __init__(self) -> None:
         """Begin with nothing."""
-        self._samples: deque[tuple[int, Velocities]] = deque()  # since when
-        self._now: Velocities = (np.zeros(3), np.zeros(3))  # held at the last time asked for
-        self.twist: Velocities = self._now
+        self._waiting: deque[tuple[int, int, Array]] = deque()  # since when; 0: velocity, 1: turn rate; the value
+        self._held = [np.zeros(3), np.zeros(3)]  # at the last time asked for
+        self.twist = [np.zeros(3), np.zeros(3)]
         """The newest velocity and turn rate; zero where none has come."""
-        self._stamps: dict[str, int] = {}
+        self._stamps: dict[int, int] = {}
 
     @property
     def stamp(self) -> int | None:
@@ -33,46 +30,32 @@ class Odometer:
         return min(self._stamps.values()) if len(self._stamps) == 2 else None
 
     def put(self, stamp: int, twist: Twist) -> None:
-        """Take a sample of the velocity, of the turn rate, or of both, newer than all before of the same sensor.
-
-        Samples are kept in order. Those of two sensors come interleaved: later ones hold the new part as well.
-        """
-        self._stamps |= {part: stamp for part in ("linear", "angular") if getattr(twist, part) is not None}
-        self.twist = _replaced(self.twist, twist)
-        later = []
-        while self._samples and self._samples[-1][0] > stamp:
-            later.append(self._samples.pop())
-        before = self._samples[-1][1] if self._samples else self._now
-        for since, held in ((stamp, before), *reversed(later)):
-            self._samples.append((since, _replaced(held, twist)))
-        if len(self._samples) > MOST_SAMPLES:
-            _, self._now = self._samples.popleft()
+        """Take a sample of the velocity, of the turn rate, or of both, newer than all before of the same sensor."""
+        for part, value in enumerate((twist.linear, twist.angular)):
+            if value is not None:
+                self._waiting.append((stamp, part, value))
+                self.twist[part], self._stamps[part] = value, stamp
+        while len(self._waiting) > MOST_SAMPLES:
+            _, part, value = self._waiting.popleft()
+            self._held[part] = value
 
     def increment(self, begin: int, end: int) -> tuple[Array, Array]:
         """Return the rotation (3, 3) and translation (3,) in m from `begin` to `end`, and forget what was before."""
-        R, p = np.eye(3), np.zeros(3)
-        now = begin
-        while self._samples and self._samples[0][0] <= end:
-            since, held = self._samples.popleft()
+        R, p, now = np.eye(3), np.zeros(3), begin
+        due = sorted((sample for sample in self._waiting if sample[0] <= end), key=itemgetter(0))
+        self._waiting = deque(sample for sample in self._waiting if sample[0] > end)
+        for since, part, value in due:
             if since > now:
                 R, p = self._go(R, p, since - now)
                 now = since
-            self._now = held
-        if end > now:
-            R, p = self._go(R, p, end - now)
-        return R, p
+            self._held[part] = value
+        return self._go(R, p, end - now) if end > now else (R, p)
 
     def _go(self, R: Array, p: Array, duration: int) -> tuple[Array, Array]:
-        v, w = self._now
+        v, w = self._held
         seconds = duration * 1e-9
         turn, step = exp_so3(w * seconds), exp_translation(w * seconds, v * seconds)
         return R.dot(turn), p + R.dot(step)
-
-
-def _replaced(held: Velocities, twist: Twist) -> Velocities:
-    """Return velocities with the parts of a twist that were measured in place of the held ones."""
-    v, w = held
-    return v if twist.linear is None else twist.linear, w if twist.angular is None else twist.angular
 
 
 MOST_POSES = 256
@@ -151,15 +134,13 @@ class Frames:
     def __init__(self, refused: Counter[str]) -> None:
         """Begin with nothing; frames that are not used are counted in `refused`."""
         self._refused = refused
-        self._waiting: deque[tuple[int, Detections]] = deque()
+        self._waiting: deque[tuple[int, Detections]] = deque(maxlen=MOST_WAITING + 1)
         self._skipped = 0  # because too many waited, since the last one was taken
 
     def put(self, stamp: int, frame: Detections) -> None:
-        """Take a frame, newer than all before."""
+        """Take a frame, newer than all before; the oldest one makes room."""
+        self._skipped += len(self._waiting) > MOST_WAITING
         self._waiting.append((stamp, frame))
-        while len(self._waiting) > MOST_WAITING + 1:
-            self._waiting.popleft()
-            self._skipped += 1
 
     def take(self, after: int, until: int) -> tuple[int, Detections] | None:
         """Return the oldest frame exposed after a time and by another one; None: there is none."""

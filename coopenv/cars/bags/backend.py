@@ -71,10 +71,10 @@ class Bag(TickGenerator):
 
     def _ticks(self) -> tuple[int, int]:
         """Return when tick 0 is, ns, and how many ticks there are."""
-        needed = {(s.car, s.role) for s in self.log.samples if s.car in self.binding.cars and s.role is not Role.TRUTH}
-        spans = [self.log.span(car, role) for car, role in needed]
-        begin = max(first for first, _ in spans) + round(self.map.start * NS) + round(1.5 * NS / self._rate)
-        end = max(last for _, last in spans)
+        needed = [s for s in self.log.samples if s.car in self.binding.cars and s.role is not Role.TRUTH]
+        first = {(s.car, s.role): s.stamp for s in reversed(needed)}
+        begin = max(first.values()) + round(self.map.start * NS) + round(1.5 * NS / self._rate)
+        end = needed[-1].stamp
         if self.map.duration is not None:
             end = min(end, begin + round(self.map.duration * NS))
         ticks = int((end - begin) * self._rate / NS + 0.5 + 1e-6) + 1  # the last one is half a period after its frame

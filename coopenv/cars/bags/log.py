@@ -270,11 +270,6 @@ class BagLog:
     rows: tuple[TopicRow, ...]  # what there is, by topic
     notes: tuple[str, ...]  # what a user should know
 
-    def span(self, car: str, role: Role) -> tuple[int, int]:
-        """Return when the first and the last sample of a car's role were taken, ns; of a role that it has."""
-        stamps = [sample.stamp for sample in self.samples if sample.car == car and sample.role is role]
-        return stamps[0], stamps[-1]
-
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
     """Read bags.

@@ -85,7 +85,7 @@ def test_samples_that_nobody_asks_for_fill_no_memory() -> None:
     odometer = Odometer()
     for k in range(5 * MOST_SAMPLES):
         odometer.put(k, Twist(np.array([float(k), 0.0, 0.0]), np.zeros(3)))
-    assert len(odometer._samples) <= MOST_SAMPLES
+    assert len(odometer._waiting) <= MOST_SAMPLES
 
 
 def test_rotations_stay_rotations() -> None:
