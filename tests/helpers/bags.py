@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.cars import codec
+from coopenv.cars.transport.authors import to_ros1
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import log_so3
 from coopenv.observers import Recording
@@ -74,21 +75,6 @@ def drive(seconds: float = 4.0, seed: int = 0) -> Recording:
     return record(load_scenario("crossing_path", overrides), seed)
 
 
-def vector(kind: str, values: Any) -> tuple[str, dict[str, Any]]:
-    return f"geometry_msgs/msg/{kind}", dict(zip("xyz", map(float, values), strict=True))
-
-
-def pose(R: np.ndarray, p: np.ndarray) -> tuple[str, dict[str, Any]]:
-    half = 0.5 * log_so3(R)
-    angle = float(np.linalg.norm(half))
-    axis = half if angle < 1e-12 else half / angle * np.sin(angle)
-    turn = dict(zip("xyzw", [*map(float, axis), float(np.cos(angle))], strict=True))
-    return "geometry_msgs/msg/Pose", {
-        "position": vector("Point", p),
-        "orientation": ("geometry_msgs/msg/Quaternion", turn),
-    }
-
-
 AUTHORS = {
     "blocks": "/agent8/pixy_node/objectsInfo",
     "twist": "/agent8/actuation_twist",
@@ -103,7 +89,7 @@ def messages(r: Recording) -> list[Message]:
     for k in range(r.ticks):
         t = round(k * 1e9 * r.dt)
         point = r.landmarks[k, 4] - np.array([0.0, 0.0, 0.25])  # of a point only the marker's height is added
-        fields = {"point": vector("Point", point)}
+        fields = {"point": point}
         found.append(Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, fields))
     return found
 
@@ -120,14 +106,14 @@ def of_vehicle(
         if k + 1 < r.ticks:
             moved = {"twist": twist(r, k + 1, i)}
             found.append(Message(names["twist"], "geometry_msgs/msg/TwistWithCovarianceStamped", t, t, moved))
-        place = {"pose": pose(r.truth.rotation[k, i], r.truth.position[k, i])}
+        place = {"pose": codec.pose(r.truth.rotation[k, i], r.truth.position[k, i])}
         found.append(Message(names["truth"], "geometry_msgs/msg/PoseStamped", t, t, place))
     return found
 
 
 def blocks(
     r: Recording, k: int, i: int, numbers: dict[int, int], distortion: tuple[float, ...]
-) -> list[tuple[str, dict[str, Any]]]:
+) -> list[dict[str, int]]:
     """Return the blocks of a frame, an unwanted small one of every marker among them."""
     camera = load_scenario("crossing_path").cameras[0]
     found = []
@@ -136,20 +122,16 @@ def blocks(
         flat = distort((ray[:2] / ray[2])[None], distortion)[0]
         u, v = np.round(flat * camera.focal_length + np.array(camera.principal_point)).astype(int).tolist()
         for x, width in ((u, 9), (1, 2)):
-            row = {"signature": numbers[target], "center_x": x, "center_y": v, "width": width, "height": width}
-            found.append(("pixy_camera/msg/ObjectInfo", {**row, "angle": 0, "index": 0, "age": 1}))
+            sides = {"width": width, "height": width, "age": 1}
+            found.append({"signature": numbers[target], "center_x": x, "center_y": v, **sides})
     return found
 
 
-def twist(r: Recording, k: int, i: int) -> tuple[str, dict[str, Any]]:
+def twist(r: Recording, k: int, i: int) -> dict[str, Any]:
     """Return the twist that leads to a tick when it is held since the last one; its rotation is small or none."""
     turn = log_so3(r.rotation[k, i])
     linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, i])
-    both = {"linear": vector("Vector3", linear / r.dt), "angular": vector("Vector3", turn / r.dt)}
-    return "geometry_msgs/msg/TwistWithCovariance", {
-        "twist": ("geometry_msgs/msg/Twist", both),
-        "covariance": np.diag([0.1] * 6).ravel(),
-    }
+    return {"twist": (linear / r.dt, turn / r.dt), "covariance": np.diag([0.1] * 6)}
 
 
 def _left_jacobian(turn: np.ndarray) -> np.ndarray:
@@ -176,44 +158,24 @@ def write(path: Path, given: Iterable[Message], form: str) -> Path:
 
         path = path.with_suffix(".bag")
         with Writer1(path) as bag:
-            _fill(bag, ordered, codec.ros1(), lambda s, m, kind: s.serialize_ros1(m, kind))
+            _fill(bag, ordered, codec.ros1(), lambda message: codec.encode_ros1(to_ros1(message)))
         return path
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     plugin = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
     with Writer(path, version=9, storage_plugin=plugin) as bag:
-        _fill(bag, ordered, codec.ros2(), lambda s, m, kind: s.serialize_cdr(m, kind))
+        _fill(bag, ordered, codec.ros2(), codec.encode)
     return path
 
 
-def _fill(bag: Any, ordered: list[Message], store: Any, encode: Any) -> None:
+def _fill(bag: Any, ordered: list[Message], store: Any, encode: Callable[[Any], bytes]) -> None:
     connections: dict[str, Any] = {}
-    for number, m in enumerate(ordered):
+    for m in ordered:
         if m.topic not in connections:
             connections[m.topic] = bag.add_connection(m.topic, m.kind, typestore=store)
-        message = _made(store, m.kind, {"header": _header(store, BEGIN + m.stamp, number), **m.fields})
-        bag.write(connections[m.topic], BEGIN + m.received, encode(store, message, m.kind))
+        bag.write(connections[m.topic], BEGIN + m.received, encode(made(m)))
 
 
-def payload(m: Message, number: int = 0) -> bytes:
-    """Return the CDR bytes of a message."""
-    return codec.encode(
-        _made(codec.ros2(), m.kind, {"header": _header(codec.ros2(), BEGIN + m.stamp, number), **m.fields})
-    )
-
-
-def _header(store: Any, stamp: int, number: int) -> Any:
-    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    fields = {"stamp": time, "frame_id": ""}
-    kind = store.types["std_msgs/msg/Header"]
-    return kind(**fields, seq=number) if "seq" in kind.__dataclass_fields__ else kind(**fields)
-
-
-def _made(store: Any, kind: str, fields: dict[str, Any]) -> Any:
-    return store.types[kind](**{name: _value(store, value) for name, value in fields.items()})
-
-
-def _value(store: Any, value: Any) -> Any:
-    if isinstance(value, tuple):
-        return _made(store, *value)
-    return [_value(store, part) for part in value] if isinstance(value, list) else value
+def made(m: Message) -> Any:
+    """Return a message as one of ROS 2."""
+    return codec.make(m.kind, header=codec.header(BEGIN + m.stamp), **m.fields)

@@ -253,17 +253,17 @@ class Svea:
                 self.gates.send(name, Role.REPORT, report)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
-        """Return the entries of a vehicle's info about its car and the network."""
+        """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""
         name = self.binding.names[vehicle]
-        gate, trip = self.gates.states.get(name), self.watchdog.trip
+        trip = self.watchdog.trip or Trip("")
         offset = self.intake.offsets[name].seconds
         return {
             "name": name,
             "armed": self._armed,
-            "stopped": "" if trip is None else trip.reason,
-            "stopped_by": "" if trip is None else trip.car,
-            "gate": "unknown" if gate is None else gate.state,
-            "gate_rejections": {} if gate is None else self.gates.refused(name),
+            "stopped": trip.reason,
+            "stopped_by": trip.car,
+            "gate": self.gates.states[name].state,
+            "gate_rejections": self.gates.refused(name),
             "rejections": dict(self.link.refused),
             "missed_deadlines": self.link.missed,
             "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,

@@ -165,7 +165,7 @@ class GateState:
     state: str = "unknown"
     session: str = ""
     nonce: str = ""
-    accepted: int = 0
+    stamp: int = 0  # ns, by the clock of the car
     rejections: dict[str, int] = field(default_factory=dict)
     received: float = float("-inf")  # by the monotonic clock, s
 
@@ -193,7 +193,6 @@ class Gates:
         self._states = {car: GateState() for car in cars}
         self._before: dict[str, dict[str, int]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
-        self._stamps = dict.fromkeys(cars, 0)
         self._stopping = False
         self.stopped_by_others: set[str] = set()
         """Cars stopped by another station, or on the spot, since their last arming."""
@@ -235,12 +234,11 @@ class Gates:
             self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
             return
         counts = dict(zip(m.rejections, (int(n) for n in m.counts), strict=False))
-        state = GateState(m.state, m.session, m.nonce, int(m.accepted), counts, time.monotonic())
         with self._lock:
-            if stamp < self._stamps[car]:
+            if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
                 return
-            self._stamps[car], self._states[car] = stamp, state
+            self._states[car] = GateState(m.state, m.session, m.nonce, stamp, counts, time.monotonic())
             if m.state == "stopped" and not self._stopping:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)

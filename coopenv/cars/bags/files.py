@@ -16,11 +16,10 @@ from coopenv.cars import codec
 if TYPE_CHECKING:
     from coopenv.backends.mcap.container import Allowance
 
-SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
 
-REPAIRS = {".bag": "rosbag reindex", ".mcap": REPAIR, ".db3": "sqlite3 FILE .recover"}
-"""By suffix, the tool that mends a file whose recording was cut off."""
+REPAIRS = {".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover", ".mcap": REPAIR}
+"""By the suffix of bags that are files, the tool that mends one whose recording was cut off."""
 
 
 class BagFile:
@@ -39,8 +38,8 @@ class BagFile:
             raise DataError(f"no such bag: {path}")
         if path.is_dir() and not (path / METADATA).is_file():
             raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
-        if path.is_file() and path.suffix not in SUFFIXES:
-            raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(SUFFIXES)}")
+        if path.is_file() and path.suffix not in REPAIRS:
+            raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(REPAIRS)}")
         self._stack = ExitStack()
         self._parts = [path] if path.is_file() else [part for part in sorted(path.iterdir()) if part.is_file()]
         self._bytes = sum(part.stat().st_size for part in self._parts)

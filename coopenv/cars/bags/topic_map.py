@@ -13,12 +13,6 @@ from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
 from coopenv.cars.profile import PREFIX, VELOCITY, Number, Positive, Role, load_profile
 from coopenv.cars.readings import READERS
 
-READ = (
-    *(Role.DETECTIONS, Role.BEARINGS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.ODOMETRY),
-    *(Role.ESTIMATE, Role.POINT, Role.TRUTH),
-)
-"""Roles that are of use in a bag."""
-
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {
         Role.DETECTIONS: ("/{agent}/pixy_node/objectsInfo",),
@@ -80,6 +74,10 @@ class Topics(Section):
     def given(self) -> dict[Role, str]:
         """What is set, by role."""
         return {role: name for role in READ if (name := getattr(self, role.value)) is not None}
+
+
+READ = tuple(Role(name) for name in Topics.model_fields)
+"""Roles that are of use in a bag."""
 
 
 class BagCar(Car):
