@@ -56,9 +56,8 @@ def test_nothing_that_comes_stops_the_ticks_or_stays_in_memory() -> None:
     rng, bound, now = np.random.default_rng(0), binding(), time.time_ns()
     intake, assembler = Intake(bound, Sensors()), Assembler(bound)
     assembler.begin(now)
-    topics = list(intake.topics)
-    kinds = {topic: kind for topic in topics for role, kind in _kinds().items() if topic in _topics(role)}
-    half = 0
+    kinds = {topic: SVEA.topics[role].type for topic, (_, role, _) in intake.topics.items()}
+    topics, half = list(kinds), 0
     for k in range(COUNT):
         if k == COUNT // 2:
             tracemalloc.start()
@@ -75,31 +74,24 @@ def test_nothing_that_comes_stops_the_ticks_or_stays_in_memory() -> None:
     tracemalloc.stop()
     assert sum(sum(counts.values()) for counts in intake.rejected.values()) > 0.3 * COUNT
     assert grown < 300_000
-    wheel = make(
-        SVEA.topics[Role.WHEEL].type,
-        header=header(now + 10**10),
-        twist=make("geometry_msgs/msg/TwistWithCovariance"),
-    )
-    wheel.twist.twist.linear.x = 0.25
+    moved = {"twist": ((0.25, 0.0, 0.0), (0.0, 0.0, 0.0))}
+    wheel = make(SVEA.topics[Role.WHEEL].type, header=header(now + 10**10), twist=moved)
     arrival = Arrival(SVEA.topic_of("svea7", Role.WHEEL), encode(wheel), now + 10**10)
     [sample] = intake.samples(arrival)
     assembler.put(sample)
     assert assembler.tick(COUNT, now + 10**10).velocity[0, 0] == pytest.approx(0.25)
 
 
-def _kinds() -> dict[Role, str]:
-    return {role: topic.type for role, topic in SVEA.topics.items()}
-
-
-def _topics(role: Role) -> set[str]:
-    return {SVEA.topic_of(car.name, role) for car in CARS}
-
-
-def test_a_message_that_is_too_long_is_not_looked_at() -> None:
-    intake = Intake(binding(), Sensors())
-    topic = SVEA.topic_of("svea7", Role.DETECTIONS)
-    assert not list(intake.samples(Arrival(topic, b"\x00\x01\x00\x00" + bytes(MOST_BYTES), 0)))
+def test_a_message_that_is_too_long_is_neither_kept_nor_looked_at() -> None:
+    intake, hub = Intake(binding(), Sensors()), Hub()
+    topic, long = SVEA.topic_of("svea7", Role.DETECTIONS), b"\x00\x01\x00\x00" + bytes(MOST_BYTES)
+    assert not list(intake.samples(Arrival(topic, long, 0)))
     assert intake.rejected["svea7"] == {Role.DETECTIONS.value: 1}
+    station = Station(hub.connect(), (topic,), None, {})
+    for payload in (long, bytes(100)):
+        hub.connect().publish(topic, payload)
+    assert station.dropped == {"too long": 1} and [len(a.payload) for a in station.drain()] == [100]
+    assert station.silence(topic) < 10.0
 
 
 def test_a_flood_of_one_topic_takes_nobody_elses_place() -> None:
@@ -145,8 +137,7 @@ def test_replayed_messages_of_others_count_once() -> None:
     topic = SVEA.topic_of("svea7", Role.ESTIMATE)
 
     def say(stamp: int, received: int) -> Any:
-        pose = make("geometry_msgs/msg/PoseWithCovariance")
-        pose.pose.orientation.w = 1.0
+        pose = {"pose": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
         message = make(SVEA.topics[Role.ESTIMATE].type, header=header(stamp), pose=pose)
         for sample in intake.samples(Arrival(topic, encode(message), received)):
             assembler.put(sample)

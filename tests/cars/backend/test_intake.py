@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from coopenv.cars.backend.assembler import Assembler, Intake
-from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.deployment import Car, Sensors
+from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
-from coopenv.scenario import load_scenario
+from tests.cars.backend.test_hostile import binding
 
 MS = 1_000_000
 START = 10**12
-CARS = [Car(name="svea7", marker=7), Car(name="svea1", marker=6)]
-MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 
 
 @pytest.mark.parametrize(
@@ -26,17 +23,17 @@ MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
     [("wheel+imu", 1.0), ("wheel", 0.6)],  # rad: 2 s of the gyro's 0.5 rad/s, or of the wheels' 0.3
 )
 def test_the_wheels_turn_rate_counts_only_without_a_gyro(odometry: Any, turned: float) -> None:
-    bound = bind(load_scenario("svea_overtaking"), CARS, MARKERS, "test", None)
+    bound = binding()
     intake, assembler = Intake(bound, Sensors(odometry=odometry)), Assembler(bound)
     assembler.begin(START)
     heading = 0.0
     for k in range(2001):
-        now, spoken = START + k * MS, list[tuple[Role, dict[str, Any]]]()
+        now, spoken = START + k * MS, dict[Role, dict[str, Any]]()
         if k % 10 == 0:
-            spoken.append((Role.IMU, {"angular_velocity": (0.0, 0.0, 0.5)}))
+            spoken[Role.IMU] = {"angular_velocity": (0.0, 0.0, 0.5)}
         if k % 20 == 3:
-            spoken.append((Role.WHEEL, {"twist": {"twist": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.3))}}))
-        for role, fields in spoken:
+            spoken[Role.WHEEL] = {"twist": {"twist": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.3))}}
+        for role, fields in spoken.items():
             payload = encode(make(SVEA.topics[role].type, header=header(now), **fields))
             for sample in intake.samples(Arrival(SVEA.topic_of("svea7", role), payload, now)):
                 assembler.put(sample)

@@ -13,7 +13,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
-from coopenv.cars.codec import MOST_BYTES, encode, make
+from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Gate, GateClock
 from coopenv.cars.gate.process import GateConnection
@@ -94,23 +94,6 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     monitor.looked = BEGIN + 700 * MS
     lost = [wrong for _, wrong in misplaced(safety, monitor, ("a",), ("b",))]
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
-
-
-@pytest.mark.parametrize(
-    "corners", [[(0, 0), (1, 0)], [(0, 0), (1, 1), (1, 0), (0, 1)], [(0, 0), (1, 0), (2, 0)], [(0, 0)] * 4]
-)
-def test_a_fence_that_encloses_nothing_is_refused(corners: Any) -> None:
-    with pytest.raises(ValueError, match="at least 3 corners of a polygon"):
-        Safety(geofence=corners)
-
-
-def test_a_station_keeps_no_message_that_is_too_long() -> None:
-    hub = Hub()
-    station = Station(hub.connect(), [WHEEL], None, {})
-    hub.connect().publish(WHEEL, b"x" * (MOST_BYTES + 1))
-    hub.connect().publish(WHEEL, b"x" * 100)
-    wait_until(lambda: station.silence(WHEEL) < 10.0)
-    assert station.dropped["too long"] == 1 and [len(a.payload) for a in station.drain()] == [100]
 
 
 class Yard:

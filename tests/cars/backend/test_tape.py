@@ -34,12 +34,9 @@ def written(tmp_path: Path) -> Path:
     recorder.tick(0, 10**9, 2**64 - 1, 3)
     for k in range(20):
         now = 10**9 + k * 10**7
-        twist = make(
-            TYPES[WHEEL], header=header(now - 5, "base_link"), twist=make("geometry_msgs/msg/TwistWithCovariance")
-        )
-        twist.twist.twist.linear.x = 0.1 * k
-        recorder.write(WHEEL, encode(twist), now)
-        frame = make(TYPES[FRAMES], header=header(now), objects=[make("pixy_camera/msg/ObjectInfo")] * (k % 3))
+        moved = {"twist": ((0.1 * k, 0.0, 0.0), (0.0, 0.0, 0.0))}
+        recorder.write(WHEEL, encode(make(TYPES[WHEEL], header=header(now - 5, "base_link"), twist=moved)), now)
+        frame = make(TYPES[FRAMES], header=header(now), objects=[{}] * (k % 3))
         recorder.write(FRAMES, encode(frame), now)
         recorder.write("fleet/nobody/knows", b"123", now)
         recorder.tick(k + 1, now)

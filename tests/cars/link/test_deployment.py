@@ -40,23 +40,20 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
     assert fleet.car("svea8").marker is None
 
 
-def test_each_kind_of_network_has_its_usual_place(tmp_path: Path) -> None:
-    usual = {"zenoh": "tcp/127.0.0.1:7447", "nats": "nats/127.0.0.1:4222", "ros1": "tcp/127.0.0.1:11311"}
-    for kind, endpoint in usual.items():
-        network = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"')).network
-        assert network.connect == (endpoint,)
-
-
-def test_authors_cars_need_not_tell_of_themselves(tmp_path: Path) -> None:
-    for kind, safety, needed in (
-        ("zenoh", "", True),
-        ("nats", "", False),
-        ("ros1", "", False),
-        ("zenoh", "[safety]\nconditions = false", False),
-        ("nats", "[safety]\nconditions = true", True),
-    ):
-        fleet = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"\n{safety}'))
-        assert fleet.conditions is needed
+@pytest.mark.parametrize(
+    ("kind", "endpoint", "tells"),
+    [
+        ("zenoh", "tcp/127.0.0.1:7447", True),
+        ("nats", "nats/127.0.0.1:4222", False),
+        ("ros1", "tcp/127.0.0.1:11311", False),
+    ],
+)
+def test_each_network_has_its_usual_place_and_the_authors_cars_need_not_tell_of_themselves(
+    tmp_path: Path, kind: str, endpoint: str, tells: bool
+) -> None:
+    for safety, needed in (("", tells), ("conditions = false", False), ("conditions = true", True)):
+        fleet = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"\n[safety]\n{safety}'))
+        assert fleet.network.connect == fleet.gate_connect == (endpoint,) and fleet.conditions is needed
 
 
 def test_a_gate_stays_on_its_car_wherever_the_network_is(tmp_path: Path) -> None:
@@ -64,10 +61,10 @@ def test_a_gate_stays_on_its_car_wherever_the_network_is(tmp_path: Path) -> None
     assert load_deployment(written(tmp_path, GOOD + away)).gate_connect == ("tcp/127.0.0.1:7447",)
     told = load_deployment(written(tmp_path, GOOD + away + '[gate]\nconnect = ["tcp/[::1]:1"]'))
     assert told.gate_connect == ("tcp/[::1]:1",)
-    ros = load_deployment(written(tmp_path, GOOD + '[network]\nkind = "ros1"'))
-    assert ros.gate_connect == ("tcp/127.0.0.1:11311",)
 
 
+FENCES = ("[[0, 0], [1, 0]]", "[[0, 0], [1, 1], [1, 0], [0, 1]]", "[[0, 0], [1, 0], [2, 0]]", str([[0, 0]] * 4))
+CORNERS = "safety.geofence: expected at least 3 corners of a polygon whose edges do not cross"
 BAD = {
     "an unknown key": ('[network]\nconect = ["tcp/a:1"]', "network.conect: unknown key (did you mean 'connect'?)"),
     "an unknown kind": ('[network]\nkind = "mqtt"', "network.kind: Input should be 'zenoh', 'nats' or 'ros1'"),
@@ -101,6 +98,7 @@ BAD = {
     "too fast": ("[safety]\nmax_speed = 2.0", "safety.max_speed: 2 is over 1.53, the largest of this make"),
     "a channel of two": ("[remote]\nthrottle = 1", "remote: steering, throttle and mode_switch: two of them are on"),
     "no such channel": ("[remote]\nsteering = 0", "remote.steering: Input should be greater than or equal to 1"),
+    **{f"a fence of {n}": (f"[safety]\ngeofence = {fence}", CORNERS) for n, fence in enumerate(FENCES)},
     "not a number": ("[safety]\nmax_speed = nan", "safety.max_speed: "),
     "text for a number": ('[safety]\nmax_speed = "fast"', "safety.max_speed: Input should be a valid number"),
     "no TOML": ("[network", "not valid TOML: "),
