@@ -32,19 +32,36 @@ pytest.importorskip("rosbags", reason="needs the extra 'log'")
 SHORT = [m for m in bags.messages(bags.drive()) if m.stamp < 500_000_000]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def short(tmp_path_factory: pytest.TempPathFactory) -> None:
-    WRITTEN.append(bags.write(tmp_path_factory.mktemp("short") / "drive", SHORT, "ros1"))
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The drive `SHORT` as a file of each form."""
+    folder, found = tmp_path_factory.mktemp("short"), {}
+    for form in ("ros1", "sqlite3", "mcap"):
+        whole = bags.write(folder / form, SHORT, form)
+        found[form] = whole if whole.is_file() else next(whole.glob(f"{form}.*"))
+    return found
 
 
-WRITTEN: list[Path] = []
-"""The bag of `SHORT`, written once."""
+@pytest.fixture
+def topics(tmp_path: Path) -> Path:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    return tmp_path / "topics.toml"
 
 
-def opened(tmp_path: Path, text: str, drive: list[bags.Message] | None = None, form: str = "ros1") -> Bag:
-    (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
-    path = WRITTEN[-1] if drive is None else bags.write(tmp_path / "drive", drive, form)
-    return Bag([path], tmp_path / "topics.toml")
+def opened(folder: Path, text: str, drive: list[bags.Message] = SHORT, form: str = "ros1") -> Bag:
+    (folder / "topics.toml").write_text(text, encoding="utf-8")
+    return Bag([bags.write(folder / "drive", drive, form)], folder / "topics.toml")
+
+
+def bag_or_line(path: Path, topics: Path) -> tuple[Bag | None, list[str]]:
+    """Return a bag and the warnings at its opening; None where it is refused, in one line that names it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            return Bag([path], topics), [str(w.message) for w in caught if issubclass(w.category, DataWarning)]
+        except CoopenvError as error:
+            assert re.search(rf"{path.stem}\.\w+: ", str(error)) and "\n" not in str(error)
+            return None, []
 
 
 def without(topic: str) -> list[bags.Message]:
@@ -54,10 +71,7 @@ def without(topic: str) -> list[bags.Message]:
 @pytest.mark.parametrize(
     ("topic", "line"),
     [
-        (
-            "/agent8/actuation_twist",
-            r"svea3 has no odometry: .* has no topic /agent8/actuation_twist .*; it has ",
-        ),
+        ("/agent8/actuation_twist", r"svea3 has no odometry: .* has no topic /agent8/actuation_twist .*; it has "),
         ("/agent8/pixy_node/objectsInfo", r"svea3 has no camera: .* has no topic /agent8/pixy_node/objectsInfo"),
         ("/agent7/riccatiPoint", r"svea1 has no position: .* has no topic /agent7/riccatiPoint"),
     ],
@@ -86,22 +100,17 @@ def test_a_bag_of_one_frame_is_too_short(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
 @pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
-def test_a_truncated_bag_is_one_line_or_what_could_be_read(form: str, share: float, tmp_path: Path) -> None:
-    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
-    whole = bags.write(tmp_path / "whole", SHORT, form)
-    file = whole if whole.is_file() else next(whole.glob("whole*.*"))
-    cut = tmp_path / f"cut{file.suffix}"
-    cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            bag = Bag([cut], tmp_path / "topics.toml")
-        except CoopenvError as error:
-            assert re.search(r"cut\.\w+: ", str(error)) and "\n" not in str(error)
-            return
-    complete = len(bag.log.samples) == len(SHORT)  # only what lies behind the data is lost
-    assert complete or any(issubclass(w.category, DataWarning) and "damaged" in str(w.message) for w in caught)
-    assert len(list(bag.episode(None, {}))) >= 2
+def test_a_truncated_bag_is_one_line_or_what_could_be_read(
+    form: str, share: float, written: dict[str, Path], topics: Path
+) -> None:
+    data = written[form].read_bytes()
+    cut = topics.with_name(f"cut{written[form].suffix}")
+    cut.write_bytes(data[: int(share * len(data))])
+    bag, warned = bag_or_line(cut, topics)
+    if bag is not None:
+        complete = len(bag.log.samples) == len(SHORT)  # only what lies behind the data is lost
+        assert complete or any("damaged" in line for line in warned)
+        assert len(list(bag.episode(None, {}))) >= 2
 
 
 @pytest.mark.parametrize(("form", "tool"), [("sqlite3", "sqlite3 FILE .recover"), ("mcap", "mcap recover")])
@@ -115,23 +124,17 @@ def test_a_folder_whose_file_is_cut_off_names_the_tool_that_mends_it(form: str, 
 
 
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
-def test_bytes_that_changed_are_one_line_or_what_could_be_read(form: str, tmp_path: Path) -> None:
-    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
-    whole = bags.write(tmp_path / "whole", SHORT, form)
-    file = whole if whole.is_file() else next(whole.glob("whole*.*"))
-    data, generator = bytearray(file.read_bytes()), np.random.default_rng(5)
+def test_bytes_that_changed_are_one_line_or_what_could_be_read(
+    form: str, written: dict[str, Path], topics: Path
+) -> None:
+    data, generator = written[form].read_bytes(), np.random.default_rng(5)
     for number in range(6):
         changed = bytearray(data)
         for place in generator.integers(0, len(data), 4):
             changed[place] = int(generator.integers(256))
-        path = tmp_path / f"changed{number}{file.suffix}"
+        path = topics.with_name(f"changed{number}{written[form].suffix}")
         path.write_bytes(changed)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                Bag([path], tmp_path / "topics.toml")
-            except CoopenvError as error:
-                assert "\n" not in str(error)
+        bag_or_line(path, topics)
 
 
 MISTAKES: list[tuple[Callable[[str], str], str]] = [
@@ -165,23 +168,19 @@ def test_a_mistake_in_a_map_is_one_line(change: Callable[[str], str], line: str,
     assert "\n" not in str(caught.value)
 
 
-def test_a_map_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(TopicMapError, match=r"nowhere\.toml: cannot be read"):
-        load_map(tmp_path / "nowhere.toml")
-
-
 @pytest.mark.parametrize("name", ["nowhere.bag", "nowhere.db3", "nowhere.mcap", "nofolder"])
-def test_a_bag_that_is_not_there(name: str, tmp_path: Path) -> None:
-    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+def test_a_bag_that_is_not_there(name: str, topics: Path) -> None:
     with pytest.raises(DataError, match=f"no such bag: .*{name}"):
-        Bag([tmp_path / name], tmp_path / "topics.toml")
+        Bag([topics.with_name(name)], topics)
+    with pytest.raises(TopicMapError, match=r"nowhere\.toml: cannot be read"):
+        load_map(topics.with_name("nowhere.toml"))
 
 
-def test_a_folder_that_is_no_bag_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
-    (tmp_path / "empty").mkdir()
+def test_a_folder_that_is_no_bag_is_told_so(topics: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = topics.with_name("empty")
+    folder.mkdir()
     for command in ("run", "import"):
-        assert main([command, str(tmp_path / "empty"), "--map", str(tmp_path / "topics.toml")]) == 2
+        assert main([command, str(folder), "--map", str(topics)]) == 2
         assert "empty: a folder without metadata.yaml, which a bag of ROS 2 has" in capsys.readouterr().err
 
 
@@ -194,19 +193,18 @@ def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:
         opened(tmp_path, MAP, drive)
 
 
-def test_files_of_others_are_told_from_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    foreign = bags.write(tmp_path / "foreign", SHORT, "mcap")
-    shutil.copy(next(foreign.glob("*.mcap")), tmp_path / "foreign.mcap")
-    assert (
-        metadata_names(tmp_path / "foreign.mcap") == frozenset()
-        and kind_of(tmp_path / "foreign.mcap") is SourceKind.BAG
-    )
-    assert kind_of(foreign) is SourceKind.BAG
-    assert main(["run", str(tmp_path / "foreign.mcap")]) == 2
+def test_files_of_others_are_told_from_ours(
+    written: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign, text = tmp_path / "foreign.mcap", tmp_path / "text.mcap"
+    shutil.copy(written["mcap"], foreign)
+    assert metadata_names(foreign) == frozenset()
+    assert kind_of(foreign) is kind_of(written["mcap"].parent) is SourceKind.BAG
+    assert main(["run", str(foreign)]) == 2
     assert "foreign.mcap: a ROS bag, which needs a map" in capsys.readouterr().err
-    (tmp_path / "text.mcap").write_bytes(b"no log")
-    assert metadata_names(tmp_path / "text.mcap") is None and kind_of(tmp_path / "text.mcap") is SourceKind.LOG
-    assert is_bag(tmp_path / "text.mcap", "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
+    text.write_bytes(b"no log")
+    assert metadata_names(text) is None and kind_of(text) is SourceKind.LOG
+    assert is_bag(text, "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
 
 
 def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
