@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.assembler import Assembler
-from coopenv.cars.backend.binding import Binding, bind
+from coopenv.cars.backend.assembler import Assembler, Intake
+from coopenv.cars.backend.binding import Binding, bind, estimate_message, report_message
 from coopenv.cars.backend.tracks import LONGEST_GAP, PoseTrack
-from coopenv.cars.deployment import Car
+from coopenv.cars.codec import decode, encode, header, make
+from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.transport.base import Arrival
+from coopenv.estimation.poses import exp_so3
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
@@ -49,9 +53,9 @@ def binding(cars: int = 1, only: str | None = None, **sections: Any) -> Binding:
     return bind(world(cars, **sections), fleet, MARKERS, "lab.toml", only)
 
 
-def begun(bound: Binding) -> Assembler:
+def begun(bound: Binding, now: int = START) -> Assembler:
     assembler = Assembler(bound)
-    assembler.begin(START)
+    assembler.begin(now)
     return assembler
 
 
@@ -346,3 +350,52 @@ def test_who_is_not_there_is_named(fleet: list[Car], markers: dict[str, int], wh
 def test_a_camera_without_calibration_is_refused() -> None:
     with pytest.raises(CoopenvError, match="the camera of vehicle_1 has no calibration"):
         binding(camera={"model": "omnidirectional"})
+
+
+@pytest.mark.parametrize(
+    ("odometry", "turned"),
+    [("wheel+imu", 1.0), ("wheel", 0.6)],  # rad: 2 s of the gyro's 0.5 rad/s, or of the wheels' 0.3
+)
+def test_the_wheels_turn_rate_counts_only_without_a_gyro(odometry: Any, turned: float) -> None:
+    bound = binding()
+    intake, assembler, heading = Intake(bound, Sensors(odometry=odometry)), begun(bound), 0.0
+    for k in range(2001):
+        now, spoken = START + k * MS, dict[Role, dict[str, Any]]()
+        if k % 10 == 0:
+            spoken[Role.IMU] = {"angular_velocity": (0.0, 0.0, 0.5)}
+        if k % 20 == 3:
+            spoken[Role.WHEEL] = {"twist": {"twist": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.3))}}
+        for role, fields in spoken.items():
+            payload = encode(make(SVEA.topics[role].type, header=header(now), **fields))
+            for sample in intake.samples(Arrival(SVEA.topic_of("car0", role), payload, now)):
+                assembler.put(sample)
+        if k % 50 == 0 and k > 0:
+            R = assembler.tick(k // 50, now).rotation[0]
+            heading += float(np.arctan2(R[1, 0], R[0, 0]))
+    assert heading == pytest.approx(turned, abs=0.015)
+
+
+LAB = np.array([1.0, 2.0, 0.0])
+PLACE, ROTATION = np.array([0.7, -0.4, 0.1]), exp_so3(np.array([0.0, 0.0, 0.8]))
+ODOMETRY = np.array([0.0, 0.0, 0.3, 0.5, 0.2, 0.0])
+
+
+def told() -> VehicleBroadcast:
+    extra = {"odometry": ODOMETRY, "depends_on": np.array([2], dtype=np.uint64)}
+    covariance = np.diag([1e-3, 1e-3, 2e-3, 0.01, 0.02, 0.03])
+    return VehicleBroadcast(0, ROTATION, PLACE, covariance, Message(PLACE, ROTATION, covariance, extra))
+
+
+@pytest.mark.parametrize(("role", "write"), [(Role.ESTIMATE, estimate_message), (Role.REPORT, report_message)])
+def test_what_one_says_is_where_the_other_hears_it(role: Role, write: Any) -> None:
+    message = decode(encode(write(told(), START, LAB)), SVEA.topics[role].type)
+    place = getattr(message.pose, "pose", message.pose).position
+    np.testing.assert_allclose([place.x, place.y, place.z], PLACE + LAB)  # as in the laboratory's coordinates
+    assembler = begun(binding(2, only="car1", map={"origin": LAB.tolist()}), START - MS)
+    assembler.put(Sample("car0", role, START, START + MS, read(role, message)))
+    heard = assembler.tick(1, START + 2 * MS).messages[1, 0].message
+    marker = np.array([0.1, 0.0, 0.2]) if role is Role.ESTIMATE else np.zeros(3)  # a report is of the marker already
+    np.testing.assert_allclose(np.asarray(heard.position), PLACE + ROTATION @ marker, atol=1e-12)
+    np.testing.assert_allclose(np.asarray(heard.rotation), ROTATION, atol=1e-12)
+    if role is Role.REPORT:
+        np.testing.assert_allclose(heard.extra["odometry"], ODOMETRY, atol=1e-12)  # from where it began

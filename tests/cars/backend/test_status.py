@@ -83,38 +83,26 @@ def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "why", "before"),
     [
-        (lambda talk: talk.remote(rssi=0), "signal"),
-        (lambda talk: talk.remote(*(0,) * 8), "signal"),
-        (lambda talk: talk.remote(1500, 1500), "remote.throttle"),
-        (lambda talk: talk.remote(1500, 1500, 1800, 1500, 1500), "remote control"),
-        (lambda talk: talk.state(armed=False), "armed"),
+        (lambda talk: talk.remote(1300, *(1500,) * 7), "remote control", True),
+        (lambda talk: talk.remote(1500, 1500, 1700, *(1500,) * 5), "remote control", True),
+        (lambda talk: talk.remote(1500, 1500), "remote.throttle", True),
+        (lambda talk: talk.remote(*(1500,) * 4, 1900), "mode switch", False),
+        (lambda talk: talk.remote(rssi=0), "signal", True),
+        (lambda talk: talk.remote(*(0,) * 8), "signal", True),
+        (lambda talk: talk.state(armed=False), "armed", True),
+        (lambda talk: talk.state(mode="HOLD"), "HOLD", False),
     ],
 )
-def test_a_car_in_another_state_is_not_armed(change: Any, why: str) -> None:
-    talk = Talk()
-    talk.all_is_well()
-    change(talk)
-    assert why in talk.obstacle()
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        (lambda talk: talk.remote(1300, *(1500,) * 7), "remote control"),
-        (lambda talk: talk.remote(1500, 1500, 1700, *(1500,) * 5), "remote control"),
-        (lambda talk: talk.remote(*(1500,) * 4, 1900), "mode switch"),
-        (lambda talk: talk.remote(rssi=0), "signal"),
-        (lambda talk: talk.remote(*(0,) * 8), "signal"),
-        (lambda talk: talk.state(armed=False), "armed"),
-        (lambda talk: talk.state(mode="HOLD"), "HOLD"),
-    ],
-)
-def test_what_happens_to_an_armed_car_is_noticed_and_not_forgotten(armed: Talk, change: Any, why: str) -> None:
+def test_a_car_in_another_state_is_not_armed_and_what_happens_to_an_armed_one_is_not_forgotten(
+    armed: Talk, change: Any, why: str, before: bool
+) -> None:
+    """`before`: whether it also counts before the car is armed, and not as a change alone."""
     armed.all_is_well()
     assert armed.board.happened(CAR) == ""
     change(armed)
+    assert (why in armed.obstacle()) is before
     armed.all_is_well()
     assert why in armed.board.happened(CAR)
     armed.board.begin()

@@ -79,11 +79,16 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     others.publish(WHEEL, encode(make(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
     others.close()
     recorded.publish(WHEEL, encode(make(TYPES[WHEEL])), b"signature")
+    recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
     recorder.close()
     assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
     with AnyReader([tmp_path / "drive.mcap"]) as reader:
         messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    (stopped,) = [m for topic, m in messages if topic == f"/{STOPPED_TOPIC}"]
+    assert (stopped.reason, stopped.car) == ("svea7: is gone", "svea7")
+    assert (stopped.header.stamp.sec, stopped.header.stamp.nanosec) == (3, 5)
     assert Counter(topic for topic, _ in messages) == {
+        f"/{STOPPED_TOPIC}": 1,
         f"/{TICK_TOPIC}": 1,
         f"/{WHEEL}": 1,
         f"/{state}": 1,
@@ -91,19 +96,6 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
         "/fleet/alive/svea7": 2,
     }
     assert [m.data for topic, m in messages if topic == "/fleet/alive/svea7"] == [True, False]
-
-
-def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> None:
-    recorder = DriveRecorder(tmp_path / "drive.mcap", b"{}", TYPES)
-    recorder.tick(0, 10**9)
-    recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
-    recorder.close()
-    with AnyReader([tmp_path / "drive.mcap"]) as reader:
-        (connection,) = (c for c in reader.connections if c.topic == f"/{STOPPED_TOPIC}")
-        ((_, time, raw),) = reader.messages([connection])
-        message = reader.deserialize(raw, connection.msgtype)
-    assert (message.reason, message.car, time) == ("svea7: is gone", "svea7", 3 * 10**9 + 5)
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 5)
 
 
 def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Path) -> None:
@@ -196,14 +188,12 @@ def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "why"), [("drive.bag", r"must end in \.mcap"), ("no/drive.mcap", "cannot write to")])
-def test_where_none_can_be_written_is_said(tmp_path: Path, name: str, why: str) -> None:
-    with pytest.raises(OutputError, match=why):
-        DriveRecorder(tmp_path / name, b"{}", TYPES)
-
-
-def test_nothing_is_overwritten(written: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [("a.bag", r"must end in \.mcap"), ("no/drive.mcap", "cannot write to"), ("drive.mcap", "exists already")],
+)
+def test_where_none_can_be_written_is_said_and_nothing_is_overwritten(written: Path, name: str, why: str) -> None:
     before = written.read_bytes()
-    with pytest.raises(OutputError, match="exists already"):
-        DriveRecorder(written, b"{}", TYPES)
+    with pytest.raises(OutputError, match=why):
+        DriveRecorder(written.parent / name, b"{}", TYPES)
     assert written.read_bytes() == before

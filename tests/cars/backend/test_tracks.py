@@ -8,7 +8,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.spatial.transform import Rotation
 
 from coopenv.cars.backend.tracks import KEPT, MOST_SAMPLES, Odometer, PlaceTrack
 from coopenv.cars.readings import Twist
@@ -86,15 +85,6 @@ def test_samples_that_nobody_asks_for_fill_no_memory() -> None:
     for k in range(5 * MOST_SAMPLES):
         odometer.put(k, Twist(np.array([float(k), 0.0, 0.0]), np.zeros(3)))
     assert len(odometer._waiting) <= MOST_SAMPLES
-
-
-def test_rotations_stay_rotations() -> None:
-    odometer = Odometer()
-    for k in range(500):
-        odometer.put(k * 10**7, Twist(np.array([1.0, 0.1, 0.0]), np.array([0.3, -0.2, 1.0])))
-    R, _ = odometer.increment(0, 500 * 10**7)
-    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
-    assert Rotation.from_matrix(R).magnitude() > 0.0
 
 
 MS = 1_000_000

@@ -55,6 +55,7 @@ def read(path: Path) -> int:
     "form", ["mcap STORAGE", "mcap MESSAGE", "mcap FILE", "sqlite3 MESSAGE", "sqlite3 FILE", "ros1 BZ2", "ros1 LZ4"]
 )
 def test_a_bag_that_unpacks_to_far_more_than_it_is(form: str, tmp_path: Path) -> None:
+    assert read(bomb(tmp_path / "small", form, 2**20, 3)) == 3
     path = bomb(tmp_path / "drive", form)
     tracemalloc.start()
     with pytest.raises(DataError, match=r"drive\S*: .*would unpack to .*more than") as caught:
@@ -66,6 +67,7 @@ def test_a_bag_that_unpacks_to_far_more_than_it_is(form: str, tmp_path: Path) ->
 
 
 def test_a_value_of_a_database_that_is_too_large(tmp_path: Path) -> None:
+    assert read(bomb(tmp_path / "small", "sqlite3", 2**20, 3)) == 3
     with pytest.raises(DataError, match=r"drive: .*too big"):
         read(bomb(tmp_path / "drive", "sqlite3"))
 
@@ -85,18 +87,10 @@ def test_listing_the_topics_is_within_limits(tmp_path: Path, capsys: pytest.Capt
     assert "would unpack to more than 50 times its size" in captured.err
 
 
-@pytest.mark.parametrize(
-    "form", ["mcap STORAGE", "mcap MESSAGE", "mcap FILE", "mcap", "sqlite3 MESSAGE", "sqlite3 FILE", "sqlite3",
-             "ros1 BZ2", "ros1 LZ4"]
-)  # fmt: skip
-def test_what_is_within_limits_is_read(form: str, tmp_path: Path) -> None:
-    assert read(bomb(tmp_path / "drive", form, 2**20, 3)) == 3
-
-
 def test_other_programs_use_rosbags_without_limits(tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
-    assert read(bomb(tmp_path / "small", "mcap STORAGE", 100)) == 1
+    assert read(bomb(tmp_path / "small", "mcap", 100)) == 1
     path = bomb(tmp_path / "drive", "mcap STORAGE")
     with AnyReader([path]) as reader:
         assert [len(data) for _, _, data in reader.messages()] == [LARGE]
