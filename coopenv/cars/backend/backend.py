@@ -25,7 +25,7 @@ from coopenv.cars.backend.binding import (
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import Gates, Pacer, Station
 from coopenv.cars.backend.status import ROLES, StatusBoard
-from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, misplaced, silent, since
+from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, since
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
@@ -97,19 +97,19 @@ class Svea:
         self._armed, self._received_once, self._began, self._index = False, False, 0, 0
         self._key, self._episode = 0, 0
         self._closed = threading.Lock()
-        profile, safety, fleet = binding.profile, deployment.safety, (*binding.cars, *binding.leaders)
+        profile, fleet = binding.profile, (*binding.cars, *binding.leaders)
         self._local = {binding.names[i]: i for i in binding.local}
-        self._others = tuple(name for name in fleet if name not in self._local)
-        self._odometry, cars = VELOCITY[deployment.sensors.odometry], tuple(self._local)
+        cars, others = tuple(self._local), tuple(name for name in fleet if name not in self._local)
+        self._odometry = VELOCITY[deployment.sensors.odometry]
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
         identity = deployment.security.identity
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
         self.station = Station(transport, self.intake.topics, verifier, signers)
         self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
-        self.monitor = LinkMonitor(safety.judge)
+        self.monitor = LinkMonitor(deployment.safety.judge)
         self.watchdog = Watchdog(
-            *(safety, self.station, self.gates, self.monitor, cars, self._others, self._odometry),
+            *(deployment.safety, self.station, self.gates, self.monitor, cars, others, self._odometry),
             *(1.0 / self.scenario.rates.decision, self.board.happened, self._write_down),
         )
         transport.watch(presence_of("*"), self.watchdog.set_present)
@@ -186,15 +186,14 @@ class Svea:
                 where = f"{abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'}"
                 allowed = f"{safety.max_clock_offset * 1e3:.0f} ms are allowed"
                 yield car, f"its clock is {where} this computer's, {allowed}: let chrony or PTP synchronise them"
-            for why in silent(self.station, self.monitor, profile, car, self._odometry, safety.odometry_age):
-                yield car, why
+            yield from ((car, why) for why in self.watchdog.silent(car))
             camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
             if (age := self.station.silence(camera)) > safety.odometry_age:
                 yield car, f"no camera frames on {camera} {since(age)}"
-            for why in self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car]):
-                yield car, why
+            own = self.board.obstacles(car, safety.min_battery, self.intake.calibrations[car])
+            yield from ((car, why) for why in own)
         if safety.judge == "truth":  # estimates are not known before cars drive
-            yield from misplaced(safety, self.monitor, self._local, self._others)
+            yield from self.watchdog.misplaced()
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""

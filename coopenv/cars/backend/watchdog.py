@@ -13,7 +13,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
-from coopenv.cars.profile import CarProfile, Role, inside, presence_of
+from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message
@@ -70,50 +70,6 @@ class LinkMonitor:
         """Return for how long a car's position had been unknown when messages were looked at last, s."""
         place = self.places.get(car)
         return max(self.looked - (self._begun if place is None else place.time), 0) * 1e-9
-
-
-def misplaced(
-    safety: Safety, monitor: LinkMonitor, cars: Collection[str], others: Collection[str]
-) -> Iterator[tuple[str, str]]:
-    """Yield cars with a position that violates a rule, and the violation in words.
-
-    Args:
-        safety: fence, separation, and how old a place may be.
-        monitor: knows where the cars are.
-        cars: those that are driven here: each has to be inside the fence.
-        others: those that are not; the former have to be apart from all.
-    """
-    apart = safety.separation > 0.0
-    watched = [*cars, *others] if apart else [*cars] if safety.geofence else []
-    for car in watched:
-        never = car not in monitor.places
-        if monitor.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
-            since = "is not known" if never else f"has not been known for {monitor.lost(car):.2f} s"
-            by = [
-                name for name, judged in (("fence", safety.geofence and car in cars), ("separation", apart)) if judged
-            ]
-            yield car, f"its place {since}: {' and '.join(by)} cannot be judged"
-    places = {car: monitor.places[car].position for car in watched if car in monitor.places}
-    for car in cars:
-        if safety.geofence and car in places:
-            x, y = float(places[car][0]), float(places[car][1])
-            if not inside(safety.geofence, x, y):
-                yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
-    for car, other in combinations(places, 2) if apart else ():
-        distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
-        if distance < safety.separation and (car in cars or other in cars):
-            yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"
-
-
-def silent(
-    station: Station, monitor: LinkMonitor, profile: CarProfile, car: str, odometry: Collection[Role], longest: float
-) -> Iterator[str]:
-    """Yield the topics of a car's odometry without a message, or without a usable one, for longer than s, in words."""
-    for role in odometry:
-        topic = profile.topic_of(car, role)
-        for what, age in (("odometry", station.silence(topic)), ("usable new message", monitor.age(car, role))):
-            if age > longest:
-                yield f"no {what} on {topic} {since(age)}"
 
 
 def since(age: float) -> str:
@@ -260,12 +216,46 @@ class Watchdog:
         if beat is not None:
             if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
                 yield "", f"no decision for {age:.2f} s"
-            yield from misplaced(self._safety, self._monitor, self._cars, self._others)
+            yield from self.misplaced()
 
     def _of_car(self, car: str) -> Iterator[str]:
-        longest, profile = self._safety.odometry_age, self._gates.profile
-        yield from silent(self._station, self._monitor, profile, car, self._odometry, longest)
+        yield from self.silent(car)
         if not self._present[presence_of(car)]:
             yield "is gone"
         if why := self._happened(car):
             yield why
+
+    def silent(self, car: str) -> Iterator[str]:
+        """Yield the topics of a car's odometry without a message, or a usable one, for too long, in words."""
+        for role in self._odometry:
+            topic = self._gates.profile.topic_of(car, role)
+            ages = {"odometry": self._station.silence(topic), "usable new message": self._monitor.age(car, role)}
+            for what, age in ages.items():
+                if age > self._safety.odometry_age:
+                    yield f"no {what} on {topic} {since(age)}"
+
+    def misplaced(self) -> Iterator[tuple[str, str]]:
+        """Yield cars with a position that violates a rule, and the violation in words.
+
+        Cars that are driven here have to be inside the fence, and apart from all.
+        """
+        safety, monitor, cars = self._safety, self._monitor, self._cars
+        apart = safety.separation > 0.0
+        watched = [*cars, *self._others] if apart else [*cars] if safety.geofence else []
+        for car in watched:
+            never = car not in monitor.places
+            if monitor.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
+                unknown = "is not known" if never else f"has not been known for {monitor.lost(car):.2f} s"
+                rules = {"fence": safety.geofence and car in cars, "separation": apart}
+                by = " and ".join(name for name, judged in rules.items() if judged)
+                yield car, f"its place {unknown}: {by} cannot be judged"
+        places = {car: monitor.places[car].position for car in watched if car in monitor.places}
+        for car in cars:
+            if safety.geofence and car in places:
+                x, y = float(places[car][0]), float(places[car][1])
+                if not inside(safety.geofence, x, y):
+                    yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
+        for car, other in combinations(places, 2) if apart else ():
+            distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
+            if distance < safety.separation and (car in cars or other in cars):
+                yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"

@@ -12,7 +12,7 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.station import LATE, Gates, Station
-from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog, misplaced
+from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Gate, GateClock
@@ -90,9 +90,12 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     for car, x in places.items():
         monitor.place(car, np.array([x, 0.0, 0.0]), BEGIN + 90 * MS)
     safety = Safety(geofence=CORNERS, separation=0.3, judge=judge)
-    assert [f"{car}: {wrong}" for car, wrong in misplaced(safety, monitor, ("a",), ("b",))] == found
+    station = Station(Hub().connect(), (), None, {})
+    watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
+    watchdog.close()
+    assert [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()] == found
     monitor.looked = BEGIN + 700 * MS
-    lost = [wrong for _, wrong in misplaced(safety, monitor, ("a",), ("b",))]
+    lost = [wrong for _, wrong in watchdog.misplaced()]
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
 
 
