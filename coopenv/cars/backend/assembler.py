@@ -222,8 +222,6 @@ class Intake:
 
     def __init__(self, binding: Binding, sensors: Sensors) -> None:
         """Collect the topics that are read."""
-        self.topics: dict[str, tuple[str, Role, Calibration | None]] = {}
-        """Car, role and camera of the topics that are read, by name."""
         self._sensors, self._profile = sensors, binding.profile
         self.offsets = {name: ClockOffset() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
@@ -232,12 +230,14 @@ class Intake:
         """Of the environment, by car."""
         truth: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
         own = (*VELOCITY[sensors.odometry], Role(sensors.detections), *truth)
-        for name, vehicle in binding.cars.items():
-            for role in own if vehicle in binding.local else (*truth, *BROADCAST):
-                self.topics[binding.profile.topic_of(name, role)] = name, role, self.calibrations[name]
-        for name in binding.leaders:
-            for role in (Role.ESTIMATE, Role.POINT, *truth):
-                self.topics[binding.profile.topic_of(name, role)] = name, role, None
+        roles = {name: own if i in binding.local else (*truth, *BROADCAST) for name, i in binding.cars.items()}
+        roles |= dict.fromkeys(binding.leaders, (Role.ESTIMATE, Role.POINT, *truth))
+        self.topics = {
+            binding.profile.topic_of(name, role): (name, role, self.calibrations.get(name))
+            for name, some in roles.items()
+            for role in some
+        }
+        """Car, role and camera of the topics that are read, by name."""
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
         """Yield the sample of a message, or none if the message is malformed."""
