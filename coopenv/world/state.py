@@ -4,8 +4,8 @@ W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders)
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
 of the traffic.
 
-A field of a record states its axes once, a letter each, and is allocated by them. A table beside the struct states the
-rule that each field of a saved state must satisfy; all rules are checked before anything is restored.
+A field of a record states its axes once, a letter each, and is allocated by them. It states the rule of what a saved
+state may hold there, too; all rules are checked before anything is restored.
 """
 
 import math
@@ -33,10 +33,13 @@ from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.world.model import Precision
 
 
-def array(axes: str, dtype: Any) -> Any:
-    """Return the annotation of a struct's field: an array with these axes, a letter each, for example "WN"."""
+def array(axes: str, dtype: Any, rule: Rule | None = None) -> Any:
+    """Return the annotation of a struct's field: an array with these axes, a letter each, for example "WN".
+
+    What a saved state may hold there is its rule; numbers of a field without one have to be finite.
+    """
     annotation: Any = wp.array(dtype=dtype, ndim=len(axes))
-    annotation.axes = axes
+    annotation.axes, annotation.rule = axes, rule
     return annotation
 
 
@@ -156,6 +159,7 @@ def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
 ANYTHING = Rule("anything", lambda values, fields, model: np.ones(values.shape, dtype=bool))
 FLAG = whole(0, 1)
 NUMBER = numbers()
+TRUTH = NUMBER._replace(of_truth=True)
 TICK = whole(-1, "tick")  # a tick of the past or the present one; -1: never
 ODOMETRY_SAMPLES = Rule("as many as at this tick", _odometry_samples)
 ROUTE_COUNT = Rule(
@@ -231,88 +235,88 @@ def state_struct(p: Precision) -> Any:
     class State:
         """Everything that changes. Lengths in m, angles in rad, map and body frames as named."""
 
-        seed: array("W", wp.uint64)
-        episode: array("W", wp.uint32)
-        tick: array("W", wp.int32)  # camera ticks since the reset
-        exhausted: array("W", wp.int32)  # 1: its source has no more ticks, the episode is over
+        seed: array("W", wp.uint64, ANYTHING)
+        episode: array("W", wp.uint32, ANYTHING)
+        tick: array("W", wp.int32, whole(0, "horizon_ticks"))  # camera ticks since the reset
+        exhausted: array("W", wp.int32, FLAG)  # 1: its source has no more ticks, the episode is over
 
-        parameter: array("WQ", scalar)  # factors, see `coopenv.world.random`
-        parameter_set: array("WQ", scalar)  # by whoever resets, for all episodes to come; negative: drawn
-        difficulty: array("W", scalar)  # in [0, 1], of the episodes to come
-        present: array("WA", wp.int32)  # 1: in the scene now; landmarks keep their place on the map
-        pace: array("WA", scalar)  # of prescribed motions
+        parameter: array("WQ", scalar, numbers(MOST**3))  # factors, see `coopenv.world.random`
+        parameter_set: array("WQ", scalar, numbers(MOST))  # set by a reset for all later episodes; negative: drawn
+        difficulty: array("W", scalar, numbers(1.0))  # in [0, 1], of the episodes to come
+        present: array("WA", wp.int32, FLAG)  # 1: in the scene now; landmarks keep their place on the map
+        pace: array("WA", scalar, numbers(2.0 * MOST**3))  # of prescribed motions
 
         route: array("WNP", vec3)  # x, y in m, map; arc length s from the first point, m
-        route_count: array("WN", wp.int32)  # points of it; 0: no goal
-        route_drawn: array("WN", wp.int32)  # number of the scenario's route that it is drawn from; -1: of none
+        route_count: array("WN", wp.int32, ROUTE_COUNT)  # points of it; 0: no goal
+        route_drawn: array("WN", wp.int32, ROUTE_DRAWN)  # the scenario's route that it is drawn from; -1: none
         goal: array("WN", vec3)  # m, map
-        arrivals: array("WN", wp.int32)  # at goals, in this episode
+        arrivals: array("WN", wp.int32, whole(0, 10**8))  # at goals, in this episode
 
-        start_rotation: array("WA", mat33)
+        start_rotation: array("WA", mat33, ROTATION)
         start_position: array("WA", vec3)  # map
-        rotation: array("WA", mat33)  # truth, body to map
-        position: array("WA", vec3)  # truth, map
-        velocity: array("WA", vec3)  # truth, body, m/s
-        angular_velocity: array("WA", vec3)  # truth, body, rad/s
+        rotation: array("WA", mat33, ROTATION._replace(of_truth=True))  # truth, body to map
+        position: array("WA", vec3, TRUTH)  # truth, map
+        velocity: array("WA", vec3, TRUTH)  # truth, body, m/s
+        angular_velocity: array("WA", vec3, TRUTH)  # truth, body, rad/s
         speed: array("WN", scalar)  # of the bicycle, m/s
-        steering: array("WN", scalar)  # rad
-        pan: array("WN", scalar)  # angle by which the camera is turned to the left, rad
-        action: array("WNU", scalar)  # of the current decision, in [-1, 1]
+        steering: array("WN", scalar, numbers(1.6))  # rad
+        pan: array("WN", scalar, numbers(3.15))  # angle by which the camera is turned to the left, rad
+        action: array("WNU", scalar, numbers(1.001))  # of the current decision, in [-1, 1]
         command: array("WN", vec4)  # what it asks for: speed m/s, steering rad, acceleration m/s^2, pan rad
         last_command: array("WN", vec4)  # of the decision before, in force during the dead time
-        ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
-        collided: array("WN", wp.int32)  # touching something now
+        ended: array("WN", wp.int32, whole(-1, "last_outcome"))  # `Outcome`, then the scenario's own conditions
+        collided: array("WN", wp.int32, FLAG)  # touching something now
 
         traffic_position: array("WZ", vec3)  # centres of boxes without identity, map
-        traffic_rotation: array("WZ", mat33)  # body to map
+        traffic_rotation: array("WZ", mat33, ROTATION)  # body to map
         traffic_half: array("WZ", vec3)  # half of their edges, m; zero: not there
 
         sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
         sampled_angular_velocity: array("WNM", vec3)  # likewise, rad/s; of driven vehicles
 
-        odometry_scale: array("WN", scalar)  # truth: the wheels read (1 + this) times the speed
-        gyro_bias: array("WN", vec3)  # truth, rad/s
-        slip: array("WN", vec2)  # truth: share that the wheels read too much, side slip angle in rad; zero: none
-        camera_turn: array("WN", vec3)  # truth: rotation vector of the camera in its frame, beside the nominal one
-        camera_shift: array("WN", vec3)  # truth: of the camera in the body frame, from the nominal position, m
-        camera_focal: array("WN", scalar)  # truth: its focal length is (1 + this) times the nominal one
+        odometry_scale: array("WN", scalar, TRUTH)  # truth: the wheels read (1 + this) times the speed
+        gyro_bias: array("WN", vec3, TRUTH)  # truth, rad/s
+        slip: array("WN", vec2, TRUTH)  # truth: share that the wheels read too much, side slip angle in rad; zero: none
+        camera_turn: array("WN", vec3, TRUTH)  # rotation vector of the camera in its frame, beside the nominal one
+        camera_shift: array("WN", vec3, TRUTH)  # truth: of the camera in the body frame, from the nominal position, m
+        camera_focal: array("WN", scalar, TRUTH)  # truth: its focal length is (1 + this) times the nominal one
 
-        clock: array("WN", wp.int32)  # truth: ticks by which a vehicle's clock is ahead
-        restart_tick: array("WN", wp.int32)  # before which its observer restarts; -1: never
-        lie_tick: array("WN", wp.int32)  # from which on its messages are lies; -1: never
+        clock: array("WN", wp.int32, whole(-(10**8), 10**8))  # truth: ticks by which a vehicle's clock is ahead
+        restart_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # before which its observer restarts; -1: never
+        lie_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # from which on its messages are lies; -1: never
         lie_vector: array("WN", vec3)  # of its lie, m or m/s, map
         broadcast_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
         broadcast_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
         odometry_velocity: array("WN", vec3)  # last sample, m/s
         odometry_angular_velocity: array("WN", vec3)  # last sample, rad/s
-        odometry_samples: array("WN", wp.int32)  # samples taken; sample m is at m / rate
-        increment_rotation: array("WN", mat33)  # odometry over the last tick
+        odometry_samples: array("WN", wp.int32, ODOMETRY_SAMPLES)  # samples taken; sample m is at m / rate
+        increment_rotation: array("WN", mat33, ROTATION)  # odometry over the last tick
         increment_translation: array("WN", vec3)  # m, in the body frame at the tick's start
 
-        bearing: array("WNA", vec3)  # camera to target, camera frame without pan, last measured
-        bearing_tick: array("WNA", wp.int32)  # tick of that bearing; -1: never
-        sight: array("WNA", wp.uint8)  # values of `Sight`
+        bearing: array("WNA", vec3, DIRECTION)  # camera to target, camera frame without pan, last measured
+        bearing_tick: array("WNA", wp.int32, TICK)  # tick of that bearing; -1: never
+        sight: array("WNA", wp.uint8, whole(min(Sight), max(Sight)))  # values of `Sight`
 
-        outbox_rotation: array("WNS", mat33)  # Rhat as sent
+        outbox_rotation: array("WNS", mat33, ROTATION)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
-        outbox_tick: array("WNS", wp.int32)  # -1: nothing sent in this slot
-        arriving: array("WNN", wp.int32)  # per receiver and sender: tick of sending of what arrives now; -1: nothing
-        inbox_rotation: array("WNN", mat33)  # per receiver and sender
+        outbox_tick: array("WNS", wp.int32, TICK)  # -1: nothing sent in this slot
+        arriving: array("WNN", wp.int32, TICK)  # per receiver and sender: tick of sending of what arrives; -1: nothing
+        inbox_rotation: array("WNN", mat33, ROTATION)  # per receiver and sender
         inbox_position: array("WNN", vec3)  # map
-        inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: nothing received
-        inbox_stamp: array("WNN", wp.int32)  # the same by the receiver's clock
+        inbox_tick: array("WNN", wp.int32, TICK)  # tick of sending; -1: nothing received
+        inbox_stamp: array("WNN", wp.int32, TICK)  # the same by the receiver's clock
 
-        estimate_rotation: array("WN", mat33)  # Rhat
+        estimate_rotation: array("WN", mat33, ROTATION)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame
-        covariance: array("WN", mat66)  # P over (2 lambda, p)
-        corrected_tick: array("WN", wp.int32)  # tick of the observer's last correction
-        nis: array("WN", wp.float64)  # normalised innovation squared of its last tick, if the observer gives it
-        nis_dof: array("WN", wp.int32)  # degrees of freedom; 0: no correction, or not given
+        covariance: array("WN", mat66, COVARIANCE)  # P over (2 lambda, p)
+        corrected_tick: array("WN", wp.int32, whole(0, "tick"))  # tick of the observer's last correction
+        nis: array("WN", wp.float64, numbers(LARGEST**3))  # normalised innovation squared of its last tick, if given
+        nis_dof: array("WN", wp.int32, whole(0, 10**6))  # degrees of freedom; 0: no correction, or not given
 
-        gramian_11: array("WNB", mat33)  # block sums of int C^T C dt, map axes
-        gramian_12: array("WNB", mat33)
-        gramian_22: array("WNB", mat33)
+        gramian_11: array("WNB", mat33, numbers(LARGEST**3))  # block sums of int C^T C dt, map axes
+        gramian_12: array("WNB", mat33, numbers(LARGEST**3))
+        gramian_22: array("WNB", mat33, numbers(LARGEST**3))
         gramian_time: array("WNB", scalar)  # s, or m where the window is a distance
         gramian_distance_at: array("WN", scalar)  # m, `distance_driven` at its last sample: the most so far
         distance_driven: array("WN", scalar)  # m forwards since the reset, by odometry; where the window is a distance
@@ -324,55 +328,6 @@ LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_
 """Fields with the true errors of a vehicle's sensors, see `coopenv.world.odometry`; beside `camera_focal`."""
 FAULTS = ("clock", "restart_tick", "lie_tick")
 """Fields with what goes wrong with a vehicle's clock, computer and messages, see `coopenv.world.v2x`."""
-
-VALID: dict[str, Rule] = {
-    "seed": ANYTHING,
-    "episode": ANYTHING,
-    "tick": whole(0, "horizon_ticks"),
-    "exhausted": FLAG,
-    "parameter": numbers(MOST**3),
-    "parameter_set": numbers(MOST),
-    "difficulty": numbers(1.0),
-    "present": FLAG,
-    "pace": numbers(2.0 * MOST**3),
-    "route_count": ROUTE_COUNT,
-    "route_drawn": ROUTE_DRAWN,
-    "arrivals": whole(0, 10**8),
-    "start_rotation": ROTATION,
-    "rotation": ROTATION._replace(of_truth=True),
-    "position": NUMBER._replace(of_truth=True),
-    "velocity": NUMBER._replace(of_truth=True),
-    "angular_velocity": NUMBER._replace(of_truth=True),
-    **dict.fromkeys((*LASTING_ERRORS, "camera_focal"), NUMBER._replace(of_truth=True)),
-    "steering": numbers(1.6),
-    "action": numbers(1.001),
-    "pan": numbers(3.15),
-    "ended": whole(-1, "last_outcome"),
-    "collided": FLAG,
-    "traffic_rotation": ROTATION,
-    "odometry_samples": ODOMETRY_SAMPLES,
-    "increment_rotation": ROTATION,
-    "bearing": DIRECTION,
-    "bearing_tick": TICK,
-    "sight": whole(min(Sight), max(Sight)),
-    "outbox_rotation": ROTATION,
-    "outbox_tick": TICK,
-    "arriving": TICK,
-    "inbox_rotation": ROTATION,
-    "inbox_tick": TICK,
-    "inbox_stamp": TICK,
-    "clock": whole(-(10**8), 10**8),
-    "restart_tick": whole(-1, 2**31 - 1),
-    "lie_tick": whole(-1, 2**31 - 1),
-    "estimate_rotation": ROTATION,
-    "covariance": COVARIANCE,
-    "corrected_tick": whole(0, "tick"),
-    "nis": numbers(LARGEST**3),
-    "nis_dof": whole(0, 10**6),
-    **dict.fromkeys(("gramian_11", "gramian_12", "gramian_22"), numbers(LARGEST**3)),
-    "actions": ANYTHING,
-}
-"""What a saved state may hold; numbers that are not in it have to be finite."""
 
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:

@@ -17,7 +17,7 @@ from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
-    VALID,
+    ANYTHING,
     allocate,
     allocate_state,
     checked_state,
@@ -225,7 +225,9 @@ class World:
 
     def state_rules(self) -> dict[str, Rule]:
         """Return what the fields of a saved state may hold, by name."""
-        return {**VALID, **{f"observer_{name}": rule for name, rule in self.observer.valid.items()}}
+        own = {name: field.rule for name, field in state_fields(self.precision).items() if field.rule is not None}
+        of_observer = {f"observer_{name}": rule for name, rule in self.observer.valid.items()}
+        return {**own, **of_observer, "actions": ANYTHING}
 
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""
