@@ -9,12 +9,13 @@ import json
 import math
 import struct
 from collections.abc import Iterable
+from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, create_model
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
@@ -113,56 +114,24 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix6 = tuple[Vector6, Vector6, Vector6, Vector6, Vector6, Vector6]
 
 
-class NoiseHeader(Section):
-    """A `SensorNoise`."""
-
-    velocity: Number
-    angular_velocity: Number
-    odometry_period: Number
-    bearing: Number
-    image_axis: Vector3 | None
-    odometry_scale: Number = 0.0
-    odometry_scale_walk: Number = 0.0
-    gyro_bias: Vector3 = (0.0, 0.0, 0.0)
-    gyro_bias_walk: Vector3 = (0.0, 0.0, 0.0)
-    slip: tuple[Number, Number, Number, Number] = (0.0, 1.0, 0.0, 0.0)
-    camera_orientation: Number = 0.0
-    camera_position: Number = 0.0
-    focal_length: Number = 0.0
-    clock_offset: Number = 0.0
+def _section_of(record: Any, **types: Any) -> Any:
+    """Return a section with the fields of a dataclass; `types` gives those that JSON has in place of its arrays."""
+    columns: dict[str, Any] = {
+        field.name: (types.get(field.name, field.type), ... if field.default is MISSING else field.default)
+        for field in fields(record)
+    }
+    return create_model(f"{record.__name__}Header", __base__=Section, **columns)
 
 
-class GainsHeader(Section):
-    """The `Gains` of one vehicle."""
-
-    k: Number
-    q: tuple[Number, ...]
-    V: tuple[Number, Number]
-    P0: tuple[Number, Number]
-    max_turn: Number
-
-
-class SetupHeader(Section):
-    """The `Setup` of one vehicle."""
-
-    vehicle: Index
-    name: str
-    target_names: tuple[str, ...]
-    landmarks: Index
-    targets: tuple[Index, ...]
-    lever_arm: Vector3
-    marker: Vector3
-    planar: bool
-    noise: NoiseHeader
-    gains: GainsHeader
-
-
-class DrawnHeader(Section):
-    """A `Drawn`."""
-
-    key: int
-    episode: int
-    parameters: tuple[Number, ...]
+SetupHeader = _section_of(
+    Setup,
+    landmarks=Index,
+    targets=tuple[Index, ...],
+    lever_arm=Vector3,
+    marker=Vector3,
+    noise=_section_of(SensorNoise),
+    gains=_section_of(Gains, q=tuple[Number, ...]),
+)
 
 
 class Header(Section):
@@ -174,12 +143,12 @@ class Header(Section):
     period: int
     staleness: Number | None
     """s; none: messages are used for ever."""
-    setups: tuple[SetupHeader, ...] = Field(min_length=1)
+    setups: tuple[SetupHeader, ...] = Field(min_length=1)  # type: ignore[valid-type]
     start_rotation: tuple[Matrix3, ...]
     start_position: tuple[Vector3, ...]
     start_covariance: tuple[Matrix6, ...]
     scenario: dict[str, Any] | None
-    drawn: DrawnHeader | None = None
+    drawn: _section_of(Drawn) | None = None  # type: ignore[valid-type]
 
     @classmethod
     def read(cls, text: bytes, where: str) -> Self:
@@ -210,7 +179,7 @@ def header_of(recording: Recording) -> bytes:
     return json.dumps(values, separators=(",", ":")).encode()
 
 
-def _setup(header: SetupHeader) -> Setup:
+def _setup(header: Any) -> Setup:
     arrays = {
         "targets": np.array(header.targets, np.int64),
         "lever_arm": np.array(header.lever_arm),
