@@ -25,8 +25,7 @@ from coopenv.world.dynamics import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.model import Precision
 from coopenv.world.random import COUNT as PARAMETER_COUNT
-from coopenv.world.random import draw_parameters
-from coopenv.world.reset import draw_presence, place_agent, place_vehicle, set_initial_estimate
+from coopenv.world.reset import place_everybody, set_initial_estimate
 from coopenv.world.state import allocate, array, fields
 from coopenv.world.v2x import draw_faults, transmit
 
@@ -145,19 +144,13 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
 @wp.func
 def rewind(model: Any, state: Any, record: Any, world: int):
     """Go to the start in one world: initial estimates are those of the record, or drawn by the scenario."""
-    state.tick[world] = 0
-    state.exhausted[world] = 0
     if record.drawn != 0:
         state.seed[world] = record.key
         state.episode[world] = record.episode
         for k in range(PARAMETER_COUNT):
             state.parameter_set[world, k] = record.parameter[k]
-    draw_parameters(model, state, world)
-    draw_presence(model, state, world)
-    for agent in range(model.agents):
-        place_agent(model, state, world, agent)
+    place_everybody(model, state, world)
     for vehicle in range(model.vehicles):
-        place_vehicle(model, state, world, vehicle)
         forget_errors(state, world, vehicle)
         draw_faults(model, state, world, vehicle)
         position = record.true_position[0, vehicle]

@@ -28,42 +28,18 @@ POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
-def new_part(place: Path) -> tuple[Path, int | None]:
-    """Return a new hidden folder beside a place, and the descriptor that holds it, if there are locks."""
-    while True:
-        part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
-        part.mkdir()
-        with suppress(FileNotFoundError):
-            descriptor = lock(part, wait=inf)
-            if part.exists():  # not taken for abandoned before it was locked
-                return part, descriptor
-            if descriptor is not None:
-                os.close(descriptor)
+def lock(folder: Path, wait: float = 0.0, shared: bool = False) -> int | None:
+    """Return a descriptor that holds a folder until it is closed, or None: no locks, or held by others for `wait` s.
 
-
-def abandoned(place: Path, suffix: str) -> Iterator[Path]:
-    """Yield the hidden folders of a place that belong to no living process."""
-    for path in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"):
-        try:
-            descriptor = lock(path)
-        except OSError:  # gone meanwhile
-            continue
-        if descriptor is not None:
-            try:
-                yield path
-            finally:
-                os.close(descriptor)
-
-
-def lock(folder: Path, wait: float = 0.0) -> int | None:
-    """Return a descriptor that holds a folder until it is closed, or None: no locks, or held by others for `wait` s."""
+    Several may hold it `shared`, and then it is held by others for all that want it for themselves.
+    """
     if fcntl is None:
         return None
     descriptor = os.open(folder, os.O_RDONLY)
     end = monotonic() + wait
     while True:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             return descriptor
         except OSError as error:
             if not isinstance(error, BlockingIOError) or monotonic() >= end:
@@ -89,7 +65,7 @@ def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
 
 def exchange(part: Path, place: Path, old: Path) -> None:
     """Let `part` and the folder at `place` change places; the latter is then called `old`."""
-    part.rename(old)  # from now on no other run removes it as abandoned
+    part.rename(old)  # what is left of it if this process is killed goes entry by entry
     rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
     paths = os.fsencode(old), os.fsencode(place)
     if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
@@ -103,15 +79,15 @@ def exchange(part: Path, place: Path, old: Path) -> None:
         raise
 
 
-def heal(place: Path, names: Collection[str]) -> None:
-    """Finish a replacement that a killed run had begun."""
-    for old in abandoned(place, OLD):
-        if not os.path.lexists(place):
-            old.rename(place)
-        elif any((place / name).exists() for name in names):
-            clear(old, place, names)
-        else:  # the place was made anew, and is empty
-            clear(old, place, ())
+def clean(place: Path, names: Collection[str]) -> None:
+    """Remove what killed runs have left beside a place; finish a replacement that one had begun."""
+    for left in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}.*"):
+        if left.suffix == PART:
+            shutil.rmtree(left, ignore_errors=True)
+        elif left.suffix == OLD and not os.path.lexists(place):
+            left.rename(place)
+        elif left.suffix == OLD:  # a place without a result was made anew, and gets the old one
+            clear(left, place, names if any((place / name).exists() for name in names) else ())
 
 
 def clear(old: Path, place: Path, names: Collection[str]) -> None:
@@ -210,7 +186,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
         OutputError: it cannot be written or replaced, which is found before anything is yielded where it can be known;
             the old folder is untouched.
     """
-    with _staging(folder, partial(_check_folder, names)) as (place, part):
+    with _staging(folder, partial(_check_folder, names), names) as (place, part):
         try:
             yield part
         except OutputError as error:
@@ -286,7 +262,6 @@ def _check_file(path: str | Path, place: Path) -> None:
 
 def _check_folder(names: Collection[str], folder: str | Path, place: Path) -> None:
     place.parent.mkdir(parents=True, exist_ok=True)
-    heal(place, names)
     if not os.path.lexists(place):
         return
     if not place.is_dir():
@@ -309,34 +284,36 @@ def _check_folder(names: Collection[str], folder: str | Path, place: Path) -> No
 
 
 @contextmanager
-def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Iterator[tuple[Path, Path]]:
+def _staging(
+    path: str | Path, check: Callable[[str | Path, Path], None], names: Collection[str] = ()
+) -> Iterator[tuple[Path, Path]]:
     """Yield the place behind `path`, its symbolic links followed, and a hidden folder beside it, removed at the end.
 
-    The folder is locked for as long as this process lives: unlocked ones are of runs that were killed.
+    Meanwhile the folder above is locked, shared with other runs: where it is not, hidden folders are of killed runs.
     """
     with writing(path):
         place = Path(os.path.realpath(path))
         check(path, place)
         if not os.access(place.parent, os.W_OK | os.X_OK):
             raise OutputError(f"cannot write to {path}: folder {Path(path).parent} is read-only")
-        for left in abandoned(place, PART):
-            shutil.rmtree(left, ignore_errors=True)
+        if (alone := lock(place.parent)) is not None:
+            clean(place, names)
+            os.close(alone)
+        in_use = lock(place.parent, inf, shared=True)
     if place.parent not in _under_way:
         note(f"kept: {path} of an earlier run" if os.path.lexists(place) else NOTHING)
-    part = None
+    part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
+    _under_way.append(part)
     try:
         with writing(path):
-            with held():
-                part, lock = new_part(place)
-                _under_way.append(part)
+            part.mkdir()
             probe = part / "probe"
             probe.write_bytes(bytes(PROBE_BYTES))
             sync(probe)
             probe.unlink()
         yield place, part
     finally:
-        if part is not None:
-            _under_way.remove(part)
-            shutil.rmtree(part, ignore_errors=True)
-            if lock is not None:
-                os.close(lock)
+        shutil.rmtree(part, ignore_errors=True)
+        _under_way.remove(part)
+        if in_use is not None:
+            os.close(in_use)

@@ -14,7 +14,7 @@ from coopenv.world.camera import observe
 from coopenv.world.dynamics import depart, move, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.reset import reset_world
+from coopenv.world.reset import begin_sensing, place_everybody
 from coopenv.world.v2x import transmit
 from coopenv.world.warp_internals import device_function
 
@@ -148,8 +148,9 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 
 @device_function
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
-    """Draw the start of an episode."""
-    reset_world(model, state, world)
+    """Draw the start of an episode, and take the first frame."""
+    place_everybody(model, state, world)
+    begin_sensing(model, state, world)
 
 
 @device_function
@@ -166,10 +167,5 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
     transmit(model, state, world, tick)
 
 
-def nothing_recorded(p: Precision) -> Any:
-    """Return the record of a source that needs none."""
-    return Nothing
-
-
-SIMULATED = Source("simulated", begin_simulation, sense_simulation, nothing_recorded, fused=True)
+SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, fused=True)
 """Ticks that are computed."""

@@ -12,6 +12,7 @@ from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
 from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.odometry import draw_errors
+from coopenv.world.quality import empty_block
 from coopenv.world.random import (
     INITIAL_ERROR,
     INITIAL_SPEED,
@@ -205,11 +206,7 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.inbox_position[world, vehicle, sender] = o
         state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):
-        R = state.rotation[world, agent]
-        state.gramian_11[world, vehicle, block] = type(R)()
-        state.gramian_12[world, vehicle, block] = type(R)()
-        state.gramian_22[world, vehicle, block] = type(R)()
-        state.gramian_time[world, vehicle, block] = o[0]
+        empty_block(state, world, vehicle, block)
     state.gramian_distance_at[world, vehicle] = o[0]
     state.distance_driven[world, vehicle] = o[0]
 
@@ -290,10 +287,3 @@ def begin_sensing(model: Any, state: Any, world: int):
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, 0)
     transmit(model, state, world, 0)
-
-
-@wp.func
-def reset_world(model: Any, state: Any, world: int):
-    """Start a new episode in one world; its seed and episode number are already set."""
-    place_everybody(model, state, world)
-    begin_sensing(model, state, world)
