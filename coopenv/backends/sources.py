@@ -162,26 +162,25 @@ def open_backend(
     Raises:
         CoopenvError: any of it does not exist or does not fit.
     """
-    given = {key: value for key, value in (cars or {}).items() if value is not None}
+    recorded, cars = {"data": data, "variant": variant, "topics": topics}, cars or {}
     if backend == "svea":
-        return _open_cars(name_or_path, overrides, {**given, "data": data, "variant": variant, "topics": topics})
+        _refuse(recorded, " is for recorded data, backend='svea' has cars")
+        return _open_cars(name_or_path, overrides, cars)
     if _is_backend(backend):
-        for key, value in {**overrides, **given, "data": data, "variant": variant, "topics": topics}.items():
-            if value is not None:
-                raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
+        _refuse(
+            {**overrides, **cars, **recorded}, f": {type(backend).__name__} has its scenario already, choose it there"
+        )
         return backend
-    for key in given:
-        raise CoopenvError(f"{key}: is for backend='svea'")
-    _check_backend(backend)
+    _refuse(cars, ": is for backend='svea'")
+    if backend is not None and backend not in BACKENDS:
+        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
+        raise CoopenvError(f"unknown backend '{backend}'{known}")
     if backend in (None, "replay") and is_bag(name_or_path, topics):
         return open_bags([name_or_path], topics, overrides, data, variant)
-    if topics is not None:
-        raise CoopenvError(f"topics {topics}: is for ROS bags, '{name_or_path}' is none")
+    _refuse({f"topics {topics}": topics}, f": is for ROS bags, '{name_or_path}' is none")
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
         return _open_recorded(name_or_path, overrides, data, variant)
-    for what, value in (("data", data), ("variant", variant)):
-        if value is not None:
-            raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
+    _refuse(recorded, f" is for recorded data, '{name_or_path}' is simulated")
     from coopenv.scenario import load_scenario
 
     scenario = load_scenario(name_or_path, overrides)
@@ -198,10 +197,10 @@ def _is_backend(given: str | Backend | None) -> TypeGuard[Backend]:
     return isinstance(given, Backend)
 
 
-def _check_backend(backend: object) -> None:
-    if backend is not None and backend not in BACKENDS:
-        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
-        raise CoopenvError(f"unknown backend '{backend}'{known}")
+def _refuse(options: Mapping[str, Any], why: str) -> None:
+    """Refuse an option that is given, which does not fit; its name and `why` are the error."""
+    for name in [name for name, value in options.items() if value is not None]:
+        raise CoopenvError(f"{name}{why}")
 
 
 def _open_recorded(
@@ -222,14 +221,11 @@ def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[st
     """Return the cars of a deployment file: that which is given, or `name` itself."""
     from coopenv.cars.backend.backend import open_svea
 
-    for key in ("data", "variant", "topics"):
-        if given[key] is not None:
-            raise CoopenvError(f"{key} is for recorded data, backend='svea' has cars")
     deployment = given.get("deployment")
     if deployment is None and not str(name).endswith(".toml"):
         raise CoopenvError(f"deployment: needed by backend='svea': the file with the cars that drive {name}")
     environment = None if deployment is None else str(name)
-    options = {key: given[key] for key in ("car", "record", "connect") if key in given}
+    options = {key: given[key] for key in ("car", "record", "connect") if given.get(key) is not None}
     return open_svea(deployment or name, environment, overrides, **options)
 
 
@@ -242,9 +238,7 @@ def open_bags(
 ) -> Bag:
     """Return ROS bags of one drive as a backend; arguments and errors as for `open_backend`."""
     where = ", ".join(str(name) for name in names)
-    for what, value in (("data", data), ("variant", variant)):
-        if value is not None:
-            raise CoopenvError(f"{what} is for recorded data sets, {where} is a ROS bag")
+    _refuse({"data": data, "variant": variant}, f" is for recorded data sets, {where} is a ROS bag")
     missing = [str(name) for name in names if not Path(name).exists()]
     if missing:
         raise DataError(f"no such bag: {', '.join(missing)}")

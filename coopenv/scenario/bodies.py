@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
@@ -147,6 +147,15 @@ VehicleMotion = Annotated[
 ]
 
 
+Oriented = TypeVar("Oriented", "InitialPose", "InitialEstimate")
+
+
+def _has_one_orientation(given: Oriented) -> Oriented:
+    if given.yaw is not None and given.quaternion_wxyz is not None:
+        raise ValueError("give yaw or quaternion_wxyz, not both")
+    return given
+
+
 class InitialPose(Section):
     """Where an agent starts, fixed or drawn anew at each reset; one with routes starts on that which it draws."""
 
@@ -161,11 +170,7 @@ class InitialPose(Section):
     yaw_spread: NonNegative = 0.0
     """Half-width of a uniform turn about the body's z axis, rad."""
 
-    @model_validator(mode="after")
-    def _one_orientation(self) -> Self:
-        if self.yaw is not None and self.quaternion_wxyz is not None:
-            raise ValueError("give yaw or quaternion_wxyz, not both")
-        return self
+    _one_orientation = model_validator(mode="after")(_has_one_orientation)
 
 
 class InitialEstimate(Section):
@@ -193,11 +198,7 @@ class InitialEstimate(Section):
             return None
         return tuple(value) if isinstance(value, list) else value  # what a validator returns is no JSON any more
 
-    @model_validator(mode="after")
-    def _one_orientation(self) -> Self:
-        if self.yaw is not None and self.quaternion_wxyz is not None:
-            raise ValueError("give yaw or quaternion_wxyz, not both")
-        return self
+    _one_orientation = model_validator(mode="after")(_has_one_orientation)
 
 
 class Goal(Section):

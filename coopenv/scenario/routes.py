@@ -47,18 +47,18 @@ class Route(Section):
         return self
 
 
-class Piece(NamedTuple):
-    """A straight line, or an arc."""
+class Pieces(NamedTuple):
+    """Straight lines and arcs, one after the other."""
 
-    position: np.ndarray  # (2,) m, where it begins
-    heading: float  # rad, there
-    curvature: float  # 1/m, positive to the left
-    length: float  # m
+    position: np.ndarray  # (n, 2) m, where they begin
+    heading: np.ndarray  # (n,) rad, there
+    curvature: np.ndarray  # (n,) 1/m, positive to the left
+    length: np.ndarray  # (n,) m
 
 
 def route_length(route: Route) -> float:
     """Return the length of a route as designed, m."""
-    return math.fsum(piece.length for piece in _pieces(route))
+    return math.fsum(_pieces(route).length)
 
 
 def point_count(route: Route) -> int:
@@ -69,11 +69,10 @@ def point_count(route: Route) -> int:
 
 def route_points(route: Route, s: np.ndarray) -> np.ndarray:
     """Return (x, y, heading), (K, 3) in m and rad, of a route as designed at arc lengths s (K,), m."""
-    pieces = list(_pieces(route))
-    begin = np.concatenate([[0.0], np.cumsum([piece.length for piece in pieces])[:-1]])
+    pieces = _pieces(route)
+    begin = np.concatenate([[0.0], np.cumsum(pieces.length)[:-1]])
     which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, None)
-    position = np.array([piece.position for piece in pieces])[which]
-    heading, curvature = (np.array([piece[k] for piece in pieces])[which] for k in (1, 2))
+    position, heading, curvature, _ = (values[which] for values in pieces)
     h = np.asarray(s) - begin[which]
     turn = curvature * h
     chord, middle = h * np.sinc(turn / (2 * np.pi)), heading + turn / 2
@@ -127,16 +126,14 @@ def _problems(route: Route) -> Iterator[str]:
         yield f"start_spread: {route.start_spread:g} m must be below the route's length ({total:g} m)"
 
 
-def _pieces(route: Route) -> Iterator[Piece]:
-    length, headings, turn, cut = _shape(route)
-    for i, heading in enumerate(headings):
-        ahead, begin, end = _direction(heading), np.array(route.waypoints[i]), np.array(route.waypoints[i + 1])
-        straight = length[i] - cut[i] - cut[i + 1]
-        if straight > 1e-9:
-            yield Piece(begin + cut[i] * ahead, heading, 0.0, straight)
-        if cut[i + 1] > 0.0:
-            curvature, arc = math.copysign(1.0 / route.corner_radius, turn[i + 1]), abs(turn[i + 1])
-            yield Piece(end - cut[i + 1] * ahead, heading, curvature, route.corner_radius * arc)
+def _pieces(route: Route) -> Pieces:
+    length, heading, turn, cut = _shape(route)
+    points, ahead, radius = np.array(route.waypoints), _direction(heading), route.corner_radius
+    lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
+    curvature = np.sign(turn[1:]) / (radius or np.inf)
+    arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
+    there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
+    return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
 
 
 def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:

@@ -5,7 +5,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -162,12 +162,11 @@ class Scenario(Section):
     @field_validator("landmarks")
     @classmethod
     def _names_are_free(cls, landmarks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:
-        names = [landmark.name for landmark in landmarks]
-        for name in _twice(names):
+        for name in _twice(landmarks):
             raise ValueError(f"landmark name '{name}' is used twice")
-        for name in names:
-            if re.fullmatch(r"vehicle_\d+", name):
-                raise ValueError(f"landmark name '{name}' is reserved for vehicles")
+        for landmark in landmarks:
+            if re.fullmatch(r"vehicle_\d+", landmark.name):
+                raise ValueError(f"landmark name '{landmark.name}' is reserved for vehicles")
         return landmarks
 
     @model_validator(mode="after")
@@ -186,8 +185,8 @@ class Scenario(Section):
         return self
 
 
-def _twice(names: Sequence[str]) -> list[str]:
-    return [name for name, times in Counter(names).items() if times > 1]
+def _twice(named: Sequence[Any]) -> list[str]:
+    return [name for name, times in Counter(entry.name for entry in named).items() if times > 1]
 
 
 def _misplaced(s: Scenario) -> Iterator[str]:
@@ -225,10 +224,11 @@ def _problems(s: Scenario) -> Iterator[str]:
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
     names = [route.name for route in s.routes]
-    yield from (f"routes: the name '{name}' is used twice" for name in _twice(names))
+    for key in ("routes", "landmark_groups"):
+        yield from (f"{key}: the name '{name}' is used twice" for name in _twice(getattr(s, key)))
     for i, vehicle in enumerate(s.vehicles):
-        for key, name in [*(("routes", n) for n in vehicle.routes), *(("next_routes", n) for n in vehicle.next_routes)]:
-            if name not in names:
+        for key in ("routes", "next_routes"):
+            for name in [name for name in getattr(vehicle, key) if name not in names]:
                 yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
     yield from _problems_of_draws(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
@@ -255,8 +255,7 @@ def _beyond_limits(s: Scenario) -> Iterator[str]:
 
 
 def _problems_of_draws(s: Scenario) -> Iterator[str]:
-    groups = [group.name for group in s.landmark_groups]
-    yield from (f"landmark_groups: the name '{name}' is used twice" for name in _twice(groups))
+    groups = {group.name for group in s.landmark_groups}
     for i, mark in enumerate(s.landmarks):
         if mark.group is not None and mark.group not in groups:
             yield f"landmarks.{i}.group: unknown group {shown(mark.group)}; groups make their landmarks themselves"

@@ -1,7 +1,7 @@
 """Turn a scenario into the arrays and numbers of a `Model` on a device."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -69,14 +69,14 @@ def drawn_of(scenario: Scenario) -> dict[str, Any]:
     rows = np.arange(len(scenario.vehicles))[:, None] * len(routes) + np.arange(len(routes) + 1)
     return {
         "presence": [agent.presence for agent in agents],
-        "any_driven": int(scenario.driven),
+        "any_driven": scenario.driven,
         "pace_spread": [agent.pace_spread for agent in agents],
         "speed_spread": [motion.initial_speed_spread if motion.kind == "driven" else 0.0 for motion in motions],
         **_groups(scenario),
         **{name: [part.factors(key)[0] for key in PARAMETERS] for name, part in (("low", drawn), ("easy", hard))},
         **{name: [part.factors(key)[1] for key in PARAMETERS] for name, part in (("high", drawn), ("hard", hard))},
         "level": scenario.difficulty.number,
-        "after_arrival": int(AFTER_ARRIVAL[scenario.termination.after_arrival]),
+        "after_arrival": AFTER_ARRIVAL[scenario.termination.after_arrival],
         "next_first": ends[rows],
         "next_choice": [i for of_vehicle in following for next_ones in of_vehicle for i in next_ones],
     }
@@ -111,7 +111,7 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
         "corruption_start": corruption.start,
         "corruption_size": corruption.size,
         "corruption_turn": corruption.turn,
-        "lie": int(KINDS[lie.kind]),
+        "lie": KINDS[lie.kind],
         "lie_chance": lie.chance,
         "lie_start": lie.start,
         "lie_spread": lie.start_spread,
@@ -122,28 +122,14 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def fault_switches(scenario: Scenario) -> dict[str, int]:
-    """Return the faults that any vehicle has; faults of no vehicle cost nothing."""
-    everybody = scenario.all_faults
-    return {
-        "clocks": int(any(f.clock_offset > 0.0 for f in everybody)),
-        "restarts": int(any(f.restart.chance > 0.0 for f in everybody)),
-        "alters": int(any(f.alters for f in everybody)),
-    }
-
-
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
-    """Return the values of the model's `CameraValues`."""
+    """Return the values of the model's `CameraValues` that are not the camera's own."""
     on = float(noise.enabled)
-    same = ("position", "image_size", "focal_length", "principal_point")
     return {
-        **{name: getattr(c, name) for name in same},
         "rotation": c.to_body(),
-        "pinhole": int(c.model == "pinhole"),
+        "pinhole": c.model == "pinhole",
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
         "max_radius": largest_radius(c.distortion),
-        "undistort": int(c.undistort),
-        "quantise": int(c.quantise),
         "range": math.inf if c.range is None else c.range,
         "miss": c.miss_probability,
         "orientation_std": on * c.extrinsics_error,
@@ -154,7 +140,7 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
 
 def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
     """Return the values of the model's `NoiseValues`."""
-    on = float(n.enabled)
+    on, slip = float(n.enabled), n.slip
     axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     if abs(axis[2]) > 1 - 1e-12:
@@ -163,18 +149,10 @@ def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
     return {
         "velocity": on * _at_rate(n.velocity, n.odometry_rate, rates.odometry),
         "angular_velocity": on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry),
-        "bearing_paper": int(n.bearing.model == "paper"),
+        "bearing_paper": n.bearing.model == "paper",
         "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
         "axis": np.column_stack([first, np.cross(axis, first), axis]),
-        **_lasting(n),
-    }
-
-
-def _lasting(n: Noise) -> dict[str, Any]:
-    """Return the errors of the odometry that last."""
-    on, slip = float(n.enabled), n.slip
-    return {
-        "lasting": int(n.enabled and n.lasts),
+        "lasting": n.enabled and n.lasts,
         "odometry_scale": on * n.odometry_scale,
         "odometry_scale_walk": on * n.odometry_scale_walk,
         "gyro_bias": on * np.broadcast_to(n.gyro_bias, 3),
@@ -202,29 +180,37 @@ NOWHERE = (0.0, 0.0, 0.0)
 def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     """Return the Warp `Model` of a scenario."""
     model = model_struct(p)()
-    _fill(model, _world(scenario), device)
-    _fill(model.start, _start(scenario), device)
-    _fill(model.motion, _motion(scenario), device)
-    model.dynamics = _structs(p, "dynamics", [_dynamics(d, scenario) for d in scenario.limits], device)
-    _fill(model.scene, _scene(scenario), device)
-    _fill(model.routes, routes_of(scenario), device)
-    _fill(model.drawn, drawn_of(scenario), device)
-    sensors = zip(scenario.cameras, scenario.noises, strict=True)
-    model.camera = _structs(p, "camera", [camera_entries(camera, noise) for camera, noise in sensors], device)
-    model.noise = _structs(p, "noise", [noise_entries(n, scenario.rates) for n in scenario.noises], device)
-    model.fault = _structs(p, "fault", [fault_entries(f, scenario) for f in scenario.all_faults], device)
-    _fill(model, fault_switches(scenario), device)
-    _fill(model.radio, _radio(scenario), device)
-    _fill(model.observer, _observer(scenario), device)
-    _fill(model.judgement, _judgement(scenario), device)
+    cameras, noises, faults = scenario.cameras, scenario.noises, scenario.all_faults
+    _fill(model, device, _world(scenario))
+    _fill(model.start, device, _start(scenario))
+    _fill(model.motion, device, _motion(scenario))
+    _fill(model.scene, device, _scene(scenario))
+    _fill(model.routes, device, routes_of(scenario))
+    _fill(model.drawn, device, drawn_of(scenario))
+    _fill(model.radio, device, _radio(scenario), scenario.v2x)
+    _fill(model.observer, device, _observer(scenario), scenario.observer)
+    _fill(model.judgement, device, {}, scenario.reward)
+    of_vehicles: dict[str, list[tuple[Any, dict[str, Any]]]] = {
+        "dynamics": [(d, _dynamics(d, scenario)) for d in scenario.limits],
+        "camera": [(c, camera_entries(c, noise)) for c, noise in zip(cameras, noises, strict=True)],
+        "noise": [(n, noise_entries(n, scenario.rates)) for n in noises],
+        "fault": [(f, fault_entries(f, scenario)) for f in faults],
+    }
+    for name, rows in of_vehicles.items():
+        kind = entry_struct(p, name)
+        entries = [kind() for _ in rows]
+        for entry, (section, values) in zip(entries, rows, strict=True):
+            _fill(entry, device, values, section)
+        setattr(model, name, wp.array(entries, dtype=kind, device=device))
     return model
 
 
-def _fill(struct: Any, values: Mapping[str, Any], device: str) -> None:
-    """Write fields of a struct, each in the type that it is declared with."""
-    types = field_types(struct)
-    for name, value in values.items():
-        kind = types[name]
+def _fill(struct: Any, device: str, values: Mapping[str, Any], section: Any = None) -> None:
+    """Write fields of a struct in their types: the values, and entries of the same names of a scenario's section."""
+    for name, kind in field_types(struct).items():
+        if name not in values and not hasattr(section, name):
+            continue
+        value = values[name] if name in values else getattr(section, name)
         if isinstance(kind, wp.array):
             scalar = scalar_of(kind.dtype)
             data = np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(scalar))
@@ -232,20 +218,11 @@ def _fill(struct: Any, values: Mapping[str, Any], device: str) -> None:
             value = wp.array(data, dtype=kind.dtype, ndim=kind.ndim, device=device) if data.size else empty
         elif hasattr(kind, "_shape_"):
             value = kind(*np.ravel(value).tolist())
-        setattr(struct, name, value)
-
-
-def _structs(p: Precision, name: str, rows: Sequence[Mapping[str, Any]], device: str) -> Any:
-    """Return one of the model's arrays of structs, filled."""
-    kind = entry_struct(p, name)
-    entries = [kind() for _ in rows]
-    for entry, values in zip(entries, rows, strict=True):
-        _fill(entry, values, device)
-    return wp.array(entries, dtype=kind, device=device)
+        setattr(struct, name, int(value) if kind is wp.int32 else value)
 
 
 def _world(scenario: Scenario) -> dict[str, Any]:
-    rates, vehicles = scenario.rates, len(scenario.vehicles)
+    rates, vehicles, faults = scenario.rates, len(scenario.vehicles), scenario.all_faults
     agents = len(scenario.landmarks) + vehicles
     sets = neighbour_sets(scenario)
     order = processing_order(scenario, sets)
@@ -255,7 +232,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "agents": agents,
         "obstacles": len(scenario.obstacles),
         "traffic": scenario.highway.most_vehicles if scenario.highway else 0,
-        "sensed": int(scenario.topology.mode == "sensed"),
+        "sensed": scenario.topology.mode == "sensed",
         "sensing": {"sensed": SENSED, "ideal": IDEAL, "blind": BLIND}[scenario.sensing],
         "camera_rate": rates.camera,
         "odometry_rate": rates.odometry,
@@ -272,6 +249,9 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),
+        "clocks": any(f.clock_offset > 0.0 for f in faults),
+        "restarts": any(f.restart.chance > 0.0 for f in faults),
+        "alters": any(f.alters for f in faults),
     }
 
 
@@ -324,15 +304,12 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
 
 def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
-    same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate", "dead_band")
     return {
-        **{name: getattr(d, name) for name in same},
         "min_speed": -d.max_speed if d.reverse else 0.0,
         "speed_lag": 0.0 if accelerates else d.speed_time_constant,  # an acceleration acts at once
         "steering_lag": d.steering_time_constant,
-        "gated": int(d.gated),
         "latency_ticks": round(d.latency * scenario.rates.camera),
-        "acceleration_mode": int(accelerates),
+        "acceleration_mode": accelerates,
         "action_steering": scenario.action.steering or d.max_steering,
         "pan_limit": pan.limit if pan else 0.0,
         "pan_rate": pan.rate if pan else 0.0,
@@ -351,8 +328,8 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "obstacle_center": [np.array(obstacle.center) - origin for obstacle in scenario.obstacles],
         "obstacle_half": [np.array(obstacle.size) / 2 for obstacle in scenario.obstacles],
         "goal_radius": [vehicle.goal_radius for vehicle in scenario.vehicles],
-        "end_on_collision": int(scenario.termination.collision),
-        "end_on_arrival": int(scenario.termination.arrival),
+        "end_on_collision": scenario.termination.collision,
+        "end_on_arrival": scenario.termination.arrival,
         "off_route": scenario.termination.off_route or 0.0,
     }
 
@@ -360,7 +337,6 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
 def _radio(scenario: Scenario) -> dict[str, Any]:
     v = scenario.v2x
     return {
-        **{name: getattr(v, name) for name in ("delay", "period", "loss")},
         "slots": max(v.delay, 1) + 1 + scenario.replay_ticks,
         "range": math.inf if v.range is None else v.range,
         "staleness": math.inf if v.staleness is None else v.staleness,
@@ -375,15 +351,9 @@ def _observer(scenario: Scenario) -> dict[str, Any]:
         "k": o.k if isinstance(o.k, tuple) else [o.k] * len(scenario.vehicles),
         "q": [o.q.get(name, 10.0) if isinstance(o.q, dict) else o.q for name in scenario.target_names],
         **dict(zip(("v1", "v2", "p1", "p2"), (*o.V, *o.P0), strict=True)),
-        "max_turn": o.max_turn,
         "rate": min(scenario.rates.observer or camera, camera),
         "gramian_stride": stride,
         "block_ticks": stride * max(1, block),
         "block_distance": (o.gramian_distance or 0.0) / GRAMIAN_BLOCKS,
         "blocks": GRAMIAN_BLOCKS,
     }
-
-
-def _judgement(scenario: Scenario) -> dict[str, Any]:
-    names = ("uncertainty_threshold", "uncertainty_cap", "observability_floor", "observability_level")
-    return {name: getattr(scenario.reward, name) for name in names}

@@ -53,12 +53,6 @@ def _written() -> Iterator[None]:
         ) from None
 
 
-def start() -> None:
-    """Initialise Warp, which makes the folder of the cache. Raises KernelCacheError: it cannot."""
-    with _written():
-        wp.init()
-
-
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
     """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
     name = kernel.module.name
@@ -131,20 +125,27 @@ WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between 
 
 @cache
 def start_warp() -> None:
-    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is."""
+    """Initialise Warp, which makes the folder of the cache, without its banner.
+
+    Neither is there the notice that its library prints where no GPU driver is.
+
+    Raises:
+        KernelCacheError: the folder cannot be made.
+    """
     wp.config.log_level = wp.LOG_ERROR
-    try:
+    saved = None
+    with suppress(OSError):  # no standard error: nothing to mute
         saved = os.dup(2)
-    except OSError:  # no standard error: nothing to mute
-        start()
-        return
     try:
-        with Path(os.devnull).open("wb") as nothing:
-            os.dup2(nothing.fileno(), 2)
-        start()
+        if saved is not None:
+            with Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), 2)
+        with _written():
+            wp.init()
     finally:
-        os.dup2(saved, 2)
-        os.close(saved)
+        if saved is not None:
+            os.dup2(saved, 2)
+            os.close(saved)
 
 
 @cache

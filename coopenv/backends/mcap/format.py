@@ -60,14 +60,12 @@ float64[3] position  # m, map
 """,
 }
 
-PAN = {"pan": "coopenv_msgs/msg/Pan"}
-"""A further topic of a vehicle, where cameras pan."""
-
 EXACT = {
     "increment": "coopenv_msgs/msg/Odometry",
     "bearings": "coopenv_msgs/msg/Bearings",
     "v2x": "coopenv_msgs/msg/Inbox",
     "truth_exact": "coopenv_msgs/msg/Truth",
+    "pan": "coopenv_msgs/msg/Pan",
 }
 """Topics of a vehicle that hold the recording, one message a tick."""
 
@@ -91,6 +89,11 @@ LANDMARKS_TYPE = "geometry_msgs/msg/PoseArray"
 def topic(vehicle: str, name: str) -> str:
     """Return the full name of a vehicle's topic."""
     return f"/{vehicle}/{name}"
+
+
+def exact_topics(pan: bool) -> dict[str, str]:
+    """Return `EXACT`; without `pan`, where no camera turns, without that topic."""
+    return {name: kind for name, kind in EXACT.items() if pan or name != "pan"}
 
 
 @cache

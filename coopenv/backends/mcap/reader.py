@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,41 +12,43 @@ import numpy as np
 from coopenv.backends.mcap.format import (
     ATTACHMENT,
     CONTENTS,
-    EXACT,
     FORMAT,
     LANDMARKS,
     LANDMARKS_TYPE,
-    PAN,
     Header,
     codec,
+    exact_topics,
     topic,
 )
 from coopenv.base.errors import CoopenvError, DataError, check_memory, shown
-from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording
+from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording, sizes_of
 
 if TYPE_CHECKING:
     from coopenv.backends.mcap.container import Container
 
 
 class TickArrays:
-    """K ticks of N vehicles and T targets, of which the first L are landmarks; `pan`: whether cameras turn."""
+    """The arrays of a recording while its messages come in; `pan`: whether cameras turn."""
 
-    def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int, pan: bool) -> None:
+    def __init__(self, header: Header, pan: bool) -> None:
         """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
-        sizes = {"K": ticks, "N": len(vehicles), "T": targets, "L": landmarks}
+        vehicles, ticks = [setup.name for setup in header.setups], header.ticks
+        sizes = {"K": ticks, **sizes_of(header.setups)}
         kept = [n for n, spec in ARRAYS.items() if spec.recorded and spec.axes[0] == "K" and (n != "pan" or pan)]
         shapes = {name: ARRAYS[name].shape(sizes) for name in kept}
-        exact = EXACT | PAN if pan else EXACT
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())
-        check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {targets} targets")
+        check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {sizes['T']} targets")
         self._shape_of_landmarks = shapes.pop("landmarks")[1:]
         shapes["due"] = (ticks, len(vehicles))
         dtypes: dict[str, Any] = {"b": np.bool_, "i": np.int64, "f": np.float64}
         # zeros take no memory before they are written to
         self._arrays = {name: np.zeros(shape, dtypes[ARRAYS[name].kind]) for name, shape in shapes.items()}
-        self._ticks, self._targets = ticks, targets
+        self._ticks, self._targets = ticks, sizes["T"]
         self._landmarks: dict[int, np.ndarray] = {}
+        exact = exact_topics(pan)
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in exact}
+        self.kinds = {LANDMARKS: LANDMARKS_TYPE} | {name: exact[field] for name, (field, _) in self._places.items()}
+        """Topic to the type of its messages."""
         self._columns = {
             name: [(part, self._arrays[array][:, i]) for part, array in CONTENTS[field].items()]
             for name, (field, i) in self._places.items()
@@ -129,14 +130,10 @@ def read_recording(path: str | Path) -> Recording:
 def _read(container: Container, where: str) -> Recording:
     header = _header(container, where)
     constants = header.constants(f"{where}: {ATTACHMENT}")
-    names = [setup.name for setup in header.setups]
-    scenario, first = constants["scenario"], header.setups[0]
-    pan = scenario is not None and scenario.action.pan is not None
-    exact = EXACT | PAN if pan else EXACT
-    ticks = TickArrays(header.ticks, names, len(first.target_names), first.landmarks, pan)
-    kinds = {LANDMARKS: LANDMARKS_TYPE} | {topic(name, field): exact[field] for name in names for field in exact}
+    scenario = constants["scenario"]
+    ticks = TickArrays(header, pan=scenario is not None and scenario.action.pan is not None)
     for channel, schema, message in container.messages():
-        kind = kinds.get(channel.topic)
+        kind = ticks.kinds.get(channel.topic)
         if kind is None:
             continue
         try:

@@ -13,15 +13,14 @@ from scipy.spatial.transform import Rotation
 from coopenv.backends.mcap.format import (
     ATTACHMENT,
     CONTENTS,
-    EXACT,
     FORMAT,
     LANDMARKS,
     LANDMARKS_TYPE,
-    PAN,
     SHOWN,
     LogClock,
     View,
     codec,
+    exact_topics,
     header_of,
     ros_definition,
     topic,
@@ -67,7 +66,7 @@ class _Log:
         from mcap.writer import Writer
 
         self.recording, self.clock, self.codec = recording, clock, codec()
-        self.exact = EXACT if recording.pan is None else EXACT | PAN
+        self.exact = exact_topics(recording.pan is not None)
         self.types = {name.removeprefix("geometry_msgs/msg/"): kind for name, kind in self.codec.types.items()}
         self.writer = Writer(stream)
         self.writer.start(profile="ros2", library=f"coopenv {version()}")

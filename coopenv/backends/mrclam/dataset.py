@@ -231,29 +231,23 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
     origin, end = min(starts), max(float(odometry.values[-1, 0]) for _, odometry, _ in tables)
     robots = tuple(_robot(name, robot, origin, known, *tables[i]) for i, robot in enumerate(ROBOTS))
     dataset = Dataset(name, end - origin, landmarks, robots)
-    if remarks := [*_remarks_on(dataset), *_repairs_of([table for three in tables for table in three])]:
+    if remarks := _remarks_on(dataset, [table for three in tables for table in three]):
         warnings.warn(DataWarning(f"{name}: {'; '.join(remarks)}"), stacklevel=2)
     return dataset
 
 
-def _remarks_on(dataset: Dataset) -> list[str]:
-    """Return which robots saw nothing and how many detections were left out."""
-    skipped, used = (
-        sum(counts) for counts in zip(*((r.skipped, len(r.detections)) for r in dataset.robots), strict=True)
-    )
+def _remarks_on(dataset: Dataset, tables: list[Table]) -> list[str]:
+    """Return which robots saw nothing, and what of the files was left out or put in order."""
+    skipped = sum(robot.skipped for robot in dataset.robots)
+    used = sum(len(robot.detections) for robot in dataset.robots)
     blind = [str(robot.subject) for robot in dataset.robots if not len(robot.detections)]
     remarks = [f"no detections of robot {', '.join(blind)}"] if blind else []
     if skipped:
         remarks.append(f"{skipped} of {skipped + used} detections left out: no robot carries their barcode")
+    for what, count in (("rows that stood too late put in order", "late"), ("rows with NaN left out", "unknown")):
+        counts = [f"{number} of {table.path.name}" for table in tables if (number := getattr(table, count))]
+        remarks += [f"{what}: {', '.join(counts)}"] if counts else []
     return remarks
-
-
-def _repairs_of(tables: list[Table]) -> list[str]:
-    """Return what of the files' rows was put in order or left out."""
-    late = [f"{table.late} of {table.path.name}" for table in tables if table.late]
-    unknown = [f"{table.unknown} of {table.path.name}" for table in tables if table.unknown]
-    remarks = [f"rows that stood too late put in order: {', '.join(late)}"] if late else []
-    return [*remarks, f"rows with NaN left out: {', '.join(unknown)}"] if unknown else remarks
 
 
 def _barcodes(table: Table) -> dict[int, int]:
