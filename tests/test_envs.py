@@ -27,10 +27,6 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def test_ships_the_papers_scenarios() -> None:
-    assert {"crossing_path", "overtaking", "busy_intersection", "busy_intersection_mirror"} <= set(ENVS)
-
-
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_suite(name: str, check: Callable[[Make], None]) -> None:
     check(partial(coopenv.parallel_env, name, overrides={"horizon": 6.0}))

@@ -18,11 +18,6 @@ NAME = "urban_crossing"
 WORD = 2**32
 
 
-def test_no_two_seeds_of_ten_thousand_share_a_world() -> None:
-    keys = np.array([world_keys(seed, 50) for seed in range(10_000)], dtype=np.uint64)
-    assert len(np.unique(keys)) == keys.size
-
-
 @given(
     a=st.tuples(st.integers(0, WORD - 1), st.integers(0, WORD - 1)),
     b=st.tuples(st.integers(0, WORD - 1), st.integers(0, WORD - 1)),

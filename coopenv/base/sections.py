@@ -172,8 +172,8 @@ def _valid_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list
             if isinstance(part, str) and part in model.model_fields
             for inner in _models_in(model.model_fields[part].annotation)
         ]
-        tagged = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
-        models = nested or tagged or models
+        kinds = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
+        models = kinds if kinds and len(models) > 1 else nested or models  # a kind and a key may have the same name
     return sorted({name for model in models for name in model.model_fields})
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv import CoopenvError, DataError, OutputError
+from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import format, read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
@@ -189,29 +189,6 @@ def test_foreign_files(tmp_path: Path) -> None:
         read_recording(tmp_path / "nowhere.mcap")
 
 
-def test_missing_topics_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from coopenv.backends.mcap import writer
-
-    path = tmp_path / "drive.mcap"
-    send = writer._Log._send
-    for topic, keep, why in (
-        ("/vehicle_1/bearings", lambda k: False, "topic '/vehicle_1/bearings' is missing"),
-        ("/vehicle_1/v2x", lambda k: k != 3, "topic '/vehicle_1/v2x': tick 3 is missing"),
-        ("/landmarks", lambda k: False, "topic '/landmarks' is missing"),
-    ):
-
-        def lossy(
-            self: Any, name: str, kind: str, k: int, *rest: Any, t: Any = topic, q: Any = keep, **kw: Any
-        ) -> None:
-            if name != t or q(k):
-                send(self, name, kind, k, *rest, **kw)
-
-        monkeypatch.setattr(writer._Log, "_send", lossy)
-        write_recording(simulated("crossing_path", horizon=0.1), path)
-        with pytest.raises(DataError, match=why):
-            read_recording(path)
-
-
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     real = builtins.__import__
 
@@ -226,11 +203,6 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
         with pytest.raises(CoopenvError, match=r"pip install '\.\[log\]'"):
             act()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="none does not exist"):
-        write_recording(simulated(), tmp_path / "none" / "a.mcap")
 
 
 # The command

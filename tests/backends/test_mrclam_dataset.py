@@ -103,6 +103,7 @@ def test_what_is_of_no_use_is_told(tmp_path):
     table[1:, 1] = 999
     np.savetxt(path, table)
     with pytest.warns(DataWarning) as caught:
-        load_dataset("mrclam_6", folder)
+        robot = load_dataset("mrclam_6", folder).robots[1]
+    assert (robot.skipped, len(robot.detections)) == (own - 1, 1)
     said = f"{own - 1} of {seen} detections left out: no robot carries their barcode"
     assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]

@@ -150,15 +150,6 @@ def test_clocks_that_are_days_apart(folder):
     assert f"{path}:1: 86400 s apart from Robot1_Odometry.dat" in message(folder)
 
 
-def test_unknown_barcodes_are_counted_and_left_out(folder):
-    before = load_dataset("mrclam_6", folder).robots[3]
-    change(folder / "Robot4_Measurement.dat", 5, f"{ORIGIN + 1.04} 999 2.0 0.1\n")
-    with pytest.warns(DataWarning, match="1 of"):
-        after = load_dataset("mrclam_6", folder).robots[3]
-    assert after.skipped == 1
-    assert len(after.detections) == len(before.detections) - 1
-
-
 def test_rows_a_little_late_are_put_in_order(folder):
     """As in sub-dataset 9, where the second row of odometry stands .1 s before the first."""
     before = load_dataset("mrclam_6", folder).robots[1]

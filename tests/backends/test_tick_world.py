@@ -89,10 +89,13 @@ def test_a_recording_of_a_recording_is_the_recording() -> None:
 
 
 def test_commands_and_their_rows() -> None:
-    rows = np.arange(6.0).reshape(2, 3)
-    command = Command.of(rows)
-    assert command.speed.tolist() == [0, 3] and command.steering.tolist() == [1, 4]
-    assert command.acceleration.tolist() == [2, 5] and np.array_equal(command.rows, np.insert(rows, 3, 0.0, axis=1))
+    rows = np.arange(8.0).reshape(2, 4)
+    for command in (Command.of(rows), Command.of(rows[:, :3])):
+        assert command.speed.tolist() == [0, 4] and command.steering.tolist() == [1, 5]
+        assert command.acceleration.tolist() == [2, 6]
+        pan = [0, 0] if command.pan is None else command.pan
+        assert np.array_equal(command.rows, np.column_stack([rows[:, :3], pan]))
+    assert np.array_equal(Command.of(rows).rows, rows)
 
 
 def test_it_is_one_world_on_the_cpu() -> None:

@@ -186,16 +186,12 @@ def test_overrides(file: Path, key: str, value: Any, where: str, expected: Any) 
     assert get(load_scenario(file, {key: value}), where) == expected
 
 
-def test_star_means_every_entry(file: Path) -> None:
-    made = load_scenario(file, {"vehicles.*.goal.radius": 0.9, "vehicles.*.initial_estimate.position_radius": 0.0})
-    assert [v.goal.radius for v in made.vehicles if v.goal] == [0.9, 0.9]
+def test_star_means_every_entry_and_later_overrides_win(file: Path) -> None:
+    every = {"vehicles.*.goal.radius": 0.9, "vehicles.*.initial_estimate.position_radius": 0.0}
+    made = load_scenario(file, {**every, "vehicles.1.goal.radius": 1.1})
+    assert [v.goal.radius for v in made.vehicles if v.goal] == [0.9, 1.1]
     assert [v.initial_estimate.position_radius for v in made.vehicles] == [0.0, 0.0]
     assert [v.body.size[0] for v in made.vehicles if v.body] == [1.0, 2.0]
-
-
-def test_later_overrides_win(file: Path) -> None:
-    made = load_scenario(file, {"vehicles.*.goal.radius": 0.9, "vehicles.1.goal.radius": 1.1})
-    assert [v.goal.radius for v in made.vehicles if v.goal] == [0.9, 1.1]
 
 
 def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:

@@ -6,27 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.outcomes import Outcome
+from coopenv.scenario.routes import Boxes
 from coopenv.world import dynamics
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
+from tests.scenario.test_boxes import depth as overlap
 
 call = Calls(__name__, {dynamics.boxes_touch: "3 33 3 3 33 3 > b"})
-
-
-def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: np.ndarray, hb: np.ndarray) -> float:
-    """Return how deep two boxes have a point in common: the largest t that some point keeps to all 12 faces."""
-    rows, limits = [], []
-    for c, R, h in ((ca, Ra, ha), (cb, Rb, hb)):
-        for sign in (1.0, -1.0):
-            rows += list(sign * R.T)
-            limits += list(h + sign * (R.T @ c))
-    A = np.column_stack([np.array(rows), np.ones(12)])
-    found = linprog([0, 0, 0, -1.0], A_ub=A, b_ub=limits, bounds=[(None, None)] * 4)
-    return float(found.x[3])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -38,7 +27,7 @@ def test_upright_boxes_against_a_linear_programme(dtype: str) -> None:
     yaw[:, :200] = np.pi / 2 * rng.integers(0, 4, (2, 200))  # parallel faces
     Ra, Rb = (Rotation.from_euler("z", y[:, None]).as_matrix() for y in yaw)
     ha, hb = rng.uniform(0.05, 1.2, (2, count, 3))
-    depth = np.array([overlap(*x) for x in zip(ca, Ra, ha, cb, Rb, hb, strict=True)])
+    depth = np.array([overlap(Boxes(ca, Ra, ha), Boxes(cb, Rb, hb), n) for n in range(count)])
     touching = call(dynamics.boxes_touch, dtype, ca, Ra, ha, cb, Rb, hb)
     swapped = call(dynamics.boxes_touch, dtype, cb, Rb, hb, ca, Ra, ha)
     clear = np.abs(depth) > 1e-5

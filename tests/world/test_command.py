@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.helpers.builders import command, run, scenario, start, vehicle
+from tests.helpers.builders import command, scenario, start, vehicle
 
 MAX_STEERING = 0.6981317007977318
 
@@ -39,20 +39,6 @@ def test_or_the_acceleration_towards_a_limit() -> None:
     assert_allclose(rows[:, 2], [0.5, 1.0, 0.0])
 
 
-def test_the_action_may_use_a_part_of_the_steering() -> None:
-    assert_allclose(asked([(0.0, 1.0)], action={"steering": 0.3})[0, 1], 0.3)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_counts_as_zero(bad: float) -> None:
     assert_allclose(asked([(bad, bad)]), asked([(0.0, 0.0)]))
-
-
-def test_who_has_arrived_is_to_stand() -> None:
-    car = vehicle(motion={"kind": "driven"}, goal={"position": [0.3, 0.0, 0.0], "radius": 0.2})
-    world = start(scenario([car]))
-    command(world, (1.0, 0.0))
-    run(world, 60)
-    assert world.view("ended")[0, 0] == 1
-    world.decide()
-    assert_allclose(world.view("command")[0, 0], [0.0, 0.0, 2.0, 0.0])

@@ -335,25 +335,6 @@ def test_a_saved_world_goes_on_with_its_draws() -> None:
         assert_array_equal(value, other.get_state()[name], err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("present", 2),
-        ("parameter", np.inf),
-        ("route_count", 1),
-        ("route_drawn", 7),
-        ("difficulty", 1.5),
-        ("arrivals", -1),
-    ],
-)
-def test_draws_of_a_saved_state_are_checked(name: str, value: float) -> None:
-    world = start(scenario(), range(2))
-    state = world.get_state()
-    state[name].flat[-1] = value
-    with pytest.raises(ValueError, match=f"field '{name}'"):
-        world.set_state(state)
-
-
 def test_data_of_groups_is_kept_through_json() -> None:
     """As recordings keep a scenario: its groups do not draw their landmarks twice."""
     made = scenario([vehicle()], landmark_groups=GROUPS)

@@ -123,41 +123,21 @@ def test_truth_and_twist_agree() -> None:
         assert_allclose(np.linalg.norm(step), mean / 60, atol=1e-4)
 
 
-def test_speed_follows_a_first_order_lag() -> None:
-    states = drive(driven({"max_acceleration": 1000.0}), [(1.0, 0.0)] * 30, ticks=1)
-    t = np.arange(31) / 60
-    assert_allclose(path(states)[:, 3], 1.53 * (1 - np.exp(-t / 0.1)), atol=1e-12)
+NO_LAG = {"speed_time_constant": 0.0, "steering_time_constant": 0.0}
+NO_LIMIT = {"max_acceleration": 1e6, "max_steering_rate": 1e6}
 
 
-def test_steering_follows_a_first_order_lag_of_its_own() -> None:
-    states = drive(driven({"max_steering_rate": 1000.0}), [(-1.0, 1.0)] * 30, ticks=1)
-    t = np.arange(31) / 60
-    assert_allclose(path(states)[:, 4], DEFAULTS["max_steering"] * (1 - np.exp(-t / 0.05)), atol=1e-12)
-
-
-def test_rates_are_limited() -> None:
-    rows = path(drive(driven({"speed_time_constant": 0.0, "steering_time_constant": 0.0}), [(1.0, 1.0)] * 60, ticks=1))
+def test_lags_and_limits_of_the_actuators() -> None:
+    """Speed and steering have lags of first order, each its own, and limits of their rates; without both, neither."""
     t = np.arange(61) / 60
-    assert_allclose(rows[:, 3], np.minimum(2.0 * t, 1.53), atol=1e-12)
-    assert_allclose(rows[:, 4], np.minimum(2.0 * t, DEFAULTS["max_steering"]), atol=1e-12)
-
-
-def test_no_lag_and_no_limit_is_immediate() -> None:
-    rows = path(
-        drive(
-            driven(
-                {
-                    "speed_time_constant": 0,
-                    "steering_time_constant": 0,
-                    "max_acceleration": 1e6,
-                    "max_steering_rate": 1e6,
-                }
-            ),
-            [(0.0, -0.5)],
-            ticks=1,
-        )
-    )
-    assert_allclose(rows[1, 3:], [1.53 / 2, -0.5 * DEFAULTS["max_steering"]], atol=1e-12)
+    for actuators, speed, steering in (
+        (NO_LIMIT, 1 - np.exp(-t / 0.1), 1 - np.exp(-t / 0.05)),
+        (NO_LAG, np.minimum(2.0 * t / 1.53, 1.0), np.minimum(2.0 * t / DEFAULTS["max_steering"], 1.0)),
+        (NO_LAG | NO_LIMIT, t > 0.0, t > 0.0),
+    ):
+        rows = path(drive(driven(actuators), [(1.0, 1.0)] * 60, ticks=1))
+        assert_allclose(rows[:, 3], 1.53 * speed, atol=1e-12)
+        assert_allclose(rows[:, 4], DEFAULTS["max_steering"] * steering, atol=1e-12)
 
 
 @pytest.mark.parametrize(("reverse", "lowest"), [(False, 0.0), (True, -1.53)])
@@ -229,13 +209,7 @@ def test_a_dead_band_above_the_top_speed_is_refused() -> None:
 
 def test_gated_commands_change_as_fast_as_is_permitted() -> None:
     """Without lags, so that speed and steering are the commands: 1 m/s^2 and 2 rad/s at ten decisions a second."""
-    made = {
-        "gated": True,
-        "max_acceleration": 1.0,
-        "max_steering_rate": 2.0,
-        "speed_time_constant": 0.0,
-        "steering_time_constant": 0.0,
-    }
+    made = {"gated": True, "max_acceleration": 1.0, "max_steering_rate": 2.0, **NO_LAG}
     rows = path(drive(driven(made), [(1.0, 1.0)] * 6 + [(-1.0, -1.0)] * 6))
     decisions = np.arange(1, 7)
     assert_allclose(rows[1:7, 3], np.minimum(0.1 * decisions, 1.53), atol=1e-9)
@@ -294,6 +268,7 @@ def test_an_ended_vehicle_parks() -> None:
     assert all(s["speed"][0, 0] == 0 and (s["velocity"][0, -2] == 0).all() for s in after)
     assert all((s["odometry_velocity"][0, 0] == 0).all() for s in after[2:])
     assert states[-1]["speed"][0, 1] > 1.0
+    assert_allclose(states[-1]["command"][0, 0, [0, 2]], [0.0, 2.0])  # to stand
 
 
 def test_prescribed_and_static_vehicles_ignore_actions() -> None:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.backends.base import Command
 from coopenv.backends.mcap.reader import read_recording
 from coopenv.backends.mcap.writer import write_recording
 from coopenv.backends.replay import Replay
@@ -162,15 +161,6 @@ def test_an_action_has_three_entries_everywhere() -> None:
     rows = np.stack(list(observations.values()))
     for policy in (zero_policy(0, 3), random_policy(0, 3)):
         assert decide(policy, rows, 3).shape == (4, 3)
-
-
-def test_a_command_carries_it() -> None:
-    command = Command(np.ones(2), np.zeros(2), np.ones(2))
-    assert_array_equal(command.rows[:, 3], 0.0)
-    again = Command.of(np.arange(8.0).reshape(2, 4))
-    assert again.pan is not None
-    assert_array_equal(again.pan, [3.0, 7.0])
-    assert_array_equal(again.rows, np.arange(8.0).reshape(2, 4))
 
 
 def test_a_recording_replays_to_the_same_observations(tmp_path: Path) -> None:

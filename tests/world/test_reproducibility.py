@@ -56,13 +56,6 @@ def test_a_world_does_not_know_its_batch(dtype: str) -> None:
         assert len(np.unique(many[name].reshape(64, -1), axis=0)) == 64, name
 
 
-def test_the_same_run_twice_in_one_world() -> None:
-    world = start(noisy(), [3, 4])
-    first = played(world)
-    reset(world, [3, 4])
-    assert_same(first, played(world))
-
-
 def test_reset_leaves_nothing_of_the_last_episode() -> None:
     world = start(noisy(), [3, 4])
     fresh = world.get_state()
@@ -182,13 +175,6 @@ def test_what_cannot_be_built() -> None:
         World(noisy(), 1, "float23")
     with pytest.raises(DeviceError, match="unknown device 'gpu'"):
         World(noisy(), 1, "float32", "gpu")
-
-
-def test_a_world_that_was_reset_advances() -> None:
-    world = simulate(noisy(), 2, "float64")
-    world.reset([1, 2])
-    world.advance(3)
-    assert world.get_state()["tick"].tolist() == [3, 3]
 
 
 @pytest.mark.parametrize("dtype", WIDE)

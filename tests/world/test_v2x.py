@@ -34,25 +34,21 @@ def assert_heard(now: State, then: State, receiver: int, sender: int, sent: int)
         assert_allclose(now["inbox_position"][0, receiver, sender], estimated_position(then)[0, sender], atol=1e-13)
 
 
-@pytest.mark.parametrize("delay", [0, 1, 2, 5, 30])
-def test_delay_in_ticks(delay: int) -> None:
-    """Delay 0: the leader's estimate of this very tick; d: the one of d ticks ago; nothing before the first."""
-    states = run(start(fleet(v2x={"delay": delay})), 70)
+@pytest.mark.parametrize(
+    ("delay", "period"), [(0, 1), (1, 1), (2, 1), (5, 1), (30, 1), (0, 2), (0, 7), (3, 7), (12, 5)]
+)
+def test_delay_and_period_in_ticks(delay: int, period: int) -> None:
+    """Delay 0: the leader's estimate of this very tick; d: the one of d ticks ago; nothing before the first.
+
+    There is one message every `period` ticks, the first at the start.
+    """
+    states = run(start(fleet(v2x={"delay": delay, "period": period})), 70)
     for tick, state in enumerate(states):
-        sent = tick - delay if tick >= delay else -1
+        sent = (tick - delay) // period * period if tick >= delay else -1
         for receiver, sender in ((1, 0), (2, 0), (2, 1)):
             assert_heard(state, states[sent], receiver, sender, sent)
     assert (np.array([s["inbox_tick"][0, 0] for s in states]) == -1).all()
     assert (np.array([s["inbox_tick"][0, 1, 1:] for s in states]) == -1).all()
-
-
-@pytest.mark.parametrize(("period", "delay"), [(2, 0), (7, 0), (7, 3), (5, 12)])
-def test_period(period: int, delay: int) -> None:
-    """One message every `period` ticks, the first at the start."""
-    states = run(start(fleet(v2x={"period": period, "delay": delay})), 60)
-    for tick, state in enumerate(states):
-        sent = (tick - delay) // period * period if tick >= delay else -1
-        assert_heard(state, states[sent], 2, 1, sent)
 
 
 def test_followers_use_what_they_have_just_heard() -> None:
