@@ -221,7 +221,8 @@ class Termination(Section):
         if isinstance(given, dict):
             custom = given.get("custom")
             names = [name for name in given if name not in cls.model_fields]
-            check_known(TERMINATION_CONDITIONS, names, custom if isinstance(custom, dict) else {})
+            others = {**cls.model_fields, **(custom if isinstance(custom, dict) else {})}
+            check_known(TERMINATION_CONDITIONS, names, others)
         return given
 
     @model_validator(mode="after")

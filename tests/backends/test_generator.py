@@ -95,17 +95,6 @@ def test_it_is_driven_by_commands_in_si_units() -> None:
         assert_allclose(command.acceleration, [2.0] * 3)
 
 
-def test_accelerations_are_limits_on_the_way_to_the_highest_or_lowest_speed() -> None:
-    fleet = Fleet(action={"longitudinal": "acceleration"}, dynamics={"max_speed": MAX_SPEED, "reverse": True})
-    env = make(fleet)
-    env.reset(seed=0)
-    for action in (0.5, -0.25):
-        env.step({agent: np.array([action, 0.0]) for agent in env.agents})
-    gas, brake = fleet.commands[0], fleet.commands[TICKS]
-    assert_allclose([gas.speed[0], gas.acceleration[0]], [MAX_SPEED, 1.0])
-    assert_allclose([brake.speed[0], brake.acceleration[0]], [-MAX_SPEED, 0.5])
-
-
 def test_who_has_arrived_is_told_to_stand() -> None:
     fleet = Fleet()
     env = make(fleet)

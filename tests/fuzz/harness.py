@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from multiprocessing import get_context
@@ -17,6 +17,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+
+from coopenv import CoopenvError
+from coopenv.base.sections import TOO_DEEP
 
 HANG_S = 10.0
 """Without a word from a case."""
@@ -77,6 +80,22 @@ def _run(module: str, numbers: Sequence[int], words: Connection) -> None:
             words.send((cases.case(number), ""))
         except Exception:
             words.send(("", traceback.format_exc(limit=-6)))
+
+
+def taken(read: Callable[[], Any], use: Callable[[Any], None], most: int = 600) -> str:
+    """Return how input is taken: refused in one line of at most so many characters, or else used."""
+    try:
+        made = read()
+    except CoopenvError as error:
+        message = str(error)
+        assert message.isprintable() and len(message) <= 600, message
+        assert len(message) <= most or "known:" in message or TOO_DEEP in message, message
+        return "refused"
+    try:
+        use(made)
+    except CoopenvError as error:
+        return "failed: " + str(error)[:60]
+    return "accepted"
 
 
 def go_through(env: Any, steps: int = 10**6, seed: int | None = None) -> None:

@@ -1,13 +1,16 @@
-"""Functions that are handed records by reference: they do what plain ones do, and get no copies."""
+"""Functions that are handed records by reference, and Warp's private interface, which is used in one file."""
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
+import coopenv
 from coopenv.world import launch
 from coopenv.world.warp_internals import device_function
 
@@ -91,3 +94,29 @@ def test_the_threshold_of_inlining_replaces_that_of_warp(monkeypatch: pytest.Mon
 def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
     monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
     assert launch.compiler_options() == {}
+
+
+PRIVATE = {"_cls", "_wp_scalar_type_", "native_func", "hooks", "adj", "runtime"}
+PACKAGE = Path(coopenv.__file__).parent
+OWN = PACKAGE / "world" / "warp_internals.py"
+
+
+def private_uses(path: Path) -> list[int]:
+    """Return the lines of a file in which private names of Warp stand, as attributes, texts or imports."""
+    uses = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if (
+            (isinstance(node, ast.Attribute) and (node.attr in PRIVATE or (node.attr == "_src")))
+            or (isinstance(node, ast.Attribute) and node.attr == "__class__" and isinstance(node.ctx, ast.Store))
+            or (isinstance(node, ast.Constant) and node.value == "_wp_scalar_type_")
+            or (isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp._"))
+            or (isinstance(node, ast.Import) and any(alias.name.startswith("warp._") for alias in node.names))
+        ):
+            uses.append(node.lineno)
+    return uses
+
+
+def test_no_other_file_uses_the_private_interface_of_warp() -> None:
+    assert private_uses(OWN)
+    found = {str(path): lines for path in PACKAGE.rglob("*.py") if path != OWN and (lines := private_uses(path))}
+    assert found == {}
