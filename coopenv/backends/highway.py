@@ -155,12 +155,9 @@ def most_of_actions(scenario: Scenario) -> tuple[float, float]:
 
 def _like(value: Any, default: Any) -> bool:
     """Return whether a value is of the kind of highway-env's default; where that is None anything may be meant."""
-    if default is None:
-        return True
-    if isinstance(default, bool) or isinstance(value, bool):
-        return isinstance(default, bool) and isinstance(value, bool)
-    kinds = (int | float, str, list | tuple)
-    return any(isinstance(value, kind) and isinstance(default, kind) for kind in kinds)
+    kinds = (bool, int | float, str, list | tuple)
+    given, expected = (next((kind for kind in kinds if isinstance(x, kind)), type(x)) for x in (value, default))
+    return default is None or given == expected
 
 
 HEIGHT = 1.5  # m, of the traffic's boxes: highway-env is flat

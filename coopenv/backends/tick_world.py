@@ -159,7 +159,7 @@ class TickWorld(SensingWorld):
         arrays: dict[str, Any] = {name: np.array(getattr(tick, name), dtype=float) for name in MEASURED}
         arrays["visible"] = tick.visible.copy()
         arrays.update({name: _or_zeros(getattr(tick, name), N) for name in ("odometry_age", "bearing_age")})
-        missing = _or_zeros(tick.missing, N).astype(bool)
+        missing, late = (_or_zeros(flags, N).astype(bool) for flags in (tick.missing, tick.late))
         for i in np.flatnonzero(missing):
             turn, step = last.angular_velocity[i] * tick.dt, last.velocity[i] * tick.dt
             arrays["rotation"][i], arrays["translation"][i] = exp_so3(turn), exp_translation(turn, step)
@@ -173,7 +173,7 @@ class TickWorld(SensingWorld):
         for values in arrays.values():
             values.setflags(write=False)
         due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
-        return replace(tick, **arrays, missing=missing, late=_or_zeros(tick.late, N).astype(bool), due=due)
+        return replace(tick, **arrays, missing=missing, late=late, due=due)
 
     def _receive(self) -> None:
         """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""

@@ -137,12 +137,9 @@ def writing(path: str | Path) -> Iterator[None]:
     """Turn the system's refusal to write `path` into an `OutputError`."""
     try:
         yield
-    except FileExistsError:  # where a folder is to be made
-        raise OutputError(f"cannot write to {path}: it is not a folder") from None
-    except NotADirectoryError:
-        raise OutputError(f"cannot write to {path}: a part of its path is not a folder") from None
     except OSError as error:
-        raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
+        of_folders = {FileExistsError: "it is not a folder", NotADirectoryError: "a part of its path is not a folder"}
+        raise OutputError(f"cannot write to {path}: {of_folders.get(type(error), error.strerror or error)}") from None
 
 
 @contextmanager

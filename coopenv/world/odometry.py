@@ -126,17 +126,11 @@ def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, 
 def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: wp.float64):
     """Return the true (v, omega) at the tick's sample number `taken`, which is due at time t."""
     agent = model.landmarks + vehicle
-    v = state.velocity[world, agent]
-    w = state.angular_velocity[world, agent]
     if model.motion.kind[agent] == DRIVEN:
-        v = state.sampled_velocity[world, vehicle, taken]
-        w = state.sampled_angular_velocity[world, vehicle, taken]
-    else:
-        pace = state.pace[world, agent]
-        segment = segment_at(model, agent, t * wp.float64(pace))
-        v = model.motion.linear[segment] * pace
-        w = model.motion.angular[segment] * pace
-    return v, w
+        return state.sampled_velocity[world, vehicle, taken], state.sampled_angular_velocity[world, vehicle, taken]
+    pace = state.pace[world, agent]
+    segment = segment_at(model, agent, t * wp.float64(pace))
+    return model.motion.linear[segment] * pace, model.motion.angular[segment] * pace
 
 
 @wp.func

@@ -132,21 +132,18 @@ def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
 
 
 @wp.func
-def gaussian_vectors(a: vec4u, b: vec4u, zero: Any):
-    """Return two vectors of three independent standard normal numbers each, in the type of `zero`."""
+def six_gaussians(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32, zero: Any):
+    """Return two vectors of three independent standard normal numbers each, in the type of `zero`.
+
+    They are drawn from a stream and the next one.
+    """
     one = zero.dtype(1.0)
+    a = random_words(seed, episode, index, subject, stream)
+    b = random_words(seed, episode, index, subject, stream + wp.uint32(1))
     x1, y1 = gaussian_pair(a[0], a[1], one)
     z1, x2 = gaussian_pair(a[2], a[3], one)
     y2, z2 = gaussian_pair(b[0], b[1], one)
     return type(zero)(x1, y1, z1), type(zero)(x2, y2, z2)
-
-
-@wp.func
-def six_gaussians(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32, zero: Any):
-    """Return two vectors of three standard normal numbers each, drawn from a stream and the next one."""
-    first = random_words(seed, episode, index, subject, stream)
-    second = random_words(seed, episode, index, subject, stream + wp.uint32(1))
-    return gaussian_vectors(first, second, zero)
 
 
 @wp.func

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from coopenv.backends.mcap.format import (
     topic,
 )
 from coopenv.base.errors import CoopenvError, DataError, check_memory, shown
+from coopenv.observers.contract import Setup
 from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording, sizes_of
 
 if TYPE_CHECKING:
@@ -30,10 +32,9 @@ if TYPE_CHECKING:
 class TickArrays:
     """The arrays of a recording while its messages come in; `pan`: whether cameras turn."""
 
-    def __init__(self, header: Header, pan: bool) -> None:
+    def __init__(self, ticks: int, setups: Sequence[Setup], pan: bool) -> None:
         """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
-        vehicles, ticks = [setup.name for setup in header.setups], header.ticks
-        sizes = {"K": ticks, **sizes_of(header.setups)}
+        vehicles, sizes = [setup.name for setup in setups], {"K": ticks, **sizes_of(setups)}
         kept = [n for n, spec in ARRAYS.items() if spec.recorded and spec.axes[0] == "K" and (n != "pan" or pan)]
         shapes = {name: ARRAYS[name].shape(sizes) for name in kept}
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())
@@ -131,7 +132,8 @@ def _read(container: Container, where: str) -> Recording:
     header = _header(container, where)
     constants = header.constants(f"{where}: {ATTACHMENT}")
     scenario = constants["scenario"]
-    ticks = TickArrays(header, pan=scenario is not None and scenario.action.pan is not None)
+    pan = scenario is not None and scenario.action.pan is not None
+    ticks = TickArrays(header.ticks, constants["setups"], pan)
     for channel, schema, message in container.messages():
         kind = ticks.kinds.get(channel.topic)
         if kind is None:

@@ -6,7 +6,7 @@ All robots receive from all others: at tick k the last message of tick k - 1 or 
 """
 
 import math
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ def check_variant(name: str) -> Variant:
     """Return the variant of that name. Raises DataError: there is none."""
     if name not in VARIANTS:
         raise DataError(f"unknown variant {name!r}{suggest(str(name), VARIANTS)}; there are {', '.join(VARIANTS)}")
-    return cast(Variant, name)
+    return name
 
 
 def recording_of(dataset: Dataset, variant: Variant) -> Recording:
