@@ -130,7 +130,7 @@ def _pieces(route: Route) -> Pieces:
     length, heading, turn, cut = _shape(route)
     points, ahead, radius = np.array(route.waypoints), _direction(heading), route.corner_radius
     lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
-    curvature = np.sign(turn[1:]) / (radius or np.inf)
+    curvature = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
     arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
     there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
     return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
