@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from coopenv.base.errors import CoopenvError, DataError, suggest
@@ -128,14 +129,11 @@ def simulation_of(scenario: Scenario) -> Simulated:
     Raises:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
     """
-    if scenario.backend == "simulated":
-        from coopenv.backends.simulated import Simulated
+    if scenario.cosimulator is not None:
+        return resolve_name(scenario.cosimulator.backend)(scenario)
+    from coopenv.backends.simulated import Simulated
 
-        return Simulated(scenario)
-
-    from coopenv.backends.highway import HighwayBackend
-
-    return HighwayBackend(scenario)
+    return Simulated(scenario)
 
 
 def open_backend(

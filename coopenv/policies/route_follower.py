@@ -48,8 +48,7 @@ class Driver(ABC):
         driven = [vehicle.body for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
         self.length, self.width, _ = max((body.size for body in driven), default=(*SMALL, 0.0))
         self.scale = max(1.0, self.length / SMALL[0])
-        # The reference point of highway-env's cars is midway between axles that stand at their ends, not the rear one.
-        self.midway = scenario.backend == "highway"
+        self.midway = scenario.cosimulator is not None and scenario.cosimulator.reference_midway
         self.wheelbase = self.length if self.midway else scenario.dynamics.wheelbase
         self._distances = scenario.observation.route_step * MULTIPLES
         self._memory = np.zeros((self.remembers, 0), dtype=int)

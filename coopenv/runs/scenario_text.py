@@ -181,8 +181,8 @@ def graded(scenario: Scenario) -> Iterator[str]:
 
 def drawn(s: Scenario) -> Iterator[str]:
     """Yield one line per thing that every world draws for itself at every reset."""
-    if s.highway is not None:
-        yield f"roads and traffic, by highway-env's `{s.highway.id}`"
+    if s.cosimulator is not None:
+        yield f"roads and traffic, by {s.cosimulator.roads}"
     several = [name for name, v in zip(s.vehicle_names, s.vehicles, strict=True) if len(v.routes) > 1]
     if several:
         yield f"one of its routes, for {listed(several)}"

@@ -102,7 +102,7 @@ def _vehicles(scenario: Scenario) -> str:
     fastest = [own.max_speed for own, vehicle in pairs if vehicle.motion.kind == "driven"]
     others = len(scenario.vehicles) - len(fastest)
     goals = sum(vehicle.goal_radius > 0 for vehicle in scenario.vehicles)
-    kind = "in traffic" if scenario.highway else "prescribed" if fastest else "with prescribed motion"
+    kind = "in traffic" if scenario.cosimulator else "prescribed" if fastest else "with prescribed motion"
     driven = fastest and f"{len(fastest)} driven by actions, up to {_span(fastest)} m/s"
     return _joined("; ", driven, others and f"{others} {kind}", goals and f"{goals} with a goal")
 

@@ -5,7 +5,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -33,8 +33,31 @@ SAME_PLACE = 1e-6  # m
 Setting = bool | int | Number | Word | tuple[Number, ...] | None
 
 
-class Highway(Section):
+class Cosimulator(Section):
+    """Section of a program that moves the vehicles. A subclass is a field of `Scenario`, named as in `backend`."""
+
+    title: ClassVar[str]
+    """Name of the program."""
+    backend: ClassVar[str]
+    """Its backend, `module:class`, made from the scenario."""
+    reference_midway: ClassVar[bool] = False
+    """Whether its vehicles' reference point is midway between the axles instead of the rear one."""
+
+    most_vehicles: int = Field(default=40, ge=0, le=1000)
+    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+
+    @property
+    def roads(self) -> str:
+        """What roads and traffic are made of, in words."""
+        return self.title
+
+
+class Highway(Cosimulator):
     """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
+
+    title = "highway-env"
+    backend = "coopenv.backends.highway:HighwayBackend"
+    reference_midway = True
 
     id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
     """Its id in Gymnasium's registry, such as `intersection-v0`."""
@@ -42,8 +65,15 @@ class Highway(Section):
     """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
     dynamical: bool = False
     """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
-    most_vehicles: int = Field(default=40, ge=0, le=1000)
-    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+
+    @property
+    def roads(self) -> str:
+        """What roads and traffic are made of, in words."""
+        return f"{self.title}'s `{self.id}`"
+
+
+COSIMULATORS = ("highway",)
+"""Fields of `Scenario` that are sections of a co-simulator, by their names in `backend`."""
 
 
 class Map(Section):
@@ -150,6 +180,11 @@ class Scenario(Section):
         return [overlaid(self.dynamics, vehicle.dynamics) for vehicle in self.vehicles]
 
     @property
+    def cosimulator(self) -> Cosimulator | None:
+        """Section of the program that moves the vehicles; None: coopenv moves them."""
+        return getattr(self, self.backend, None)
+
+    @property
     def ticks_per_decision(self) -> int:
         """Camera ticks between two decisions of the policy."""
         return round(self.rates.camera / self.rates.decision)
@@ -191,29 +226,36 @@ def _twice(named: Sequence[Any]) -> list[str]:
 
 def _misplaced(s: Scenario) -> Iterator[str]:
     """Yield what does not fit to what moves the vehicles."""
-    elsewhere = s.backend == "highway"
-    if elsewhere != (s.highway is not None):
-        yield "highway: needed" if elsewhere else 'highway: only with backend = "highway"'
+    for name in COSIMULATORS:
+        if (getattr(s, name) is None) == (s.backend == name):
+            yield f"{name}: needed" if s.backend == name else f'{name}: only with backend = "{name}"'
+    elsewhere = s.cosimulator is not None
+    title = s.cosimulator.title if s.cosimulator else ""
     for i, vehicle in enumerate(s.vehicles):
         kind = vehicle.motion.kind
         if elsewhere and kind not in ("driven", "traffic"):
-            yield f"vehicles.{i}.motion.kind: '{kind}' is not known to highway-env; known: driven, traffic"
+            yield f"vehicles.{i}.motion.kind: '{kind}' is not known to {title}; known: driven, traffic"
         speed = getattr(vehicle.motion, "initial_speed", 0.0)
         drawn = {"initial_pose": vehicle.initial_pose is not None, "motion.initial_speed": speed != 0.0}
         for key in [key for key, given in drawn.items() if given] if elsewhere else ():
-            yield f"vehicles.{i}.{key}: highway-env draws it; leave this out"
+            yield f"vehicles.{i}.{key}: {title} draws it; leave this out"
         if not elsewhere and kind == "traffic":
-            yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = \"highway\""
+            yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = {' or '.join(COSIMULATORS)}"
         if not elsewhere and kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
             yield f"vehicles.{i}.initial_pose: needed, with at least a position"
     given = {"dynamics": s.dynamics, **{f"vehicles.{i}.dynamics": v.dynamics for i, v in enumerate(s.vehicles)}}
     for where, part in given.items() if elsewhere else ():
-        for name in sorted((part.model_fields_set if part else set()) - LIMITS):
-            yield f"{where}.{name}: highway-env has its own; allowed: {', '.join(sorted(LIMITS))}"
+        for name in sorted(_changed(part) - LIMITS):
+            yield f"{where}.{name}: {title} has its own; allowed: {', '.join(sorted(LIMITS))}"
     if elsewhere and s.rates.camera % 1.0:
-        yield f"rates.camera: highway-env steps a whole number of times a second, not {s.rates.camera:g}"
+        yield f"rates.camera: {title} steps a whole number of times a second, not {s.rates.camera:g}"
     if elsewhere and not s.driven:
-        yield "vehicles: highway-env needs at least one that is driven"
+        yield f"vehicles: {title} needs at least one that is driven"
+
+
+def _changed(part: Dynamics | None) -> set[str]:
+    """Return the keys that differ from their defaults; a scenario in a file of results has all of its defaults."""
+    return {name for name, field in Dynamics.model_fields.items() if part and getattr(part, name) != field.default}
 
 
 def _problems(s: Scenario) -> Iterator[str]:
@@ -234,8 +276,8 @@ def _problems(s: Scenario) -> Iterator[str]:
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
-    if s.action.pan is not None and s.highway is not None:
-        yield "action.pan: cameras of vehicles of highway-env do not turn"
+    if s.action.pan is not None and s.cosimulator is not None:
+        yield f"action.pan: cameras of vehicles of {s.cosimulator.title} do not turn"
     yield from _beyond_limits(s)
 
 

@@ -127,7 +127,7 @@ def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
         (any(camera.miss_probability > 0 for camera in scenario.cameras), _sight(Sight.MISSED, "in view, but missed")),
         (True, _mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark")),
         (moving, _mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark")),
-        (scenario.highway, Patch(facecolor=TRAFFIC, edgecolor="white", linewidth=0.8, label="other traffic")),
+        (scenario.cosimulator, Patch(facecolor=TRAFFIC, edgecolor="white", linewidth=0.8, label="other traffic")),
         (goals, _mark("o", GREY, "white", 7, "goal")),
         (goals and end.arrival, _mark("*", INK, "white", 9, "arrived")),
         (bodies and end.collision, _mark("X", "white", INK, 8, "collided")),

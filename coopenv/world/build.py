@@ -231,7 +231,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "vehicles": vehicles,
         "agents": agents,
         "obstacles": len(scenario.obstacles),
-        "traffic": scenario.highway.most_vehicles if scenario.highway else 0,
+        "traffic": scenario.cosimulator.most_vehicles if scenario.cosimulator else 0,
         "sensed": scenario.topology.mode == "sensed",
         "sensing": {"sensed": SENSED, "ideal": IDEAL, "blind": BLIND}[scenario.sensing],
         "camera_rate": rates.camera,

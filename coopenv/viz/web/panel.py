@@ -302,7 +302,7 @@ def legend_html(stage: Stage, source: Source, magnification: float) -> str:
             None,
             "its goal, at the end of its route",
         ),
-        (s.highway, "block", TRAFFIC, 1.0, "other traffic"),
+        (s.cosimulator, "block", TRAFFIC, 1.0, "other traffic"),
     ]
     svg = '<svg width="22" height="12" viewBox="0 0 22 12" style="vertical-align:middle">{}</svg>'
     rows = "".join(
