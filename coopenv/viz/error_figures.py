@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullLocator
 from scipy.stats import chi2
 
@@ -24,7 +22,8 @@ from coopenv.estimation.poses import error_rotation, roll_pitch_yaw_deg
 from coopenv.viz import style
 
 _ROW, _NARROW_ROW, _FRAME = 1.35, 0.95, 0.95  # inches
-_DASHED, _DOTTED = (0, (4, 2)), (0, (1, 1.5))
+_LAST: dict[str, Any] = {"color": style.INK, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+_TOLERATED: dict[str, Any] = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
 _LATE = 0.7  # share of the record after which errors are small, and drawn linearly
 _LEAST_LINEAR = 1e-3  # m or deg
 _MOST_DECADES = 2  # that are labelled on each side of zero
@@ -50,26 +49,45 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, wi
     events = [
         mask if mask[:ticks].mean() < _ALWAYS else np.zeros_like(mask) for mask, ticks in zip(seen, live, strict=True)
     ]
-    titles = (("position", "[m]", CONVERGED.position_m), ("orientation", "[deg]", CONVERGED.orientation_deg))
-    for components, (title, unit, tolerance), column in zip(_errors(trajectory, live), titles, axes.T, strict=True):
+    bins, tolerances = style.bins_of(inches / 2), (CONVERGED.position_m, CONVERGED.orientation_deg)
+    for components, tolerance, column in zip(_errors(trajectory, live), tolerances, axes.T, strict=True):
         for vehicle, (ax, ticks) in enumerate(zip(column, live, strict=True)):
-            style.tidy(ax)
             style.shade(ax, style.runs(trajectory.t, events[vehicle], style.MERGED_GAP))
-            style.shade_ended(ax, trajectory.t, ticks)
-            _draw(ax, trajectory.t[:ticks], components[vehicle], tolerance, style.bins_of(inches / 2))
+            _draw(ax, trajectory.t[:ticks], components[vehicle], tolerance, bins)
             if np.isfinite(converged[vehicle]):
-                ax.axvline(converged[vehicle], color=style.INK, linewidth=0.8, linestyle=_DASHED)
-            style.time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
+                ax.axvline(converged[vehicle], **_LAST)
         _share_scale(column, components, tolerance)
-        column[0].set_title(f"{title} {unit}" if narrow else f"{title} error {unit}", **style.TEXT)
-    for vehicle, ax in enumerate(axes[:, 0]):
-        name, last = style.vehicle_label(trajectory.vehicles[vehicle]), converged[vehicle]
-        ax.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=style.NORMAL + 2, color=style.INK)
+    error = "" if narrow else " error"
+    _finish(axes, trajectory, live, (f"position{error} [m]", f"orientation{error} [deg]"))
+    for ax, last in zip(axes[:, 0], converged, strict=True):
         when = f"last above {CONVERGED.position_m:g} m or {CONVERGED.orientation_deg:g} deg: {last:.1f} s"
         when = "above to the end" if np.isnan(last) else f"last above: {last:.1f} s" if narrow else when
         style.note(ax, 0.985, 0.95, when, ha="right", va="top", path_effects=style.HALO)
-    style.legend_above(figure, _marks(converged, any(map(np.any, events)), live.min() < len(trajectory.t)))
+    dot = {"color": style.INK, "linestyle": "none", "marker": "o", "markersize": _DOT}
+    axis_names = zip(style.AXES_COLOURS, ("x, roll", "y, pitch", "z, yaw"), strict=True)
+    marks = style.marks(
+        *((True, name, {"color": colour, "linewidth": style.LINE}) for colour, name in axis_names),
+        (True, "at t = 0", dot),
+        (True, f"± {CONVERGED.text}", _TOLERATED),
+        (np.isfinite(converged).any(), "last above either", _LAST),
+        (any(map(np.any, events)), "moving target detected", {"facecolor": style.SHADE}),
+        (live.min() < len(trajectory.t), "ended, parked", {"facecolor": style.ENDED}),
+    )
+    style.legend_above(figure, marks)
     return figure
+
+
+def _finish(axes: np.ndarray, trajectory: Trajectory, live: np.ndarray, titles: Sequence[str]) -> None:
+    """Finish panels (vehicle, quantity) on which everything has been drawn; `live` ticks of a vehicle count."""
+    for vehicle, row in enumerate(axes):
+        for ax in row:
+            style.tidy(ax)
+            style.shade_ended(ax, trajectory.t, live[vehicle])
+            style.time_axis(ax, trajectory.t, labelled=vehicle == len(axes) - 1)
+        name = style.vehicle_label(trajectory.vehicles[vehicle])
+        row[0].set_ylabel(name, rotation=0, ha="right", va="center", fontsize=style.NORMAL + 2, color=style.INK)
+    for ax, title in zip(axes[0], titles, strict=True):
+        ax.set_title(title, **style.TEXT)
 
 
 def _errors(trajectory: Trajectory, live: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -103,7 +121,7 @@ def unwrapped(angles: np.ndarray) -> np.ndarray:
 def _draw(ax: Axes, t: np.ndarray, components: np.ndarray, tolerance: float, bins: int) -> None:
     ax.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
     for level in (-tolerance, tolerance):
-        ax.axhline(level, color=style.GREY, linewidth=0.9, linestyle=_DOTTED)
+        ax.axhline(level, **_TOLERATED)
     for component, colour in zip(components.T, style.AXES_COLOURS, strict=True):
         first = 1 if len(t) > 1 else 0  # the error before the first correction is a dot
         style.draw_band(ax, t[first:], component[first:], bins, color=colour, linewidth=style.LINE)
@@ -128,26 +146,6 @@ def _share_scale(column: Sequence[Axes], components: Sequence[np.ndarray], toler
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "\N{MINUS SIGN}")))
 
 
-def _marks(converged: np.ndarray, shaded: bool, ended: bool) -> list[Line2D | Patch]:
-    """Return the marks of the legend that occur in the figure."""
-    ink = style.INK
-    lines = [
-        Line2D([], [], color=colour, linewidth=style.LINE, label=f"{first}, {second}")
-        for first, second, colour in zip("xyz", ("roll", "pitch", "yaw"), style.AXES_COLOURS, strict=True)
-    ]
-    marks: list[tuple[bool, Line2D | Patch]] = [
-        (True, Line2D([], [], color=ink, linestyle="none", marker="o", markersize=_DOT, label="at t = 0")),
-        (True, Line2D([], [], color=style.GREY, linestyle=_DOTTED, linewidth=0.9, label=f"± {CONVERGED.text}")),
-        (
-            bool(np.isfinite(converged).any()),
-            Line2D([], [], color=ink, linestyle=_DASHED, linewidth=0.8, label="last above either"),
-        ),
-        (shaded, Patch(facecolor=style.SHADE, label="moving target detected")),
-        (ended, Patch(facecolor=style.ENDED, label="ended, parked")),
-    ]
-    return [*lines, *(mark for occurs, mark in marks if occurs)]
-
-
 DEGREES_OF_FREEDOM = 6
 NEES_BOUNDS = (float(chi2.ppf(0.025, DEGREES_OF_FREEDOM)), float(chi2.ppf(0.975, DEGREES_OF_FREEDOM)))
 """95 % of the NEES of a consistent observer lie between these, at one instant over many runs."""
@@ -155,11 +153,8 @@ NEES_BOUNDS = (float(chi2.ppf(0.025, DEGREES_OF_FREEDOM)), float(chi2.ppf(0.975,
 _NEES_ROW, _NEES_NARROW_ROW, _NEES_FRAME = 1.3, 0.95, 1.2  # inches
 _EXPECTED: dict[str, Any] = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (4, 2))}
 _STEADY: dict[str, Any] = {"color": style.INK, "linewidth": 0.7, "linestyle": (0, (1, 1.5))}
-_SPREAD_LOOKS: tuple[dict[str, Any], dict[str, Any]] = (
-    {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4},
-    {"color": style.INK, "linestyle": "-", "linewidth": 0.8},
-)
-"""Of the standard deviation that the observer states, and of the error."""
+_CLAIMED: dict[str, Any] = {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4}
+_ERROR: dict[str, Any] = {"color": style.INK, "linestyle": "-", "linewidth": 0.8}
 _SHORT = 9.0  # inches: in narrower figures panels have no room for sentences
 _TITLES, _NARROW_TITLES = ("NEES (6 dof)", "position [m]", "orientation [deg]"), ("NEES", "[m]", "[deg]")
 _ROOM = 0.3  # of the height, for words above the curves
@@ -202,36 +197,24 @@ def consistency_figure(
         spread = np.sqrt(variance.reshape(-1, count, 2, 3).sum(axis=-1))
     live = live_ticks(trajectory.t, count, ends)
     for vehicle, (left, middle, right) in enumerate(axes):
-        ticks = live[vehicle]
-        t, part = trajectory.t[:ticks], (slice(ticks), vehicle)
+        t, part = trajectory.t[: live[vehicle]], (slice(live[vehicle]), vehicle)
         _draw_nees(left, t, trajectory.nees[part], steady_from, short)
         _draw_spread(middle, t, trajectory.position_error[part], spread[part][:, 1])
         _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(spread[part][:, 0]))
-        name = style.vehicle_label(trajectory.vehicles[vehicle])
-        left.set_ylabel(name, fontsize=style.NORMAL + 2, rotation=0, ha="right", va="center")
-        for ax in (left, middle, right):
-            style.shade_ended(ax, trajectory.t, ticks)
-            style.time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
+    _finish(axes, trajectory, live, _NARROW_TITLES if narrow else _TITLES)
     for column, room in zip(axes.T, (_ROOM, 0.0, 0.0), strict=True):
         _share_decades(column, room)
-    for ax, title in zip(axes[0], _NARROW_TITLES if narrow else _TITLES, strict=True):
-        ax.set_title(title, **style.TEXT)
     style.explain(figure, GAIN if gain else CONSISTENT)
-    ended = [Patch(facecolor=style.ENDED, label="ended, parked")] if live.min() < len(trajectory.t) else []
-    style.legend_above(figure, [*_nees_marks(trajectory.t, steady_from), *ended])
+    marks = style.marks(
+        (True, "95 % of $\\chi^2_6$", {"facecolor": style.SHADE}),
+        (True, "expected", _EXPECTED),
+        (trajectory.t[0] < steady_from < trajectory.t[-1], "steady state", _STEADY),
+        (True, "error", _ERROR),
+        (True, "claimed std. deviation", _CLAIMED),
+        (live.min() < len(trajectory.t), "ended, parked", {"facecolor": style.ENDED}),
+    )
+    style.legend_above(figure, marks)
     return figure
-
-
-def _nees_marks(t: np.ndarray, steady_from: float) -> list[Patch | Line2D]:
-    claimed, error = _SPREAD_LOOKS
-    steady = [Line2D([], [], label="steady state", **_STEADY)] if t[0] < steady_from < t[-1] else []
-    return [
-        Patch(facecolor=style.SHADE, label="95 % of $\\chi^2_6$"),
-        Line2D([], [], label="expected", **_EXPECTED),
-        *steady,
-        Line2D([], [], label="error", **error),
-        Line2D([], [], label="claimed std. deviation", **claimed),
-    ]
 
 
 def _share_decades(column: Sequence[Axes], room: float) -> None:
@@ -245,7 +228,6 @@ def _share_decades(column: Sequence[Axes], room: float) -> None:
 
 
 def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> None:
-    style.tidy(ax)
     ax.axhspan(*NEES_BOUNDS, color=style.SHADE, zorder=0)
     ax.axhline(DEGREES_OF_FREEDOM, **_EXPECTED)
     ax.set_yscale("log")
@@ -275,21 +257,21 @@ def _verdict(t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -
 
 
 def _draw_spread(ax: Axes, t: np.ndarray, error: np.ndarray, spread: np.ndarray) -> None:
-    style.tidy(ax)
     ax.set_yscale("log")
     keep = style.thinned(len(t))
-    for values, look in zip((spread, error), _SPREAD_LOOKS, strict=True):
+    for values, look in ((spread, _CLAIMED), (error, _ERROR)):
         shown = style.drawable(values, positive=True)
         if not np.isnan(shown).all():
             ax.plot(t[keep], shown[keep], **look)
 
 
-_VERDICTS: dict[bool, dict[str, Any]] = {
-    True: {"facecolor": style.GREEN, "edgecolor": "none", "label": "observable"},
-    False: {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////", "label": "not observable"},
+_VERDICTS: dict[bool, tuple[str, dict[str, Any]]] = {
+    True: ("observable", {"facecolor": style.GREEN, "edgecolor": "none"}),
+    False: ("not observable", {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////"}),
 }
 _FLOOR = 1e-8  # smaller eigenvalues are drawn here: they are zero but for rounding
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)), (0, (1, 0.8)))
+_THRESHOLD: dict[str, Any] = {"color": style.INK, "linewidth": 0.9, "linestyle": _DASHES[1]}
 _GRAMIAN_FRAME, _NARROW_FRAME, _LANE = 3.6, 2.6, 0.24  # inches
 MEANING = (
     "Observable: the bearings of a window, together with odometry, determine the pose near the truth. "
@@ -309,51 +291,48 @@ def observability_figure(
     frame = _NARROW_FRAME if width is not None and width < style.NARROW else _GRAMIAN_FRAME
     figure, _ = style.canvas(width, frame + _LANE * count, "")
     local, verdict = figure.subplots(2, 1, height_ratios=(2.0, max(0.3, _LANE * count)))
-    handles = _draw_eigenvalues(local, cut)
-    low = any((part.local_eigenvalue < _FLOOR).any() for part in cut)
-    style.explain(figure, MEANING + (f" Smaller eigenvalues are drawn at {_FLOOR:g}." if low else ""))
-    local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=_DASHES[1])
-    handles.append(Line2D([], [], color=style.INK, linewidth=0.9, linestyle=_DASHES[1], label="threshold"))
+    names = [style.vehicle_label(name) for name in observability.vehicles]
+    looks: list[dict[str, Any]] = [  # with different dashes, because lines may coincide
+        {"linewidth": style.LINE, "color": style.vehicle_colour(i), "linestyle": _DASHES[i % len(_DASHES)]}
+        for i in range(count)
+    ]
+    style.tidy(local)
+    local.set_yscale("log")
+    for part, look in zip(cut, looks, strict=True):
+        if len(part.t):
+            keep = style.thinned(len(part.t))
+            local.plot(part.t[keep], np.maximum(part.local_eigenvalue[keep, 0], _FLOOR), **look)
+    local.axhline(observability.threshold, **_THRESHOLD)
     window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-]"
     local.set_ylabel(window, **style.TEXT)
     style.show_decades(local)
-    occurring = _draw_verdict(verdict, cut)
+    occurring = _draw_verdict(verdict, cut, names)
     for ax in (local, verdict):
         if len(observability.t):
             span = np.array([observability.t[0], observability.t[-1] + observability.window])
             style.time_axis(ax, span, labelled=ax is verdict)
-    style.legend_above(figure, [*handles, *occurring])
+    low = any((part.local_eigenvalue < _FLOOR).any() for part in cut)
+    style.explain(figure, MEANING + (f" Smaller eigenvalues are drawn at {_FLOOR:g}." if low else ""))
+    marks = style.marks(
+        *((True, name, look) for name, look in zip(names, looks, strict=True)),
+        (True, "threshold", _THRESHOLD),
+        *((observable in occurring, *mark) for observable, mark in _VERDICTS.items()),
+    )
+    style.legend_above(figure, marks)
     return figure
 
 
-def _draw_eigenvalues(ax: Axes, cut: list[Observability]) -> list[Line2D | Patch]:
-    """Draw one line per vehicle, with different dashes because lines may coincide; return the handles of the legend."""
-    style.tidy(ax)
-    ax.set_yscale("log")
-    drawn: list[Line2D | Patch] = []
-    for vehicle, part in enumerate(cut):
-        name = style.vehicle_label(part.vehicles[0])
-        look: dict[str, Any] = {"linewidth": style.LINE, "color": style.vehicle_colour(vehicle), "label": name}
-        look["linestyle"] = _DASHES[vehicle % len(_DASHES)]
-        drawn.append(Line2D([], [], **look))
-        if len(part.t):
-            keep = style.thinned(len(part.t))
-            values = part.local_eigenvalue[keep, 0]
-            ax.plot(part.t[keep], np.maximum(values, _FLOOR), **look)
-    return drawn
-
-
-def _draw_verdict(ax: Axes, cut: list[Observability]) -> list[Patch]:
-    """Draw the verdict of every vehicle, and return the handles of the legend."""
+def _draw_verdict(ax: Axes, cut: list[Observability], names: Sequence[str]) -> set[bool]:
+    """Draw the verdict of every vehicle, and return the verdicts that occur."""
     style.tidy(ax)
     ax.grid(False, axis="y")
     occurring = set()
     for vehicle, part in enumerate(cut):
-        for observable, look in _VERDICTS.items():
+        for observable, (_, look) in _VERDICTS.items():
             stretches = [(s, e - s) for s, e, verdict in part.intervals(0) if verdict == observable]
             if stretches:
                 occurring.add(observable)
                 ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
-    ax.set_yticks(range(len(cut)), [style.vehicle_label(part.vehicles[0]) for part in cut])
-    ax.set_ylim(len(cut) - 0.5, -0.5)
-    return [Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring]
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.5, -0.5)
+    return occurring

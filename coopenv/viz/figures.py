@@ -19,7 +19,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import fontManager
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from coopenv.base.errors import CoopenvError, suggest
@@ -34,21 +33,21 @@ from coopenv.viz.error_figures import consistency_figure, error_figure, observab
 from coopenv.viz.style import save, sign
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 
-_LOOKS: dict[Sight, dict[str, Any]] = {
-    Sight.VISIBLE: {"facecolor": house.BLUE, "edgecolor": "none", "label": "visible"},
-    Sight.OCCLUDED_BY_BODY: {
-        "facecolor": "white",
-        "edgecolor": house.VERMILION,
-        "hatch": "//////",
-        "label": "occluded by a moving body",
-    },
-    Sight.OCCLUDED_BY_BUILDING: {
-        "facecolor": "white",
-        "edgecolor": house.ORANGE,
-        "hatch": "......",
-        "label": "occluded by a building",
-    },
-    Sight.OUT_OF_VIEW: {"facecolor": house.GREY, "edgecolor": "none", "label": "out of view"},
+_LOOKS: dict[Sight, tuple[str, dict[str, Any]]] = {
+    Sight.VISIBLE: ("visible", {"facecolor": house.BLUE, "edgecolor": "none"}),
+    Sight.OCCLUDED_BY_BODY: (
+        "occluded by a moving body",
+        {"facecolor": "white", "edgecolor": house.VERMILION, "hatch": "//////"},
+    ),
+    Sight.OCCLUDED_BY_BUILDING: (
+        "occluded by a building",
+        {"facecolor": "white", "edgecolor": house.ORANGE, "hatch": "......"},
+    ),
+    Sight.OUT_OF_VIEW: ("out of view", {"facecolor": house.GREY, "edgecolor": "none"}),
+    Sight.MISSED: (
+        "a frame missed",
+        {"color": house.INK, "linestyle": "none", "marker": "|", "markersize": 3.0},
+    ),
 }
 _WORDS = {
     Sight.VISIBLE: "always visible",
@@ -58,7 +57,6 @@ _WORDS = {
     Sight.MISSED: "always missed",
 }
 _BAR = {Sight.OUT_OF_VIEW: 0.14}  # share of a row; 0.62 for the others
-_MISSED: dict[str, Any] = {"color": house.INK, "linestyle": "none", "marker": "|", "markersize": 3.0}
 _LANE, _TITLE, _FRAME = 0.19, 0.42, 0.7  # inches
 _EMPTY = 0.1  # lanes, of a vehicle without any
 _LETTER = 0.068  # inches
@@ -78,22 +76,19 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None,
     rows = [max(_EMPTY, len(targets)) * _LANE + _TITLE for targets in lanes]
     figure, inches = house.canvas(width, _FRAME + sum(rows), "")
     axes = figure.subplots(count, 1, squeeze=False, height_ratios=[max(_EMPTY, len(lane)) for lane in lanes])[:, 0]
-    shaded = missed = False
+    shaded = False
     last = max((vehicle for vehicle, targets in enumerate(lanes) if len(targets)), default=-1)
     for vehicle, (ax, targets) in enumerate(zip(axes, lanes, strict=True)):
-        involved, some = _draw_lanes(ax, trajectory, vehicle, targets, live[vehicle])
-        shaded, missed = shaded | involved, missed | some
+        shaded |= _draw_lanes(ax, trajectory, vehicle, targets, live[vehicle])
         house.time_axis(ax, trajectory.t, labelled=vehicle == last)
         _write_title(ax, trajectory, vehicle, targets, live[vehicle], inches)
     drawn = [trajectory.sight[:ticks, i][:, lanes[i]] for i, ticks in enumerate(live)]
     occurring = {kind for part in drawn for kind in np.unique(part)}
-    handles: list[Patch | Line2D] = [Patch(**look) for kind, look in _LOOKS.items() if kind in occurring]
-    if missed:
-        handles.append(Line2D([], [], label="a frame missed", **_MISSED))
-    if shaded:
-        handles.append(Patch(facecolor=house.SHADE, label="moving target involved"))
-    if live.min() < len(trajectory.t):
-        handles.append(Patch(facecolor=house.ENDED, label="ended, parked"))
+    handles = house.marks(
+        *((kind in occurring, *mark) for kind, mark in _LOOKS.items()),
+        (shaded, "moving target involved", {"facecolor": house.SHADE}),
+        (live.min() < len(trajectory.t), "ended, parked", {"facecolor": house.ENDED}),
+    )
     if handles:
         house.legend_above(figure, handles)
     return figure
@@ -105,11 +100,11 @@ def _changing(trajectory: Trajectory, vehicle: int, ticks: int) -> np.ndarray:
     return np.flatnonzero(np.any(sight != Sight.NOT_A_NEIGHBOUR, axis=0) & np.any(sight != sight[:1], axis=0))
 
 
-def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int) -> tuple[bool, bool]:
-    """Draw one vehicle's lanes; return whether a moving target is ever involved, and whether a frame is missed."""
+def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int) -> bool:
+    """Draw one vehicle's lanes; return whether a moving target is ever involved."""
     if not len(targets):
         ax.axis("off")
-        return False, False
+        return False
     names, live = house.target_labels(trajectory), np.arange(len(trajectory.t)) < ticks
     sight = np.where(live[:, None], trajectory.sight[:, vehicle], Sight.NOT_A_NEIGHBOUR)
     house.tidy(ax)
@@ -118,20 +113,19 @@ def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndar
     involved = seen | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
     house.shade(ax, house.runs(trajectory.t, involved, house.MERGED_GAP))
     house.shade_ended(ax, trajectory.t, ticks)
-    missed = False
     for lane, target in enumerate(targets):
-        for kind, look in _LOOKS.items():
-            gap = house.MERGED_GAP if kind == Sight.VISIBLE else 0.0  # a frame missed does not cut a bar
-            stretches = house.runs(trajectory.t, sight[:, target] == kind, gap)
-            if stretches:
+        for kind, (_, look) in _LOOKS.items():
+            at = sight[:, target] == kind
+            if kind == Sight.MISSED:
+                ax.plot(trajectory.t[at], np.full(at.sum(), lane - 0.42), **look)
+            elif at.any():
+                gap = house.MERGED_GAP if kind == Sight.VISIBLE else 0.0  # a frame missed does not cut a bar
                 width = _BAR.get(kind, 0.62)
+                stretches = house.runs(trajectory.t, at, gap)
                 ax.broken_barh(stretches, (lane - width / 2, width), linewidth=0.4, **look)
-        lost = trajectory.t[sight[:, target] == Sight.MISSED]
-        missed |= len(lost) > 0
-        ax.plot(lost, np.full(len(lost), lane - 0.42), **_MISSED)
     ax.set_yticks(range(len(targets)), [names[target] for target in targets])
     ax.set_ylim(len(targets) - 0.5, -0.6)
-    return bool(involved.any()), missed
+    return bool(involved.any())
 
 
 def _write_title(

@@ -30,15 +30,15 @@ _ROUNDING = 1e-12  # of the largest eigenvalue: so far below zero is zero
 
 
 def semi_axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 3-sigma semi-axes of covariances (N, D, D): lengths (N, D), ascending, and axes (N, D, D).
+    """Return the 3-sigma semi-axes of covariances (..., D, D): lengths (..., D), ascending, and axes (..., D, D).
 
     Axes are rotation matrices. Lengths are NaN where a matrix is not finite, or has a negative eigenvalue.
     """
     finite = np.isfinite(covariance).all(axis=(-1, -2))
-    variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
-    axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
-    valid = finite & (variance[:, 0] >= -_ROUNDING * variance[:, -1])
-    return np.where(valid[:, None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan), axes
+    variance, axes = np.linalg.eigh(np.where(finite[..., None, None], covariance, 0.0))
+    axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
+    valid = finite & (variance[..., 0] >= -_ROUNDING * variance[..., -1])
+    return np.where(valid[..., None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan), axes
 
 
 class FrameSource(Protocol):

@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
@@ -240,6 +242,21 @@ def canvas(width: float | None, height: float, note: str) -> tuple[Figure, float
 def fitting(width: float, each: float, most: int) -> int:
     """Return how many panels of a width stand side by side."""
     return max(1, min(most, int(width / each)))
+
+
+def marks(*entries: tuple[object, str, Mapping[str, Any]]) -> list[Line2D | Patch]:
+    """Return handles of a legend for entries (whether it occurs, label, look): a patch where the look has a face."""
+    return [
+        Patch(label=label, **look) if "facecolor" in look else Line2D([], [], label=label, **look)
+        for occurs, label, look in entries
+        if occurs
+    ]
+
+
+def mark_look(marker: str, edge: str, face: str, size: float = 6.0, rim: float = 1.0) -> dict[str, Any]:
+    """Return how a mark of a point looks, as a line without a stroke; sizes in pt."""
+    look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
+    return {"linestyle": "none", "markersize": size, "markeredgewidth": rim, **look}
 
 
 def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:

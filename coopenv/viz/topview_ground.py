@@ -11,16 +11,29 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
+from coopenv.viz import style
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, road_corners, ways
-from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, place_names, vehicle_colour
+from coopenv.viz.style import (
+    DARK_BLUE,
+    DPI,
+    GREY,
+    INK,
+    NORMAL,
+    SMALL,
+    legend,
+    mark_look,
+    new_figure,
+    place_names,
+    vehicle_colour,
+)
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
 LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
@@ -32,6 +45,7 @@ ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px
 MOST_ROWS = 16
 SWATCH = 8  # px
+_RIM = 0.9  # pt, of marks
 LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
 GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
@@ -114,39 +128,29 @@ def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
     honest = states_covariance(scenario.observer.name)
     way = ", and its way" if np.any(ways(scenario)) else ""
-    marks: list[tuple[object, Artist]] = [
-        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true" + way)),
-        (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
-        (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DASH_DOTTED, label="error of the estimate")),
-        (honest, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=f"3σ, where below {largest:.2g} m")),
-        (not honest, _mark("$-$", INK, INK, 5, "no 3σ: P is a gain matrix")),
-        (stage.sees_a_part, Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
-        (True, _sight(Sight.VISIBLE, "sees (its colour)")),
-        (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),
-        (sensed, _sight(Sight.OCCLUDED_BY_BODY, "hidden by a body")),
-        (any(camera.miss_probability > 0 for camera in scenario.cameras), _sight(Sight.MISSED, "in view, but missed")),
-        (True, _mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark")),
-        (moving, _mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark")),
-        (scenario.cosimulator, Patch(facecolor=TRAFFIC, edgecolor="white", linewidth=0.8, label="other traffic")),
-        (goals, _mark("o", GREY, "white", 7, "goal")),
-        (goals and end.arrival, _mark("*", INK, "white", 9, "arrived")),
-        (bodies and end.collision, _mark("X", "white", INK, 8, "collided")),
-        (True, _mark(">", GREY, "white", 6, "estimate outside")),
-    ]
-    handles = [handle for occurs, handle in marks if occurs]
+    shown: dict[Sight, dict[str, Any]] = {kind: {"color": GREY, **look} for kind, look in SIGHT_LOOKS.items()}
+    marks = style.marks(
+        (True, "vehicle, true" + way, {"facecolor": GREY, "edgecolor": INK, "linewidth": 0.7}),
+        (True, "its estimate", {"facecolor": "white", "edgecolor": GREY, "linewidth": 1.4}),
+        (True, "error of the estimate", {"color": GREY, "linewidth": 1.0, "linestyle": DASH_DOTTED}),
+        (honest, f"3σ, where below {largest:.2g} m", {"facecolor": "#7F7F7F30", "edgecolor": GREY, "linewidth": 0.8}),
+        (not honest, "no 3σ: P is a gain matrix", mark_look("$-$", INK, INK, 5, _RIM)),
+        (stage.sees_a_part, "field of view", {"facecolor": "#7F7F7F24", "edgecolor": "none"}),
+        (True, "sees (its colour)", shown[Sight.VISIBLE]),
+        (sensed and scenario.obstacles, "hidden by a building", shown[Sight.OCCLUDED_BY_BUILDING]),
+        (sensed, "hidden by a body", shown[Sight.OCCLUDED_BY_BODY]),
+        (any(camera.miss_probability > 0 for camera in scenario.cameras), "in view, but missed", shown[Sight.MISSED]),
+        (True, "landmark", mark_look("o", DARK_BLUE, DARK_BLUE, 5, _RIM)),
+        (moving, "moving landmark", mark_look("D", DARK_BLUE, DARK_BLUE, 4.5, _RIM)),
+        (scenario.cosimulator, "other traffic", {"facecolor": TRAFFIC, "edgecolor": "white", "linewidth": 0.8}),
+        (goals, "goal", mark_look("o", GREY, "white", 7, _RIM)),
+        (goals and end.arrival, "arrived", mark_look("*", INK, "white", 9, _RIM)),
+        (bodies and end.collision, "collided", mark_look("X", "white", INK, 8, _RIM)),
+        (True, "estimate outside", mark_look(">", GREY, "white", 6, _RIM)),
+    )
     place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
     gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
-    legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
-
-
-def _sight(sight: Sight, label: str) -> Line2D:
-    return Line2D([], [], label=label, **{"color": GREY, **SIGHT_LOOKS[sight]})  # type: ignore[arg-type]
-
-
-def _mark(marker: str, edge: str, face: str, size: float, label: str) -> Line2D:
-    mark = Line2D([], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.9, label=label)
-    mark.set(markeredgecolor=edge, markerfacecolor=face)
-    return mark
+    legend(figure, marks, "upper left", place, labelcolor=INK, **gaps)
 
 
 class Layers:
@@ -168,7 +172,7 @@ class Layers:
 
     def points(self, marker: str, face: str, edge: str, size: float) -> Any:
         """Add points, in axes coordinates; `size` in pt."""
-        return self.keep(self._axes.add_line(_mark(marker, edge, face, size, "")))
+        return self.keep(self._axes.add_line(Line2D([], [], **mark_look(marker, edge, face, size, _RIM))))
 
     def keep(self, artist: Any) -> Any:
         """Add an artist that is already in the figure."""

@@ -79,7 +79,7 @@ class Drawing:
     def mark(self, point: np.ndarray, marker: str, edge: str, face: str | None = None) -> None:
         """Mark a point (3,); the face has the colour of the edge unless another one is given."""
         point = point[: self.dimensions]
-        self.ax.plot(*point[:, None], clip_on=False, zorder=4, **marker_look(marker, edge, face or edge))
+        self.ax.plot(*point[:, None], clip_on=False, zorder=4, **style.mark_look(marker, edge, face or edge))
         self._marks.append(point)
 
     def stem(self, point: np.ndarray, **look: Any) -> None:
@@ -93,7 +93,8 @@ class Drawing:
         self._names.append((text, point[: self.dimensions], colour))
 
     def write_names(self) -> None:
-        """Write the names; the limits of the axes must be final."""
+        """Arrange the figure, and write the names; the limits of the axes must be final."""
+        self.ax.figure.draw_without_rendering()
         self.ax.apply_aspect()
         if not self._names:
             return
@@ -112,12 +113,6 @@ class Drawing:
             return points
         x, y, _ = proj3d.proj_transform(*points.T, self.ax.get_proj())
         return np.stack([x, y], axis=-1)
-
-
-def marker_look(marker: str, edge: str, face: str) -> dict[str, Any]:
-    """Return how a mark of a point looks."""
-    look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
-    return {"linestyle": "none", "markersize": 6.0, "markeredgewidth": 1.0, **look}
 
 
 def trajectory_figure_2d(
@@ -146,12 +141,15 @@ def trajectory_figure_2d(
     if scenario is not None:
         draw_site(ax, Stage(scenario))
     drawing = Drawing(ax, low, high, dimensions=2)
-    elsewhere = _elsewhere(trajectory, scenario)
-    step = _draw_paths(drawing, trajectory, ends, elsewhere)
+    handles = _draw_paths(drawing, trajectory, ends, scenario)
+    if scenario is not None:
+        handles += style.marks(
+            (scenario.roads, "road", {"facecolor": ASPHALT, "edgecolor": "none"}),
+            (scenario.obstacles, "building", {"facecolor": ROOF, "edgecolor": WALL, "hatch": "//"}),
+        )
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", adjustable="box")
-    style.legend_above(figure, _handles(trajectory, step, drawing.outside, elsewhere, scenario))
-    figure.draw_without_rendering()  # which arranges the axes, so that names find their places
+    style.legend_above(figure, handles)
     drawing.write_names()
     return figure
 
@@ -176,8 +174,7 @@ def trajectory_figure_3d(
     drawing = Drawing(ax, low, high, dimensions=3)
     if scenario is not None:
         _draw_buildings(ax, scenario, low, high)
-    elsewhere = _elsewhere(trajectory, scenario)
-    step = _draw_paths(drawing, trajectory, ends, elsewhere)
+    handles = _draw_paths(drawing, trajectory, ends, scenario)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     ax.set_box_aspect(high - low, zoom=float(np.clip((1.45 if inches > style.NARROW else 1.2) - 0.5 * steep, 0.7, 1.4)))
     ax.tick_params(labelsize=style.SMALL, pad=0)
@@ -189,10 +186,9 @@ def trajectory_figure_3d(
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.pane.set_facecolor("#F7F7F7")
     height = float(figure.get_figheight())
-    style.legend_above(figure, _handles(trajectory, step, drawing.outside, elsewhere, None))
+    style.legend_above(figure, handles)
     whole = float(figure.get_figheight())
     ax.set_position((0.0, 0.1 / whole, 1.0, (height - _LEGEND) / whole))
-    figure.draw_without_rendering()
     drawing.write_names()
     return figure
 
@@ -232,9 +228,13 @@ def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_paths(
-    drawing: Drawing, trajectory: Trajectory, ends: Sequence[float] | None, elsewhere: Sequence[str]
-) -> float:
-    """Draw landmarks, estimates, and the truth on top; return the time between the marks on it, s."""
+    drawing: Drawing, trajectory: Trajectory, ends: Sequence[float] | None, scenario: Scenario | None
+) -> list[Line2D | Patch]:
+    """Draw landmarks, estimates, and the truth on top; return what the legend explains.
+
+    A scenario's vehicles that the record is not about are estimated elsewhere.
+    """
+    elsewhere = [] if scenario is None else [n for n in scenario.vehicle_names if n not in trajectory.vehicles]
     _draw_landmarks(drawing, trajectory, elsewhere)
     live = live_ticks(trajectory.t, len(trajectory.vehicles), ends)
     settled = np.nan_to_num(settling_times(trajectory, ends, SETTLED), nan=np.inf)
@@ -256,7 +256,23 @@ def _draw_paths(
         drawing.name(truth[0], name, INK)
         if np.linalg.norm(truth[-1] - truth[0]) > _MARGIN_SHARE * np.max(drawing.high - drawing.low):
             drawing.name(truth[-1], name, INK)
-    return step
+    motions = {moving for i, moving in _landmarks(trajectory) if trajectory.targets[i] not in elsewhere}
+    names = enumerate(trajectory.vehicles)
+    return style.marks(
+        *((True, vehicle_label(name), {"color": vehicle_colour(i), "linewidth": 1.6}) for i, name in names),
+        (True, "truth", _TRUTH),
+        (True, "estimate", {"color": INK, **_ESTIMATE}),
+        (True, "before it settles", {"color": INK, **_EARLY}),
+        (True, f"every {step:g} s", style.mark_look(".", INK, INK)),
+        (True, "true start", style.mark_look("^", INK, GREY)),
+        (True, "first estimate", style.mark_look("^", GREY, GREY)),
+        (True, "true end", style.mark_look("X", INK, GREY)),
+        (True, "last estimate", style.mark_look("x", GREY, GREY)),
+        (elsewhere, "heard by radio", {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}),
+        (False in motions, "landmark", style.mark_look("o", DARK_BLUE, DARK_BLUE)),
+        (True in motions, "moving landmark", {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}),
+        (drawing.outside, "starts outside", style.mark_look("^", INK, "white")),
+    )
 
 
 def _draw_estimate(drawing: Drawing, estimate: np.ndarray, early: np.ndarray, vehicle: int) -> None:
@@ -315,37 +331,3 @@ def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
     vehicles = set(trajectory.vehicles.tolist())
     names, moving = trajectory.targets.tolist(), trajectory.target_moving.tolist()
     return [(i, moves) for i, (name, moves) in enumerate(zip(names, moving, strict=True)) if name not in vehicles]
-
-
-def _elsewhere(trajectory: Trajectory, scenario: Scenario | None) -> list[str]:
-    """Return the names of vehicles that the record is not about: they are estimated elsewhere."""
-    return [] if scenario is None else [n for n in scenario.vehicle_names if n not in trajectory.vehicles]
-
-
-def _handles(
-    trajectory: Trajectory, step: float, outside: bool, elsewhere: Sequence[str], scenario: Scenario | None
-) -> list[Line2D | Patch]:
-    """Return what the legend explains."""
-    looks: dict[str, dict[str, Any]] = {
-        vehicle_label(name): {"color": vehicle_colour(i), "linewidth": 1.6}
-        for i, name in enumerate(trajectory.vehicles)
-    }
-    looks |= {"truth": _TRUTH, "estimate": {"color": INK, **_ESTIMATE}, "before it settles": {"color": INK, **_EARLY}}
-    looks |= {f"every {step:g} s": marker_look(".", INK, INK)}
-    looks |= {"true start": marker_look("^", INK, GREY), "first estimate": marker_look("^", GREY, GREY)}
-    looks |= {"true end": marker_look("X", INK, GREY), "last estimate": marker_look("x", GREY, GREY)}
-    if elsewhere:
-        looks["heard by radio"] = {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}
-    motions = {moving for i, moving in _landmarks(trajectory) if trajectory.targets[i] not in elsewhere}
-    if False in motions:
-        looks["landmark"] = marker_look("o", DARK_BLUE, DARK_BLUE)
-    if True in motions:
-        looks["moving landmark"] = {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}
-    if outside:
-        looks["starts outside"] = marker_look("^", INK, "white")
-    handles: list[Line2D | Patch] = [Line2D([], [], label=label, **look) for label, look in looks.items()]
-    if scenario is not None and scenario.roads:
-        handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))
-    if scenario is not None and scenario.obstacles:
-        handles.append(Patch(facecolor=ROOF, edgecolor=WALL, hatch="//", label="building"))
-    return handles
