@@ -13,7 +13,7 @@ from coopenv.base.errors import CoopenvError, error_text
 from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame
-from coopenv.viz.stage import Stage, entry
+from coopenv.viz.stage import Stage, entries
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim, guarded_server
 from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
@@ -55,7 +55,6 @@ class Viewer:
         self._live = reel.real_time
         self._due = self._shown_at = self._faded_at = -np.inf
         self._middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
-        self._follow, self._alone = True, False
         self.shown = 0
         """How many frames have been sent."""
         self._show(monotonic())
@@ -106,12 +105,11 @@ class Viewer:
 
     def _show(self, now: float) -> None:
         """Send the present frame; who is slow gets the latest one only, since messages replace one another."""
-        picked = self._panel.picked
-        self._look.only = picked if self._alone else None
+        picked = self._look.picked
         with self._server.atomic():
             self._picture.show(self._frame, self.shown if self.playing else None)
             place = np.zeros(3)
-            if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
+            if picked is not None and self._look.follow and np.isfinite(self._frame.vehicle_position[picked]).all():
                 place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
             self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
             frames = self._reel.frames[max(0, self._k + 1 - LONGEST) : self._k + 1]
@@ -124,16 +122,15 @@ class Viewer:
         if now - self._faded_at < _FADE_EVERY or not self._stage.buildings:
             return
         self._faded_at = now
-        picked = self._panel.picked
+        picked = self._look.picked
         places = self._frame.vehicle_position[[picked]] if picked is not None else self._frame.vehicle_position
         root = np.array(self._picture.ground.root.position)
+        places = places[np.isfinite(places).all(axis=1)]
         eyes = [np.array(client.camera.position) - root for client in self._server.get_clients().values()]
-        hidden = {
-            i
-            for i, box in enumerate(self._stage.buildings)
-            if any(np.isfinite(entry(eye, place, box)) for eye in eyes for place in places if np.isfinite(place).all())
-        }
-        self._picture.ground.fade(hidden)
+        paths = [(eye, place - eye) for eye in eyes for place in places]
+        start, path = np.array(paths).reshape(-1, 2, 3).swapaxes(0, 1)
+        between = entries(start, path, self._stage.buildings) < 1.0
+        self._picture.ground.fade(between.any(axis=1))
 
     def _welcome(self, client: Any) -> None:
         """Start farther away in a narrow window."""
@@ -157,8 +154,6 @@ class Viewer:
             try:
                 if name.startswith("show "):
                     setattr(self._look, name.removeprefix("show "), value)
-                elif name in ("follow", "alone"):
-                    setattr(self, f"_{name}", value)
                 else:
                     getattr(self, f"_wish_{name}")(value)
             except Exception as error:  # a wish never ends the view
@@ -212,7 +207,7 @@ class Viewer:
 
     def _wish_fault(self, name: str) -> None:
         time = float(self._frame.tick) / self._reel.scenario.rates.camera
-        fault = {} if name == NO_FAULT else FAULTS[name](time, self._panel.picked or 0)
+        fault = {} if name == NO_FAULT else FAULTS[name](time, self._look.picked or 0)
         self._change("Running this episode again up to here", fault=fault)
 
     def _change(self, words: str, **changes: Any) -> None:

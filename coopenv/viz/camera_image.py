@@ -82,9 +82,8 @@ def _boxes(stage: Stage, frame: Frame, vehicle: int) -> list[tuple[Box, str, str
     """Return the boxes before a camera with the colours of their faces and edges."""
     boxes = [(box, ROOF, WALL) for box in stage.buildings]
     for box in stage.solid(frame, (stage.landmarks + vehicle,)):
-        own = box.name[1:] if box.name.startswith("f") else ""
-        colour = vehicle_colour(int(own) - 1) if own.isdigit() else TRAFFIC if box.name == "traffic" else DARK_BLUE
-        boxes.append((box, colour, "white"))
+        own = box.agent - stage.landmarks
+        boxes.append((box, vehicle_colour(own) if own >= 0 else DARK_BLUE if box.agent >= 0 else TRAFFIC, "white"))
     return [each for each in boxes if np.isfinite(each[0].center).all()]
 
 

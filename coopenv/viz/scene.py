@@ -8,8 +8,9 @@ again.
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from inspect import get_annotations
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
 
@@ -54,30 +55,33 @@ class Frame:
     """A agents (landmarks first, then N vehicles), R reward terms, P points of a route, Z bodies of other traffic.
 
     Positions are in the map frame, m; rotations map body to map. Arrays are copies. Numbers are NaN of agents that are
-    not there, and of unknown true poses.
+    not there, and of unknown true poses. An annotation is the kind of a field's numbers (i: whole), and its axes in a
+    file: F, all frames; K, all, or one for a constant field; of a frame the first axis is left out.
     """
 
-    tick: np.ndarray  # () camera ticks since the start
-    rotation: np.ndarray  # (A, 3, 3) true
-    position: np.ndarray  # (A, 3) true
-    estimate_rotation: np.ndarray  # (N, 3, 3)
-    estimate_position: np.ndarray  # (N, 3)
-    position_covariance: np.ndarray  # (N, 3, 3) m^2, of the estimate, from the observer's P to first order
-    position_error: np.ndarray  # (N,) m
-    orientation_error: np.ndarray  # (N,) deg
-    nees: np.ndarray  # (N,) normalised error squared of the pose; 6 on average where P is consistent
-    sight: np.ndarray  # (N, A) values of `Sight`
-    pan: np.ndarray  # (N,) rad, by which the camera is turned to the left
-    ended: np.ndarray  # (N,) values of `Outcome`, or conditions of the scenario's own
-    inbox_tick: np.ndarray  # (N receiver, N sender) tick of sending of the last message that arrived; -1: none
-    terms: np.ndarray  # (N, R) terms of the reward, of this tick
-    goal: np.ndarray  # (N, 3)
-    route: np.ndarray  # (N, P, 3) x, y, and arc length
-    route_count: np.ndarray  # (N,) points of the route; 0: none
-    route_drawn: np.ndarray  # (N,) number of the scenario's route that it is drawn from; -1: of none
-    traffic_rotation: np.ndarray  # (Z, 3, 3)
-    traffic_position: np.ndarray  # (Z, 3)
-    traffic_half: np.ndarray  # (Z, 3) half of the edges; zero: not there
+    tick: Annotated[np.ndarray, "i F"]  # () camera ticks since the start
+    rotation: Annotated[np.ndarray, "f K A 3 3"]  # true
+    position: Annotated[np.ndarray, "f K A 3"]  # true
+    estimate_rotation: Annotated[np.ndarray, "f K N 3 3"]
+    estimate_position: Annotated[np.ndarray, "f K N 3"]
+    position_covariance: Annotated[
+        np.ndarray, "f K N 3 3"
+    ]  # m^2, from the observer's P to first order
+    position_error: Annotated[np.ndarray, "f K N"]  # m
+    orientation_error: Annotated[np.ndarray, "f K N"]  # deg
+    nees: Annotated[np.ndarray, "f K N"]  # normalised error squared of the pose; 6 on average where P is consistent
+    sight: Annotated[np.ndarray, "i K N A"]  # values of `Sight`
+    pan: Annotated[np.ndarray, "f K N"]  # rad, by which the camera is turned to the left
+    ended: Annotated[np.ndarray, "i K N"]  # values of `Outcome`, or conditions of the scenario's own
+    inbox_tick: Annotated[np.ndarray, "i K N N"]  # (receiver, sender) sending tick of the last message; -1: none
+    terms: Annotated[np.ndarray, "f K N R"]  # terms of the reward, of this tick
+    goal: Annotated[np.ndarray, "f K N 3"]
+    route: Annotated[np.ndarray, "f K N P 3"]  # x, y, and arc length
+    route_count: Annotated[np.ndarray, "i K N"]  # points of the route; 0: none
+    route_drawn: Annotated[np.ndarray, "i K N"]  # number of the scenario's route that it is drawn from; -1: of none
+    traffic_rotation: Annotated[np.ndarray, "f K Z 3 3"]
+    traffic_position: Annotated[np.ndarray, "f K Z 3"]
+    traffic_half: Annotated[np.ndarray, "f K Z 3"]  # half of the edges; zero: not there
 
     @classmethod
     def of(cls, shown: FrameSource, world: int = 0) -> Self:
@@ -131,22 +135,8 @@ class Frame:
         return semi_axes(self.position_covariance[:, :2, :2])[0][:, -1]
 
 
-FIELDS = {
-    "tick": "i F",
-    "rotation": "f K A 3 3",
-    "position": "f K A 3",
-    **dict.fromkeys(("estimate_rotation", "position_covariance"), "f K N 3 3"),
-    **dict.fromkeys(("estimate_position", "goal"), "f K N 3"),
-    **dict.fromkeys(("position_error", "orientation_error", "nees", "pan"), "f K N"),
-    **dict.fromkeys(("ended", "route_count", "route_drawn"), "i K N"),
-    "sight": "i K N A",
-    "inbox_tick": "i K N N",
-    "terms": "f K N R",
-    "route": "f K N P 3",
-    "traffic_rotation": "f K Z 3 3",
-    **dict.fromkeys(("traffic_position", "traffic_half"), "f K Z 3"),
-}
-"""By field of a frame its kind (whole number or not) and axes; F: all frames, K: all, or one for a constant field."""
+FIELDS: dict[str, str] = {name: kind.__metadata__[0] for name, kind in get_annotations(Frame).items()}
+"""By field of a frame its kind and axes."""
 _WHOLE = frozenset(name for name, rule in FIELDS.items() if rule.startswith("i"))
 
 

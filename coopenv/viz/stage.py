@@ -93,6 +93,7 @@ class Box(NamedTuple):
     rotation: np.ndarray  # (3, 3) to map
     center: np.ndarray  # (3,) map, m
     size: Any  # (3,) m
+    agent: int = -1  # its index, landmarks first; -1: of none
 
     @property
     def faces(self) -> np.ndarray:
@@ -106,22 +107,23 @@ class Box(NamedTuple):
         return np.asarray(self.faces[-2, :, :2])
 
 
-def crossings(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> tuple[np.ndarray, np.ndarray]:
-    """Return at which shares of straight paths boxes are entered and left, (B, K) each.
-
-    A path misses a box where the first share is not below the second one.
+def entries(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> np.ndarray:
+    """Return at which shares (B, K) of straight paths boxes are entered; 0: it starts inside, infinite: it misses it.
 
     Args:
         start: (K, 3) map, m.
         path: (K, 3) from there to the ends, map, m.
-        boxes: B of them, at least one.
+        boxes: B of them.
     """
+    if not boxes:
+        return np.empty((0, len(start)))
     turn, center = np.array([box.rotation for box in boxes]), np.array([box.center for box in boxes])
     half = np.array([box.size for box in boxes], float)[:, None] / 2
     a, along = (start - center[:, None]) @ turn, path @ turn
     along = np.where(np.abs(along) < 1e-12, 1e-12, along)
     one, other = (-half - a) / along, (half - a) / along
-    return np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    return np.where((enter < leave) & (leave > 0.0), np.maximum(enter, 0.0), np.inf)
 
 
 def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, boxes: Sequence[Box]) -> np.ndarray:
@@ -129,12 +131,8 @@ def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float
 
     `reach` is one for all, or (N,) of each camera. Rays are unit vectors in the map frame.
     """
-    length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
-    if not boxes:
-        return length
-    enter, leave = crossings(np.repeat(origin, rays.shape[1], axis=0), rays.reshape(-1, 3), boxes)
-    free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf).min(axis=0)
-    return np.asarray(np.minimum(length, free.reshape(length.shape)))
+    enter = entries(np.repeat(origin, rays.shape[1], axis=0), rays.reshape(-1, 3), boxes)
+    return np.minimum(enter.min(axis=0, initial=np.inf).reshape(rays.shape[:2]), np.reshape(reach, (-1, 1)))
 
 
 def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -153,8 +151,7 @@ def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     for group in scenario.landmark_groups:
         for corner, first, second in group.parallelograms:
             around.append(np.array([corner, np.add(corner, first), np.add(corner, second)]) - origin)
-    around += [road_corners(road.start, road.end, road.width) - origin for road in scenario.roads]
-    points = np.concatenate([*around, *_paths(scenario)])
+    points = np.concatenate([*around, *roads(scenario), *_paths(scenario)])
     low, high = points.min(axis=0), points.max(axis=0)
     half = (0.5 + _MARGIN) * max(1.0, float((high - low).max()))
     return (low + high) / 2 - half, (low + high) / 2 + half
@@ -175,12 +172,15 @@ def _paths(scenario: Scenario) -> list[np.ndarray]:
     return paths
 
 
-def road_corners(start: tuple[float, float], end: tuple[float, float], width: float) -> np.ndarray:
-    """Return the corners (4, 2) of a road."""
-    a, b = np.array(start), np.array(end)
-    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-    aside = np.array([-along[1], along[0]]) * width / 2
-    return np.array([a - aside, b - aside, b + aside, a + aside])
+def roads(scenario: Scenario) -> list[np.ndarray]:
+    """Return the corners (4, 2) of each road."""
+    found = []
+    for road in scenario.roads:
+        a, b = np.array([road.start, road.end]) - np.array(scenario.map.origin)[:2]
+        along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+        aside = np.array([-along[1], along[0]]) * road.width / 2
+        found.append(np.array([a - aside, b - aside, b + aside, a + aside]))
+    return found
 
 
 def pointers(
@@ -228,8 +228,8 @@ class Stage:
         self.low, self.high = low, high
         """(2,) corners of a square in plan around all that is known beforehand."""
         self.side = float(high[0] - low[0])
-        agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-        self.marker = np.array([agent.marker for agent in agents], float)
+        self._agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+        self.marker = np.array([agent.marker for agent in self._agents], float)
         """(A, 3) the point that cameras see, body frame."""
         self.camera = np.array([camera.position for camera in scenario.cameras], float)
         """(N, 3) optical centres, body frame."""
@@ -291,16 +291,13 @@ class Stage:
     def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:
         """Return the short name of the box that hides a target from a vehicle's camera; None: no drawn box does."""
         kind = frame.sight[vehicle, target]
-        start, end = self.eyes(frame)[vehicle], self.targets(frame)[target]
-        if kind == Sight.OCCLUDED_BY_BUILDING:
-            boxes = self.buildings
-        elif kind == Sight.OCCLUDED_BY_BODY:
-            boxes = self.solid(frame, (target, self.landmarks + vehicle))
-        else:
+        if kind not in (Sight.OCCLUDED_BY_BUILDING, Sight.OCCLUDED_BY_BODY):
             return None
-        hits = [(entry(start, end, box), box.name) for box in boxes]
-        share, name = min(hits, default=(np.inf, ""))
-        return name if np.isfinite(share) else None
+        own = (target, self.landmarks + vehicle)
+        boxes = self.buildings if kind == Sight.OCCLUDED_BY_BUILDING else self.solid(frame, own)
+        start, end = self.eyes(frame)[[vehicle]], self.targets(frame)[[target]]
+        share = entries(start, end - start, boxes)[:, 0]
+        return boxes[share.argmin()].name if (share < 1.0).any() else None
 
     @cached_property
     def buildings(self) -> list[Box]:
@@ -312,19 +309,11 @@ class Stage:
 
     def solid(self, frame: Frame, without: tuple[int, ...] = ()) -> list[Box]:
         """Return the bodies that move, but for those of some agents."""
-        s = self.scenario
-        agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
         boxes = []
-        for i, agent in enumerate(agents):
-            if agent.body is not None and i not in without:
+        for i, agent in enumerate(self._agents):
+            if (body := agent.body) is not None and i not in without:
                 R = frame.rotation[i]
-                boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ agent.body.center, agent.body.size))
+                boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ body.center, body.size, i))
         there = np.flatnonzero(frame.traffic_half[:, 0] > 0.0)
         R, center, size = frame.traffic_rotation, frame.traffic_position, 2.0 * frame.traffic_half
         return boxes + [Box("traffic", R[z], center[z], size[z]) for z in there]
-
-
-def entry(start: np.ndarray, end: np.ndarray, box: Box) -> float:
-    """Return at which share of a straight path from start to end (3,) a box is entered; infinite where it is not."""
-    enter, leave = (float(share[0, 0]) for share in crossings(start[None], (end - start)[None], [box]))
-    return max(enter, 0.0) if enter < leave and leave > 0.0 and enter < 1.0 else np.inf

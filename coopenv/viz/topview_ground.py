@@ -20,7 +20,7 @@ from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz import style
 from coopenv.viz.scene import Frame
-from coopenv.viz.stage import Stage, road_corners, ways
+from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import (
     DARK_BLUE,
     DPI,
@@ -94,8 +94,8 @@ def new_ground(stage: Stage) -> tuple[Figure, Axes]:
 def draw_site(ax: Axes, stage: Stage) -> None:
     """Draw roads and buildings in plan."""
     origin = stage.origin[:2]
-    for road in stage.scenario.roads:
-        ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
+    for road, corners in zip(stage.scenario.roads, roads(stage.scenario), strict=True):
+        ax.add_patch(Polygon(corners, color=ASPHALT, zorder=0.5))
         if road.marked:
             line = np.array([road.start, road.end]) - origin
             ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)

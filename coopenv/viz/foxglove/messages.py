@@ -23,7 +23,7 @@ from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body
 from coopenv.viz.camera_image import pixels
 from coopenv.viz.scene import semi_axes
-from coopenv.viz.stage import Stage, road_corners, ways
+from coopenv.viz.stage import Stage, roads, ways
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour
 from coopenv.viz.topview_ground import ASPHALT, ROOF
 
@@ -130,8 +130,7 @@ def _world(view: RunView, k: int) -> Any:
     scenario, entities = view.recording.scenario, []
     if scenario is not None:
         stage = Stage(scenario)
-        roads = [road_corners(road.start, road.end, road.width) - stage.origin[:2] for road in scenario.roads]
-        points = [_xyz(fox.Point3, [*c, _LOW]) for corners in roads for c in corners[[0, 1, 2, 0, 2, 3]]]
+        points = [_xyz(fox.Point3, [*c, _LOW]) for corners in roads(scenario) for c in corners[[0, 1, 2, 0, 2, 3]]]
         if points:
             ground = fox.TriangleListPrimitive(pose=_pose(), points=points, color=_colour(ASPHALT))
             entities.append(_entity(view, k, "roads", triangles=[ground]))

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
-from coopenv.viz.stage import CORNERS, Stage, road_corners
+from coopenv.viz.stage import CORNERS, Stage, roads
 from coopenv.viz.style import linear_light
 from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
 
@@ -22,13 +22,17 @@ class Look:
     estimates: bool = True
     sight: bool = True
     """Lines of sight."""
-    only: int | None = None
-    """Index of the only vehicle with lines of sight; None: all vehicles have them."""
+    alone: bool = False
+    """Whether the picked vehicle alone has lines of sight."""
     views: bool = True
     """Fields of view."""
     messages: bool = True
     trails: bool = True
     names: bool = True
+    picked: int | None = None
+    """Index of the vehicle that is looked at."""
+    follow: bool = True
+    """Whether the view goes along with it."""
 
 
 def rgb(colour: str) -> np.ndarray:
@@ -151,15 +155,26 @@ class Batch:
     def put(self, places: Placed, shown: bool = True) -> None:
         """Put the copies to their places."""
         if self.handle is not None:
-            self.handle.visible = shown
-            if shown:
-                self.handle.batched_wxyzs, self.handle.batched_positions, self.handle.batched_scales = places
+            wxyzs, positions, scales = places
+            update(self.handle, shown, batched_wxyzs=wxyzs, batched_positions=positions, batched_scales=scales)
+
+
+def update(handle: Any, shown: bool, **properties: Any) -> None:
+    """Show or hide one of viser's nodes; the properties of a hidden one are not sent."""
+    handle.visible = shown
+    for name, value in properties.items() if shown else ():
+        setattr(handle, name, value)
 
 
 Coloured = tuple[np.ndarray, np.ndarray]
 """Segments (K, 2, 3), m, and their colours (K, 3) uint8."""
 NOTHING: Coloured = np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
 _GROWTH = 32  # segments by which the arrays grow
+
+
+def add_lines(scene: Any, name: str, points: np.ndarray, colours: Any, thickness: float, **look: Any) -> Any:
+    """Add a node of line segments (K, 2, 3), as many pixels thick, and return its handle."""
+    return scene.add_line_segments(name, points, colours, thickness=thickness, thickness_units="screen", **look)
 
 
 class Segments:
@@ -172,8 +187,7 @@ class Segments:
         """Begin with none; the thickness is in pixels, and ends are given in steps, m."""
         self._scene, self._name, self._step = scene, name, step
         self._handle: Any = None
-        self._look = {"thickness": thickness, "thickness_units": "screen"}
-        self._room = 0
+        self._thickness, self._room = thickness, 0
 
     def show(self, segments: Coloured) -> None:
         """Show segments; those with NaN are left out."""
@@ -191,7 +205,7 @@ class Segments:
         whole = np.concatenate([points, np.broadcast_to(points[0, 0], (rest, 2, 3))])
         shade = linear(np.concatenate([colours, np.tile(colours[:1], (rest, 1))]))[:, None].repeat(2, axis=1)
         if grown:
-            self._handle = self._scene.add_line_segments(self._name, whole, shade, **self._look)
+            self._handle = add_lines(self._scene, self._name, whole, shade, self._thickness)
         else:
             self._handle.points, self._handle.colors = whole, shade
 
@@ -254,10 +268,10 @@ class Ground:
             for i, building in enumerate(stage.buildings)
         ]
 
-    def fade(self, hidden: set[int]) -> None:
-        """Make the buildings of these indices transparent, and all other ones solid."""
-        for i, building in enumerate(self._buildings):
-            building.opacity = _FADED if i in hidden else _SOLID
+    def fade(self, hiding: np.ndarray) -> None:
+        """Make the buildings transparent that hide something, (B,) bool, and all other ones solid."""
+        for building, hides in zip(self._buildings, hiding, strict=True):
+            building.opacity = _FADED if hides else _SOLID
 
     def _add_floor(self) -> None:
         side, spacing = self._stage.side, spacing_of(self._stage.side)
@@ -270,19 +284,16 @@ class Ground:
         lines = [np.array([(x, -reach, 0.0), (x, reach, 0.0)]) for x in at]
         lines += [line[:, [1, 0, 2]] for line in lines]
         place = (*(np.round(middle / spacing) * spacing), self.z - 0.003 * side)
-        look = {"thickness": 1.0, "thickness_units": "screen", "position": place}
-        self._scene.add_line_segments(f"{ROOT}/grid", np.array(lines), linear(rgb(_GRID)), **look)
+        add_lines(self._scene, f"{ROOT}/grid", np.array(lines), linear(rgb(_GRID)), 1.0, position=place)
         edge = (float(middle[0]), float(self._stage.low[1] + 0.02 * side), self.z)
         unit = f"grid {spacing:g} m" if spacing >= 1 else f"grid {100 * spacing:g} cm"
         self._scene.add_label(f"{ROOT}/scale", unit, position=edge, font_screen_scale=0.85, anchor="top-center")
 
     def _add_roads(self) -> None:
-        side, origin = self._stage.side, self._stage.origin[:2]
+        side, origin, scenario = self._stage.side, self._stage.origin[:2], self._stage.scenario
         marks = [np.zeros((0, 2, 3))]
-        for i, road in enumerate(self._stage.scenario.roads):
-            mesh = _quad(
-                road_corners(road.start, road.end, road.width) - origin, self.z - side * (2e-3 - 1e-4 * (i % 8))
-            )
+        for i, (road, corners) in enumerate(zip(scenario.roads, roads(scenario), strict=True)):
+            mesh = _quad(corners, self.z - side * (2e-3 - 1e-4 * (i % 8)))
             self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(ASPHALT), **_FLAT)
             if road.marked:
                 start, end = (np.array([[*(p - origin), self.z - 5e-4 * side]]) for p in (road.start, road.end))
@@ -290,5 +301,4 @@ class Ground:
                 marks.append(dashes(start, end, count, 0.55))
         points = np.concatenate(marks)
         if len(points):
-            look = {"thickness": 2.0, "thickness_units": "screen"}
-            self._scene.add_line_segments(f"{ROOT}/marks", points, (255, 255, 255), **look)
+            add_lines(self._scene, f"{ROOT}/marks", points, (255, 255, 255), 2.0)

@@ -1,6 +1,6 @@
 """The panel beside the live scene: switches, numbers, plots and the legend."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from queue import SimpleQueue
@@ -23,7 +23,6 @@ LONGEST = 600
 """Frames in a plot."""
 _LEAST = 1e-4  # on a logarithmic axis
 _MOST_TERMS = 6
-_X: dict[str, Any] = {"x": {"time": False, "auto": True}}
 _LOOK: dict[str, Any] = {
     "legend": {"show": False},
     "height": 170,
@@ -37,19 +36,14 @@ class Plots:
 
     def __init__(self, gui: Any, source: Source) -> None:
         """Add them, empty."""
-        self._terms = source.terms[:_MOST_TERMS]
-        log: dict[str, Any] = {**_X, "y": {"distr": 3, "log": 10, "auto": True}}
-        start, one = np.array([0.0, 1.0]), np.ones(2)
+        named = list(zip(source.terms, VEHICLE_COLOURS[:_MOST_TERMS], strict=False))
+        self._terms = len(named)
         title = f"Position error [m]; dashed: {'3σ' if source.honest else 'P, a gain'}"
-        series = _series(("error", BLUE), ("3σ", GREY))
-        self._error = gui.add_uplot((start, one, one), series, title=title, scales=log, **_LOOK)
-        title, series = "NEES; dashed: 95 % if consistent", _series(("NEES", BLUE), ("from", GREY), ("to", GREY))
-        self._nees = gui.add_uplot((start, one, one, one), series, title=title, scales=log, **_LOOK)
-        self._reward: Any = None
-        if self._terms:
-            named = list(zip(self._terms, VEHICLE_COLOURS, strict=False))
-            data = (start, *(np.zeros(2) for _ in named))
-            self._reward = gui.add_uplot(data, _series(*named), title="Reward terms", scales=dict(_X), **_LOOK)
+        self._error = _plot(gui, title, ("error", BLUE), ("3σ", GREY))
+        title = "NEES; dashed: 95 % if consistent"
+        self._nees = _plot(gui, title, ("NEES", BLUE), ("from", GREY), ("to", GREY))
+        if named:
+            self._reward = _plot(gui, "Reward terms", *named, log=False)
             words = " &nbsp; ".join(f"{swatch(colour)} {escape(name)}" for name, colour in named)
             gui.add_html(f'<div style="font-size:12px;padding:0 14px">{words}</div>')
 
@@ -64,17 +58,22 @@ class Plots:
         )
         self._error.data = (time, _positive(error), _positive(sigma))
         self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in NEES_BOUNDS))
-        if self._reward is not None:
-            terms = np.nan_to_num([frame.terms[vehicle, : len(self._terms)] for frame in frames])
+        if self._terms:
+            terms = np.nan_to_num([frame.terms[vehicle, : self._terms] for frame in frames])
             self._reward.data = (time, *np.ascontiguousarray(terms.T))
 
 
-def _series(*named: tuple[str, str]) -> tuple[dict[str, Any], ...]:
+def _plot(gui: Any, title: str, *named: tuple[str, str], log: bool = True) -> Any:
+    """Add an empty chart of curves, given by label and colour."""
     rows: list[dict[str, Any]] = [{"label": "t [s]"}]
     for label, colour in named:
         dashes = {"dash": [5, 4]} if label in ("3σ", "from", "to") else {}
         rows.append({"label": label, "stroke": colour, "width": 2, "points": {"show": False}, **dashes})
-    return tuple(rows)
+    scales: dict[str, Any] = {"x": {"time": False, "auto": True}}
+    if log:
+        scales["y"] = {"distr": 3, "log": 10, "auto": True}
+    data = (np.array([0.0, 1.0]), *(np.full(2, float(log)) for _ in named))
+    return gui.add_uplot(data, tuple(rows), title=title, scales=scales, **_LOOK)
 
 
 def _positive(values: np.ndarray) -> np.ndarray:
@@ -85,8 +84,8 @@ def _positive(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.where(np.isfinite(filled), filled, 1.0), _LEAST, 1e6))
 
 
-SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")
-MAGNIFICATIONS = ("1", "10", "100")
+SPEEDS = {text: float(text) for text in ("0.1", "0.25", "0.5", "1", "2", "4", "8")}
+MAGNIFICATIONS = {text: float(text) for text in ("1", "10", "100")}
 _CELL = "padding:2px 5px;text-align:right"
 NONE_PICKED = "none"
 _PICK = "*Pick a vehicle above, or click on one in the scene.*"
@@ -112,50 +111,86 @@ class Abilities:
     """That can be switched on."""
 
 
+_SWITCHES = {
+    "ellipsoids": "Ellipsoids",
+    "estimates": "Estimates",
+    "sight": "Lines of sight",
+    "views": "Fields of view",
+    "messages": "V2X messages",
+    "trails": "Trails",
+    "names": "Names",
+    "alone": "Lines of the picked vehicle alone",
+    "follow": "Go along with the picked vehicle",
+}
+"""Label of each choice of a `Look`."""
+
+
 class Panel:
     """viser's panel; what the user does comes out of `wishes` as (name, value), in the thread that asks."""
 
     def __init__(self, gui: Any, stage: Stage, source: Source, look: Look, abilities: Abilities, length: float) -> None:
         """Add everything; `length` is that of the episode, s."""
         self.wishes: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-        self._stage, self._source, self._look = stage, source, look
-        self._gui, self._abilities = gui, abilities
-        self.picked: int | None = None
-        """Index of the vehicle that is looked at."""
+        self._gui, self._stage, self._source, self._look = gui, stage, source, look
         self._time_at = self._texts_at = self._plots_at = -np.inf
-        self._drawn = 0.0
         self._playing: Any = None
         self._time: Any = None
         gui.set_panel_label("coopenv")
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
         self._head = gui.add_markdown("")
         self._status = gui.add_markdown("", visible=False)
-        self._add_playback(length)
-        names = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
-        self._vehicles = gui.add_dropdown(
-            "Vehicle", (NONE_PICKED, *names), hint="Its camera, its plots; the view goes along."
-        )
-        self._on(self._vehicles, "vehicle", {NONE_PICKED: None} | {name: i for i, name in enumerate(names)})
+        if abilities.pace:
+            self._add_playback(length, abilities.seek)
+        vehicles = {NONE_PICKED: None} | {stage.short_name(stage.landmarks + i): i for i in range(stage.vehicles)}
+        self._vehicles = self._choice("Vehicle", vehicles, "Its camera, its plots; the view goes along.")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Errors"):
             self._table = gui.add_html("")
-            self._add_world()
+            if abilities.observers:
+                hint = "The episode runs again from its start to this moment, under this observer."
+                self._choice("Observer", {name: name for name in abilities.observers}, hint)
+            if abilities.faults:
+                faults = {name: name for name in (NO_FAULT, *abilities.faults)}
+                self._choice("Fault", faults, "What goes wrong from this moment on.")
         with tabs.add_tab("Vehicle"):
             self._vehicle_words = gui.add_markdown(_PICK)
             self._image = gui.add_image(np.full((2, 3, 3), 255, np.uint8), visible=False)
             self._plots = Plots(gui, source)
         with tabs.add_tab("Show"):
-            self._add_switches()
+            magnified = gui.add_button_group("Ellipsoids x", tuple(MAGNIFICATIONS))
+            initial = f"{look.magnification:g}"
+            magnified.value = initial if initial in MAGNIFICATIONS else "1"
+            self._on(magnified.on_click, "magnification", MAGNIFICATIONS)
+            for name, label in _SWITCHES.items():
+                self._on(gui.add_checkbox(label, getattr(look, name)).on_update, f"show {name}", SWITCH)
+            self._legend = gui.add_html("")
         self.set_source(source)
 
-    def _on(self, handle: Any, name: str, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
+    def _add_playback(self, length: float, seek: bool) -> None:
+        self._playing = self._gui.add_button("Pause")
+        self._playing.on_click(lambda event: self.wishes.put(("play", None)))
+        group = self._gui.add_button_group("Go", ("Step", "Restart"))
+        self._on(group.on_click, "go", {"Step": "step", "Restart": "restart"})
+        self._choice("Speed", SPEEDS, "Times real time.", initial="1")
+        if seek:
+            end = max(0.1, round(length, 2))
+            self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
+            self._on(self._time.on_update, "seek", (0.0, end))
+
+    def _choice(self, label: str, offered: Mapping[str, Any], hint: str, initial: str | None = None) -> Any:
+        """Add a control that offers values by their texts, at first the first one unless another one is given."""
+        control = self._gui.add_dropdown(label, tuple(offered), initial_value=initial, hint=hint)
+        self._on(control.on_update, label.lower(), offered)
+        return control
+
+    def _on(self, listen: Callable[[Any], Any], name: str, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
         """Turn the user's changes of a control into wishes; changes by the program are no wishes."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
                 self.wish(name, event.target.value, offered)
 
-        handle.on_update(changed)
+        listen(changed)
 
     def wish(self, name: str, given: Any, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
         """Put a wish into `wishes`, or that it is refused, because a client can send any value.
@@ -171,50 +206,6 @@ class Panel:
         else:
             meant = [meaning for value, meaning in offered.items() if value == given]
         self.wishes.put((name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered"))
-
-    def _add_playback(self, length: float) -> None:
-        if not self._abilities.pace:
-            return
-        self._playing = self._gui.add_button("Pause")
-        self._playing.on_click(lambda event: self.wishes.put(("play", None)))
-        group = self._gui.add_button_group("Go", ("Step", "Restart"))
-        group.on_click(lambda event: self.wish("go", event.target.value, {"Step": "step", "Restart": "restart"}))
-        speed = self._gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint="Times real time.")
-        self._on(speed, "speed", {text: float(text) for text in SPEEDS})
-        if self._abilities.seek:
-            end = max(0.1, round(length, 2))
-            self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
-            self._on(self._time, "seek", (0.0, end))
-
-    def _add_world(self) -> None:
-        able = self._abilities
-        if able.observers:
-            hint = "The episode runs again from its start to this moment, under this observer."
-            observer = self._gui.add_dropdown(
-                "Observer", tuple(able.observers), initial_value=able.observers[0], hint=hint
-            )
-            self._on(observer, "observer", {name: name for name in able.observers})
-        if able.faults:
-            hint = "What goes wrong from this moment on."
-            fault = self._gui.add_dropdown("Fault", (NO_FAULT, *able.faults), initial_value=NO_FAULT, hint=hint)
-            self._on(fault, "fault", {name: name for name in (NO_FAULT, *able.faults)})
-
-    def _add_switches(self) -> None:
-        gui, look = self._gui, self._look
-        initial = f"{look.magnification:g}"
-        magnified = gui.add_button_group("Ellipsoids x", MAGNIFICATIONS)
-        magnified.value = initial if initial in MAGNIFICATIONS else "1"
-        sizes = {text: float(text) for text in MAGNIFICATIONS}
-        magnified.on_click(lambda event: self.wish("magnification", event.target.value, sizes))
-        names = {"ellipsoids": "Ellipsoids", "estimates": "Estimates", "sight": "Lines of sight"}
-        names |= {"views": "Fields of view", "messages": "V2X messages", "trails": "Trails", "names": "Names"}
-        for name, label in names.items():
-            self._on(gui.add_checkbox(label, getattr(look, name)), f"show {name}", SWITCH)
-        alone = gui.add_checkbox("Lines of the picked vehicle alone", False)
-        self._on(alone, "alone", SWITCH)
-        self._follow = gui.add_checkbox("Go along with the picked vehicle", True)
-        self._on(self._follow, "follow", SWITCH)
-        self._legend = gui.add_html("")
 
     def set_source(self, source: Source) -> None:
         """Set the heading and the legend."""
@@ -240,8 +231,7 @@ class Panel:
 
     def pick(self, vehicle: int | None) -> None:
         """Look at a vehicle, or at none."""
-        self.picked = vehicle
-        stage = self._stage
+        self._look.picked, stage = vehicle, self._stage
         self._vehicles.value = NONE_PICKED if vehicle is None else stage.short_name(stage.landmarks + vehicle)
         self._image.visible = vehicle is not None
         if vehicle is None:
@@ -260,11 +250,12 @@ class Panel:
         if now - self._texts_at >= TEXTS_EVERY:
             self._texts_at = now
             self._table.content = table_html(self._stage, self._source, frame)
-        if self.picked is not None and now - self._plots_at >= PLOTS_EVERY:
+        picked = self._look.picked
+        if picked is not None and now - self._plots_at >= PLOTS_EVERY:
             self._plots_at = now
-            self._image.image = camera_image(self._stage, frame, self.picked)
-            self._vehicle_words.content = sight_words(self._stage, frame, self.picked)
-            self._plots.show(frames, self.picked, rate)
+            self._image.image = camera_image(self._stage, frame, picked)
+            self._vehicle_words.content = sight_words(self._stage, frame, picked)
+            self._plots.show(frames, picked, rate)
 
 
 _ROW = "display:flex;gap:8px;align-items:center;line-height:1.45"

@@ -8,11 +8,24 @@ import numpy as np
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.viz.scene import Frame, Source, semi_axes
-from coopenv.viz.stage import Box, Stage, crossings
+from coopenv.viz.stage import Box, Stage, entries
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web import ground
-from coopenv.viz.web.ground import NOTHING, ROOT, Batch, Coloured, Ground, Look, Segments, dashes, fine, placed, rgb
+from coopenv.viz.web.ground import (
+    NOTHING,
+    ROOT,
+    Batch,
+    Coloured,
+    Ground,
+    Look,
+    Segments,
+    dashes,
+    fine,
+    placed,
+    rgb,
+    update,
+)
 
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
@@ -112,7 +125,7 @@ def _joined(parts: list[Coloured]) -> Coloured:
 def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> Coloured:
     """Return lines of sight: solid to visible targets, dotted to missed ones, and to hidden ones up to the occluder."""
     eye, target = stage.eyes(frame), stage.targets(frame)
-    chosen = (np.arange(stage.vehicles) == look.only) | (look.only is None)
+    chosen = (np.arange(stage.vehicles) == look.picked) | (not look.alone or look.picked is None)
     parts = []
     for kind in (Sight.VISIBLE, Sight.MISSED, Sight.OCCLUDED_BY_BUILDING, Sight.OCCLUDED_BY_BODY):
         observer, seen = np.nonzero((frame.sight == kind) & chosen[:, None])
@@ -130,10 +143,8 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
 
 def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
     """Return where paths from start to end (K, 3) first enter a box in which they do not start; else their ends."""
-    if not len(start) or not boxes:
-        return np.asarray(end)
-    enter, leave = crossings(start, end - start, boxes)
-    share = np.where((enter < leave) & (enter > 1e-6) & (enter < 1.0), enter, 1.0).min(axis=0)
+    enter = entries(start, end - start, boxes)
+    share = np.where(enter > 1e-6, enter, np.inf).min(axis=0, initial=1.0)
     return np.asarray(start + share[:, None] * (end - start))
 
 
@@ -294,9 +305,7 @@ def levels(points: np.ndarray, close: float) -> np.ndarray:
 
 def _put(label: Any, place: np.ndarray, shown: bool) -> None:
     """Put a label to a place (3,), NaN: nowhere."""
-    label.visible = shown and not np.isnan(place[0])
-    if label.visible:
-        label.position = tuple(place.round(3).tolist())
+    update(label, bool(shown and not np.isnan(place[0])), position=tuple(place.round(3).tolist()))
 
 
 FIELD_OF_VIEW = 0.72
@@ -367,9 +376,7 @@ class Picture:
             ]
         there = np.isfinite(corners).all(axis=(1, 2)).tolist()
         for view, corner, shown in zip(self._views[mine], corners, there, strict=True):
-            view.visible = shown
-            if shown:
-                view.vertices = corner
+            update(view, shown, vertices=corner)
 
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:
