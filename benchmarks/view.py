@@ -15,7 +15,8 @@ from typing import NamedTuple
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.live import EngineReel
 from coopenv.runs.scenes import driver_of, open_source
-from coopenv.runs.view import Viewer, serving
+from coopenv.runs.view import Viewer
+from coopenv.viz.web.page import guarded_server
 
 WARM_UP = 2.0  # s
 RATE = 20.0  # frames/s, to which shares are scaled
@@ -78,7 +79,7 @@ def measured(name: str, observer: str | None, seconds: float, watched: bool) -> 
     opened = partial(open_source, name, observer=observer)
     reel = TimedReel(opened, name, 0, lambda scenario: driver_of(None, scenario, name, 0))
     try:
-        with serving("127.0.0.1", None) as (server, url):
+        with guarded_server("127.0.0.1") as (server, url):
             viewer = Viewer(server, reel)
             with somebody(url) if watched else nobody():
                 viewer.run(until(WARM_UP))

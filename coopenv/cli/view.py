@@ -198,8 +198,8 @@ def view(given: ViewOptions) -> None:
     """
     from coopenv.runs.console import compile_notice
     from coopenv.runs.live import vehicle_index
-    from coopenv.runs.view import Viewer, serving
-    from coopenv.viz.web.page import viser_module
+    from coopenv.runs.view import Viewer
+    from coopenv.viz.web.page import guarded_server, viser_module
 
     viser_module()
     log = options.console(stderr=True)
@@ -207,7 +207,7 @@ def view(given: ViewOptions) -> None:
         reel = given.reel()
     try:
         picked = None if given.vehicle is None else vehicle_index(reel.scenario, given.vehicle)
-        with serving(given.host, given.port) as (server, url):
+        with guarded_server(given.host, given.port) as (server, url):
             viewer = Viewer(server, reel)
             viewer.pick(picked)
             options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)

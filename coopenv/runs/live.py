@@ -200,17 +200,17 @@ def vehicle_index(scenario: Scenario, name: str | None, driven: bool = False) ->
 class Reel:
     """Frames, one after the other; those that have been are kept. Nothing can be changed in those of a kept scene."""
 
-    def __init__(self, scenario: Scenario, source: Source, length: float, coming: Iterable[Frame]) -> None:
-        """Begin with none; `length` is that of the episode, s."""
+    def __init__(
+        self, scenario: Scenario, source: Source, length: float, coming: Iterable[Frame], abilities: Abilities
+    ) -> None:
+        """Begin with none; `length` is that of the episode, s, and `abilities` are what one can do."""
         self.scenario, self.source, self.length, self._coming = scenario, source, length, iter(coming)
-        self.frames: list[Frame] = []
-        self.real_time = False
-        """Whether frames come when they come."""
+        self.frames, self.abilities = list[Frame](), abilities
 
     @classmethod
     def of(cls, record: SceneRecord) -> "Reel":
         """Return the frames of a scene that a run has kept."""
-        return cls(record.scenario, record.source, record.length, map(record.frame, range(len(record))))
+        return cls(record.scenario, record.source, record.length, map(record.frame, range(len(record))), Abilities())
 
     def more(self) -> bool:
         """Append the next frame; return False where there is none."""
@@ -218,10 +218,6 @@ class Reel:
         if frame is not None:
             self.frames.append(frame)
         return frame is not None
-
-    def abilities(self) -> Abilities:
-        """Return what one can do."""
-        return Abilities()
 
     def change(self, observer: str | None = None, fault: Mapping[str, Any] | None = None) -> None:
         """Go through the episode again from its start to the present.
@@ -275,8 +271,13 @@ class EngineReel(Reel):
         ticks = play(engine, [self._seed], scenario.horizon_ticks, policy, to_the_end=False)
         stride = max(1, round(scenario.rates.camera / MAX_FPS))
         source = source_of(engine, self._name, None if able.real_time else self._seed, driver)
-        super().__init__(scenario, source, scenario.horizon, (Frame.of(engine) for tick in ticks if tick % stride == 0))
-        self.real_time = able.real_time
+        abilities = Abilities(pace=False, seek=False)
+        if not able.real_time:
+            running = scenario.observer.name
+            others = (name for name in available_names() if name != running)
+            abilities = Abilities(observers=(running, *others), faults=() if able.recorded else tuple(FAULTS))
+        frames = (Frame.of(engine) for tick in ticks if tick % stride == 0)
+        super().__init__(scenario, source, scenario.horizon, frames, abilities)
 
     def change(self, observer: str | None = None, fault: Mapping[str, Any] | None = None) -> None:
         """Build everything anew, and run up to where it was."""
@@ -298,15 +299,6 @@ class EngineReel(Reel):
     def close(self) -> None:
         """Close the engine."""
         self.engine.close()
-
-    def abilities(self) -> Abilities:
-        """Return what one can do."""
-        if self.real_time:
-            return Abilities(pace=False, seek=False)
-        running = self.scenario.observer.name
-        others = [name for name in available_names() if name != running]
-        simulated = not self.engine.backend.capabilities.recorded
-        return Abilities(observers=(running, *others), faults=tuple(FAULTS) if simulated else ())
 
 
 FAULTS: dict[str, Callable[[float, int], dict[str, Any]]] = {

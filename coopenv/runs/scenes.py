@@ -194,11 +194,10 @@ def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[st
 
 def pages_can_be_written(path: Path, log: Console) -> bool:
     """Return whether the extra `view` is installed; where it is not, a line says so."""
-    from coopenv.viz.web.page import has_viser
-
-    if not has_viser():
+    there = find_spec("viser") is not None
+    if not there:
         log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
-    return has_viser()
+    return there
 
 
 SUFFIXES = (".mp4", ".gif", ".webp")

@@ -1,9 +1,6 @@
 """`coopenv view`: the server and what it shows."""
 
-import errno
-import socket
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from time import monotonic, sleep
 from typing import Any
 
@@ -15,7 +12,7 @@ from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.web.ground import Look
-from coopenv.viz.web.page import aim, guarded_server
+from coopenv.viz.web.page import aim
 from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
 
@@ -43,7 +40,7 @@ class Viewer:
             useful_magnification(reel.frames[0].three_sigma, self._stage.side) if reel.source.honest else 1.0
         )
         self._look = Look(magnification=magnification)
-        self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
+        self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities, reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
         vehicles = {i: i for i in range(self._stage.vehicles)}
@@ -52,9 +49,8 @@ class Viewer:
         )
         server.on_client_connect(self._welcome)
         self._k, self._speed, self.playing = 0, 1.0, True
-        self._live = reel.real_time
+        self._live = not reel.abilities.pace
         self._due = self._shown_at = self._faded_at = -np.inf
-        self._middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
         self.shown = 0
         """How many frames have been sent."""
         self._show(monotonic())
@@ -85,7 +81,7 @@ class Viewer:
         if not self._step():
             self._live = False
             self._set_playing(False)
-            again = "; Restart shows it again" if self._reel.abilities().seek else ""
+            again = "; Restart shows it again" if self._reel.abilities.seek else ""
             self._panel.set_status(f"The episode is over{again}.")
             return False
         ticks = self._frame.tick - self._reel.frames[self._k - 1].tick
@@ -110,7 +106,7 @@ class Viewer:
             self._picture.show(self._frame, self.shown if self.playing else None)
             place = np.zeros(3)
             if picked is not None and self._look.follow and np.isfinite(self._frame.vehicle_position[picked]).all():
-                place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
+                place = self._stage.middle - [*self._frame.vehicle_position[picked, :2], 0.0]
             self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
             frames = self._reel.frames[max(0, self._k + 1 - LONGEST) : self._k + 1]
             self._panel.show(frames, now, exact=not self.playing)
@@ -138,7 +134,7 @@ class Viewer:
 
         def once(camera: Any) -> None:
             nonlocal waiting
-            arrived = np.linalg.norm(camera.look_at - self._middle) < 1e-3 * self._stage.side
+            arrived = np.linalg.norm(camera.look_at - self._stage.middle) < 1e-3 * self._stage.side
             if waiting and arrived:  # the first camera is there, which would come after what is set before
                 waiting = False
                 aim(camera, self._stage, float(camera.aspect), _RAISED)
@@ -220,42 +216,3 @@ class Viewer:
         self._panel.set_source(self._reel.source)
         self._panel.set_status("")
         self._due = monotonic()
-
-
-PORT, PORTS = 8080, 20
-"""The first port that is tried where none is asked for, and how many."""
-
-
-def serving(host: str, port: int | None) -> AbstractContextManager[tuple[Any, str]]:
-    """Return a context of viser's server and the address of its page, with the token that it needs.
-
-    Args:
-        host: address of this computer.
-        port: the one to listen on (None: the first free one from `PORT` on).
-
-    Raises:
-        CoopenvError: the port is taken, or the address is none of this computer's.
-    """
-    return guarded_server(host, free_port(host, port))
-
-
-def free_port(host: str, port: int | None) -> int:
-    """Return a free port; arguments and errors as for `serving`."""
-    for candidate in range(PORT, PORT + PORTS) if port is None else (port,):
-        try:
-            family, kind, protocol, _, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
-            with socket.socket(family, kind, protocol) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-            return candidate
-        except socket.gaierror:
-            raise CoopenvError(f"--host {host}: no such address") from None
-        except OSError as error:
-            if error.errno == errno.EADDRNOTAVAIL:
-                raise CoopenvError(f"--host {host}: is no address of this computer") from None
-            reason = "another program listens there"
-            if isinstance(error, PermissionError):
-                reason = "ports below 1024 are for the administrator"
-            if port is not None:
-                raise CoopenvError(f"--port {port}: {reason}; name another one") from None
-    raise CoopenvError(f"--port: {PORT} to {PORT + PORTS - 1} are taken; name another one")

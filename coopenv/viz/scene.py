@@ -64,9 +64,7 @@ class Frame:
     position: Annotated[np.ndarray, "f K A 3"]  # true
     estimate_rotation: Annotated[np.ndarray, "f K N 3 3"]
     estimate_position: Annotated[np.ndarray, "f K N 3"]
-    position_covariance: Annotated[
-        np.ndarray, "f K N 3 3"
-    ]  # m^2, from the observer's P to first order
+    position_covariance: Annotated[np.ndarray, "f K N 3 3"]  # m^2, from the observer's P to first order
     position_error: Annotated[np.ndarray, "f K N"]  # m
     orientation_error: Annotated[np.ndarray, "f K N"]  # deg
     nees: Annotated[np.ndarray, "f K N"]  # normalised error squared of the pose; 6 on average where P is consistent

@@ -40,19 +40,24 @@ def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> n
     return np.asarray(position[:, None] + shape @ np.swapaxes(rotation[:, :2, :2], 1, 2))
 
 
-def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
-    """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
-    half = np.array(size[:2]) / 2
-    corners = np.array(center[:2]) + half * CORNERS
-    return np.asarray(corners * max(1.0, shortest / (2 * half.max())))
+def box_shapes(bodies: Sequence[Body], shortest: float) -> np.ndarray:
+    """Return the corners (N, 4, 2) of boxes in the body frame, each enlarged to at least `shortest` m long."""
+    size, center = (
+        np.array([part[:2] for part in parts], float).reshape(-1, 1, 2)
+        for parts in ((body.size for body in bodies), (body.center for body in bodies))
+    )
+    grown = np.maximum(1.0, shortest / size.max(axis=-1, keepdims=True))
+    return np.asarray((center + size / 2 * CORNERS) * grown)
 
 
-def nose_shape(corners: np.ndarray) -> np.ndarray:
-    """Return the triangle (3, 2) that marks the front of a box of four corners."""
-    rear, front = corners.min(axis=0), corners.max(axis=0)
-    waist = 0.42 * rear[0] + 0.58 * front[0]
-    inset = 0.18 * (front[1] - rear[1])
-    return np.array([(waist, rear[1] + inset), (front[0] - inset, (rear[1] + front[1]) / 2), (waist, front[1] - inset)])
+def nose_shapes(boxes: np.ndarray) -> np.ndarray:
+    """Return the triangles (N, 3, 2) that mark the fronts of boxes of four corners (N, 4, 2)."""
+    rear, front = boxes.min(axis=1), boxes.max(axis=1)
+    waist = 0.42 * rear[:, 0] + 0.58 * front[:, 0]
+    inset = 0.18 * (front[:, 1] - rear[:, 1])
+    x = np.stack([waist, front[:, 0] - inset, waist], axis=-1)
+    y = np.stack([rear[:, 1] + inset, (rear[:, 1] + front[:, 1]) / 2, front[:, 1] - inset], axis=-1)
+    return np.stack([x, y], axis=-1)
 
 
 def ways(scenario: Scenario) -> np.ndarray:
@@ -185,28 +190,23 @@ def roads(scenario: Scenario) -> list[np.ndarray]:
 
 def pointers(
     origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
-) -> tuple[list[np.ndarray], list[int]]:
-    """Return triangles (3, 2) at the border, pointing to each `point` (N, 2) outside the picture, and their indices.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles (K, 3, 2) at the border, pointing to `point` (N, 2) outside the picture, and their indices (K,).
 
     The pointing lines come from `origin` (N, 2), or from the picture's middle where that is outside too. `low` and
     `high` are corners of the picture, `size` is the length of a triangle, m.
     """
-    triangles, which = [], []
-    for i, (start, end) in enumerate(zip(origin, point, strict=True)):
-        if not np.isfinite(end).all() or np.all((end >= low) & (end <= high)):
-            continue
-        if not np.all((start > low) & (start < high)):
-            start = (low + high) / 2
-        way = end - start
-        room = np.where(way > 0, high - start, start - low)
-        share = np.min(room / np.maximum(np.abs(way), 1e-9))
-        ahead = way / np.linalg.norm(way)
-        aside = np.array([-ahead[1], ahead[0]])
-        tip = start + share * way - 0.15 * size * ahead
-        base = tip - size * ahead
-        triangles.append(np.array([tip, base + 0.45 * size * aside, base - 0.45 * size * aside]))
-        which.append(i)
-    return triangles, which
+    outside = np.isfinite(point).all(axis=1) & ~np.all((point >= low) & (point <= high), axis=1)
+    start, end = origin[outside], point[outside]
+    start = np.where(np.all((start > low) & (start < high), axis=1, keepdims=True), start, (low + high) / 2)
+    way = end - start
+    room = np.where(way > 0, high - start, start - low)
+    share = np.min(room / np.maximum(np.abs(way), 1e-9), axis=1, keepdims=True)
+    ahead = size * way / np.linalg.norm(way, axis=1, keepdims=True)
+    aside = 0.45 * ahead[:, ::-1] * [-1.0, 1.0]
+    tip = start + share * way - 0.15 * ahead
+    base = tip - ahead
+    return np.stack([tip, base + aside, base - aside], axis=1), np.flatnonzero(outside)
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
@@ -228,6 +228,8 @@ class Stage:
         self.low, self.high = low, high
         """(2,) corners of a square in plan around all that is known beforehand."""
         self.side = float(high[0] - low[0])
+        self.middle = np.array([*(low + high) / 2, 0.0])
+        """(3,) of that square."""
         self._agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
         self.marker = np.array([agent.marker for agent in self._agents], float)
         """(A, 3) the point that cameras see, body frame."""
@@ -266,6 +268,12 @@ class Stage:
     def _fan(self) -> np.ndarray:
         """(N, K, 3) unit rays over the width of each camera's image, body frame without pan."""
         return np.array([camera_fan(camera) for camera in self.scenario.cameras])
+
+    def nearer(self, points: np.ndarray, sides: float) -> np.ndarray:
+        """Return points (N, D), those farther from the middle than so many sides moved there in their direction."""
+        middle = self.middle[: points.shape[-1]]
+        away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
+        return np.asarray(middle + (points - middle) * np.minimum(1.0, sides * self.side / np.maximum(away, 1e-9)))
 
     def eyes(self, frame: Frame) -> np.ndarray:
         """Return where cameras are, (N, 3)."""

@@ -148,14 +148,12 @@ class TopView:
     def _prepare_shapes(self) -> None:
         s = self.scenario
         shortest = _SHORTEST * self._pixel
-        bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
-        boxes = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
-        noses = np.array([geometry.nose_shape(box) for box in boxes])
+        boxes = geometry.box_shapes([vehicle.body or _POINT for vehicle in s.vehicles], shortest)
+        noses = geometry.nose_shapes(boxes)
         turn, still = Rotation.from_euler("z", geometry.ways(s)[:, None]).as_matrix(), np.zeros((len(boxes), 2))
         self._box, self._nose = geometry.outlines(turn, still, boxes), geometry.outlines(turn, still, noses)
-        self._others = [i for i, m in enumerate(s.landmarks) if m.body]
-        bodies = [m.body for m in s.landmarks if m.body]
-        self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
+        bodies = {i: landmark.body for i, landmark in enumerate(s.landmarks) if landmark.body}
+        self._others, self._other_box = list(bodies), geometry.box_shapes(list(bodies.values()), shortest)
         flank = np.stack([boxes[:, :, 0].mean(axis=1), boxes[:, 2, 1]], axis=-1)
         aside = np.tile([0.0, 1.0], (len(flank), 1))
         self._flank = geometry.outlines(turn, still, np.stack([flank, aside], axis=1))
@@ -224,7 +222,7 @@ class TopView:
 
     def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
-        shapes, semi = geometry.ellipses(self._drawable(estimate[:, :2]), covariance[:, :2, :2])
+        shapes, semi = geometry.ellipses(self._stage.nearer(estimate[:, :2], _FARTHEST), covariance[:, :2, :2])
         inside = np.all((estimate[:, :2] >= self._low) & (estimate[:, :2] <= self._high), axis=-1)
         drawn = inside & (semi <= ground.LARGEST_ELLIPSE * self._side) & (not self._gain)
         self._ellipses.set_verts(list(shapes[drawn]))
@@ -234,7 +232,7 @@ class TopView:
 
     def _place_bodies(self, frame: Frame) -> None:
         L, R, position, R_hat = self._landmarks, frame.rotation, frame.position, frame.estimate_rotation
-        place, guess = position[L:, :2], self._drawable(frame.estimate_position[:, :2])
+        place, guess = position[L:, :2], self._stage.nearer(frame.estimate_position[:, :2], _FARTHEST)
         self._truth.set_verts(geometry.outlines(R[L:], place, self._box))
         self._truth_nose.set_verts(geometry.outlines(R[L:], place, self._nose))
         estimated = geometry.outlines(R_hat, guess, self._box)
@@ -245,12 +243,6 @@ class TopView:
         self._links.set_segments(list(np.stack([place, guess], axis=1)))
         self._point_outside(self._pointers, place, guess)
         self._point_outside(self._strays, guess, place)
-
-    def _drawable(self, points: np.ndarray) -> np.ndarray:
-        """Return points (N, 2), those too far for the renderer drawn nearer in their direction."""
-        middle = (self._low + self._high) / 2
-        away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
-        return np.asarray(middle + (points - middle) * np.minimum(1, _FARTHEST * self._side / np.maximum(away, 1e-9)))
 
     def _point_outside(self, pointing: Any, origin: np.ndarray, point: np.ndarray) -> None:
         """Point from the border to what lies outside the picture."""

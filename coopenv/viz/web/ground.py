@@ -275,7 +275,7 @@ class Ground:
 
     def _add_floor(self) -> None:
         side, spacing = self._stage.side, spacing_of(self._stage.side)
-        middle = (self._stage.low + self._stage.high) / 2
+        middle = self._stage.middle[:2]
         corners = middle + 0.75 * side * CORNERS
         floor = _quad(corners, self.z - 0.004 * side)
         self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **_FLAT)

@@ -1,5 +1,6 @@
 """`replay.html`, which plays an episode and opens from disk, and the guarded server of viser; extra `view`."""
 
+import errno
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -29,15 +30,6 @@ TOKEN_BYTES = 12
 _STARTING = Lock()
 
 
-def has_viser() -> bool:
-    """Return whether the extra is installed."""
-    try:
-        viser_module()
-    except CoopenvError:
-        return False
-    return True
-
-
 def viser_module() -> Any:
     """Return the module.
 
@@ -55,15 +47,21 @@ def viser_module() -> Any:
 
 
 @contextmanager
-def guarded_server(host: str, port: int) -> Iterator[tuple[Any, str]]:
-    """Yield a server of viser, and the address of its page, which `refusal` guards.
+def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, str]]:
+    """Yield a server of viser, and the address of its page with the token that it needs, which `refusal` guards.
 
     viser itself answers every WebSocket and every host name and has no setting for it. The guard is put before its
     own `process_request` while it starts.
 
+    Args:
+        host: address of this computer.
+        port: the one to listen on (None: the first free one from `PORT` on; 0: any).
+
     Raises:
-        CoopenvError: the extra is not installed, or this version of viser starts its server differently.
+        CoopenvError: the port is taken, or the address is none of this computer's; the extra is not installed, or this
+            version of viser starts its server differently.
     """
+    port = free_port(host, port)
     viser = viser_module()
     from websockets.asyncio import server as asyncio_server
 
@@ -94,6 +92,32 @@ def guarded_server(host: str, port: int) -> Iterator[tuple[Any, str]]:
         yield server, f"http://{shown}:{server.get_port()}/{token}"
     finally:
         server.stop()
+
+
+PORT, PORTS = 8080, 20
+"""The first port that is tried where none is asked for, and how many."""
+
+
+def free_port(host: str, port: int | None) -> int:
+    """Return a free port; arguments and errors as for `guarded_server`."""
+    for candidate in range(PORT, PORT + PORTS) if port is None else (port,):
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+            return candidate
+        except socket.gaierror:
+            raise CoopenvError(f"--host {host}: no such address") from None
+        except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise CoopenvError(f"--host {host}: is no address of this computer") from None
+            reason = "another program listens there"
+            if isinstance(error, PermissionError):
+                reason = "ports below 1024 are for the administrator"
+            if port is not None:
+                raise CoopenvError(f"--port {port}: {reason}; name another one") from None
+    raise CoopenvError(f"--port: {PORT} to {PORT + PORTS - 1} are taken; name another one")
 
 
 def refusal(path: str, headers: Any, token: str, names: set[str]) -> tuple[str, str]:

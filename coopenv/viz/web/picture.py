@@ -91,11 +91,7 @@ class Actors:
             self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
 
     def _near(self, points: np.ndarray) -> np.ndarray:
-        """Return points (N, 3), those very far away drawn nearer in their direction."""
-        middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
-        away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
-        share = np.minimum(1.0, _FAR * self._stage.side / np.maximum(away, 1e-9))
-        return fine(middle + (points - middle) * share, self._floor.step)
+        return fine(self._stage.nearer(points, _FAR), self._floor.step)
 
     def _place_landmarks(self, frame: Frame) -> None:
         L, side, step = self._stage.landmarks, self._stage.side, self._floor.step
@@ -381,11 +377,10 @@ class Picture:
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:
     """Return where the first camera is and what it looks at, (3,) each; from the south, the whole square in sight."""
-    middle = np.array([*(stage.low + stage.high) / 2, 0.0])
     direction = np.array([-0.12, -0.72, 0.85])
     half = np.tan(FIELD_OF_VIEW / 2) * min(1.0, aspect)
     distance = 0.52 * stage.side / half
-    return middle + distance * direction / np.linalg.norm(direction), middle
+    return stage.middle + distance * direction / np.linalg.norm(direction), stage.middle
 
 
 def useful_magnification(sigma: np.ndarray, side: float) -> float:
