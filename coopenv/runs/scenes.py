@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from importlib.util import find_spec
+from itertools import chain
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -311,26 +312,27 @@ def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
         except (OSError, RuntimeError):
             raise OutputError(f"cannot write to {path}: ffmpeg could not finish it; the disk may be full") from None
 
-    writer, count = None, 0
+    images, count = iter(images), 0
+    first = next(images, None)
+    if first is None:
+        return
+    width, height = (edge // 2 * 2 for edge in first.size)  # even, as the codec asks for
+    look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
     try:
-        for image in images:
+        with told():
+            writer.send(None)
+        for image in chain([first], images):
             count += 1
-            width, height = (edge // 2 * 2 for edge in image.size)  # even, as the codec asks for
             with told():
-                if writer is None:
-                    look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
-                    writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
-                    writer.send(None)
                 writer.send(image.crop((0, 0, width, height)).tobytes())
         with told():
-            if writer is not None:
-                writer.close()
-                if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
-                    raise OSError
+            writer.close()
+            if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
+                raise OSError
     finally:
-        if writer is not None:
-            with suppress(OSError, RuntimeError):
-                writer.close()
+        with suppress(OSError, RuntimeError):
+            writer.close()
 
 
 _ON_A_PLANE = "planar_robust"

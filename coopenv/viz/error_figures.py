@@ -42,7 +42,7 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, wi
     """
     count = len(trajectory.vehicles)
     narrow = width is not None and width < style.NARROW
-    figure, inches = style.canvas(width, _FRAME + (_NARROW_ROW if narrow else _ROW) * count, "")
+    figure, inches = style.canvas(width, _FRAME + (_NARROW_ROW if narrow else _ROW) * count)
     axes = figure.subplots(count, 2, squeeze=False)
     converged, live = settling_times(trajectory, ends), live_ticks(trajectory.t, count, ends)
     seen = [style.moving_target_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
@@ -190,7 +190,7 @@ def consistency_figure(
         steady_from = STEADY_SHARE * float(trajectory.t[-1])
     count = len(trajectory.vehicles)
     narrow, short = (width is not None and width < limit for limit in (style.NARROW, _SHORT))
-    figure, _ = style.canvas(width, _NEES_FRAME + (_NEES_NARROW_ROW if narrow else _NEES_ROW) * count, "")
+    figure, _ = style.canvas(width, _NEES_FRAME + (_NEES_NARROW_ROW if narrow else _NEES_ROW) * count)
     axes = figure.subplots(count, 3, squeeze=False)
     variance = np.diagonal(np.asarray(trajectory.covariance, float), axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore"):  # of an observer that has diverged
@@ -289,7 +289,7 @@ def observability_figure(
     count = len(observability.vehicles)
     cut = [observability_of(observability, i, np.nan if ends is None else ends[i]) for i in range(count)]
     frame = _NARROW_FRAME if width is not None and width < style.NARROW else _GRAMIAN_FRAME
-    figure, _ = style.canvas(width, frame + _LANE * count, "")
+    figure, _ = style.canvas(width, frame + _LANE * count)
     local, verdict = figure.subplots(2, 1, height_ratios=(2.0, max(0.3, _LANE * count)))
     names = [style.vehicle_label(name) for name in observability.vehicles]
     looks: list[dict[str, Any]] = [  # with different dashes, because lines may coincide

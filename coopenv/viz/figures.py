@@ -74,7 +74,7 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None,
     live = live_ticks(trajectory.t, count, ends)
     lanes = [_changing(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
     rows = [max(_EMPTY, len(targets)) * _LANE + _TITLE for targets in lanes]
-    figure, inches = house.canvas(width, _FRAME + sum(rows), "")
+    figure, inches = house.canvas(width, _FRAME + sum(rows))
     axes = figure.subplots(count, 1, squeeze=False, height_ratios=[max(_EMPTY, len(lane)) for lane in lanes])[:, 0]
     shaded = False
     last = max((vehicle for vehicle, targets in enumerate(lanes) if len(targets)), default=-1)

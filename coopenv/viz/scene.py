@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol, Self
 
 import numpy as np
+from pydantic import Field
 
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
-from coopenv.base.format import jsonable
+from coopenv.base.format import fixed, jsonable
 from coopenv.base.npz import read_npz
 from coopenv.base.sections import Section, validated
 from coopenv.estimation.outcomes import Outcome, Sight
@@ -132,6 +133,15 @@ class Frame:
         """(N,) m: three standard deviations of the estimated position in plan, along the axis where it is worst."""
         return semi_axes(self.position_covariance[:, :2, :2])[0][:, -1]
 
+    def table(self, sigma: bool = True) -> list[tuple[str, str, str, str]]:
+        """Return, per vehicle, both errors (m, deg), 3 sigma (m; with `sigma`), and targets seen of all, as text."""
+        sigmas = self.three_sigma if sigma else np.full(len(self.nees), np.nan)
+        columns = self.position_error, self.orientation_error, sigmas, self.sees, self.could_see
+        return [
+            (fixed(error, 3), fixed(angle, 1), fixed(bound, 3), f"{sees}/{could_see}")
+            for error, angle, bound, sees, could_see in zip(*columns, strict=True)
+        ]
+
 
 FIELDS: dict[str, str] = {name: kind.__metadata__[0] for name, kind in get_annotations(Frame).items()}
 """By field of a frame its kind and axes."""
@@ -170,6 +180,14 @@ class Source(Section):
         parts = [self.name, f"observer {self.observer}"]
         parts += [f"driven by {self.policy}"] if self.policy else []
         return ", ".join([*parts, *([f"seed {self.seed}"] if self.seed is not None else [])])
+
+
+class Header(Section):
+    """What the file of a scene says of its arrays."""
+
+    frames: int = Field(ge=1)
+    source: Source
+    scenario: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -235,17 +253,8 @@ class SceneRecord:
         Raises:
             DataError: there is no such file, or it is no scene.
         """
-        header = read_npz(path, "scene", {_HEADER: "u B"})[_HEADER]
-        try:
-            facts = json.loads(header.tobytes())
-            count, source = int(facts["frames"]), validated(Source, facts["source"], str(path), DataError)
-            scenario = parse_scenario(facts["scenario"], str(path))
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            if isinstance(error, CoopenvError):
-                raise
-            raise DataError(f"{path}: not a scene: header: {error}") from None
-        if count < 1:
-            raise DataError(f"{path}: not a scene: header: {count} frames")
+        header = validated(Header, read_npz(path, "scene", {_HEADER: "u B"})[_HEADER].tobytes(), f"{path}", DataError)
+        count, source, scenario = header.frames, header.source, parse_scenario(header.scenario, str(path))
         n = len(scenario.vehicles)
         lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}
         lengths["R"] = (len(source.terms),)

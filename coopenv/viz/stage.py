@@ -188,25 +188,22 @@ def roads(scenario: Scenario) -> list[np.ndarray]:
     return found
 
 
-def pointers(
-    origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles (K, 3, 2) at the border, pointing to `point` (N, 2) outside the picture, and their indices (K,).
+def pointers(origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float) -> np.ndarray:
+    """Return triangles (N, 3, 2) at the border that point to each `point` (N, 2) outside the picture; else NaN.
 
     The pointing lines come from `origin` (N, 2), or from the picture's middle where that is outside too. `low` and
     `high` are corners of the picture, `size` is the length of a triangle, m.
     """
-    outside = np.isfinite(point).all(axis=1) & ~np.all((point >= low) & (point <= high), axis=1)
-    start, end = origin[outside], point[outside]
-    start = np.where(np.all((start > low) & (start < high), axis=1, keepdims=True), start, (low + high) / 2)
-    way = end - start
+    inside = np.all((point >= low) & (point <= high), axis=1, keepdims=True)
+    start = np.where(np.all((origin > low) & (origin < high), axis=1, keepdims=True), origin, (low + high) / 2)
+    way = np.where(inside, np.nan, point - start)
     room = np.where(way > 0, high - start, start - low)
     share = np.min(room / np.maximum(np.abs(way), 1e-9), axis=1, keepdims=True)
     ahead = size * way / np.linalg.norm(way, axis=1, keepdims=True)
     aside = 0.45 * ahead[:, ::-1] * [-1.0, 1.0]
     tip = start + share * way - 0.15 * ahead
     base = tip - ahead
-    return np.stack([tip, base + aside, base - aside], axis=1), np.flatnonzero(outside)
+    return np.stack([tip, base + aside, base - aside], axis=1)
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther

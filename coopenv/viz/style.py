@@ -61,16 +61,13 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(
-    figure: Figure, path: Path, file_format: str = "", note: str = "", about: Mapping[str, object] | None = None
-) -> Path:
+def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, object] | None = None) -> Path:
     """Write a figure in one of `FORMATS` (by default as the path ends) and return the path.
 
     Args:
-        figure: is changed by the note.
+        figure: any.
         path: an older file is replaced.
         file_format: one of `FORMATS`.
-        note: in small print below the figure.
         about: what the file's metadata say of it, for example environment, observer and seed.
 
     Raises:
@@ -80,9 +77,8 @@ def save(
     if form not in FORMATS:
         raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
     stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
-    words = "; ".join(f"{name}: {value}" for name, value in (about or {}).items()) or note
+    words = "; ".join(f"{name}: {value}" for name, value in (about or {}).items())
     told = {"Title": path.stem, {"png": "Description", "pdf": "Subject", "svg": "Description"}[form]: words}
-    sign(figure, note)
     with replacing_file(path) as new, rc_context({"svg.hashsalt": "coopenv", "pdf.fonttype": 42}):
         figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None, **(told if words else {})})
     return path
@@ -224,7 +220,7 @@ def legend(
     owner.legend(handles=handles, **look)
 
 
-def canvas(width: float | None, height: float, note: str) -> tuple[Figure, float]:
+def canvas(width: float | None, height: float, note: str = "") -> tuple[Figure, float]:
     """Return an empty figure that arranges itself, with a note in small print below, and its width, inches.
 
     Raises:

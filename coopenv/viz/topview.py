@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patches import Rectangle
-from matplotlib.patheffects import withStroke
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.format import fixed
@@ -86,7 +85,6 @@ def _opened(title: str, picture: np.ndarray) -> Any:
 _SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
 _LABEL = 3  # px between a vehicle and its name
-_HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 
@@ -107,12 +105,11 @@ class TopView:
         """
         self.scenario, self._panel = scenario, panel
         self._error_words = "mean error" if len(scenario.vehicles) > 1 else "error"
-        self._stage, self._landmarks = Stage(scenario), len(scenario.landmarks)
+        self._stage = Stage(scenario)
         self._gain = not states_covariance(scenario.observer.name)
         self._figure, self._axes = ground.new_ground(self._stage)
         self._layers = Layers(self._figure, self._axes)
-        self._low, self._high, self._side = self._stage.low, self._stage.high, self._stage.side
-        self._pixel = self._side / self._axes.get_window_extent().width  # m
+        self._pixel = self._stage.side / self._axes.get_window_extent().width  # m
         self._prepare_shapes()
         self._prepare_artists()
         self._prepare_table()
@@ -124,7 +121,7 @@ class TopView:
 
     def paint(self, frame: Frame) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of a frame, as wide as the map if that is all."""
-        sigma = self._place_ellipses(frame.estimate_position, frame.position_covariance)
+        self._place_ellipses(frame)
         self._goals.place(frame)
         self._place_bodies(frame)
         there = frame.traffic_half[:, 0] > 0.0
@@ -133,7 +130,7 @@ class TopView:
         self._traffic.set_verts(outline)
         self._place_sight(frame)
         self._place_marks(frame)
-        self._write(frame, sigma)
+        self._write(frame)
         picture = self._layers.paint()
         return picture if self._panel else picture[:, : ground.MAP_WIDTH].copy()
 
@@ -164,7 +161,8 @@ class TopView:
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
         self._wedges = layers.polygons(facecolor=to_rgba_array(self._rgba, 0.11), edgecolor="none")
-        self._ellipses = layers.polygons(linewidth=1.0)
+        pale, strong = to_rgba_array(self._rgba, 0.09), to_rgba_array(self._rgba, 0.8)
+        self._ellipses = layers.polygons(facecolor=pale, edgecolor=strong, linewidth=1.0)
         self._sight = {sight: layers.lines(**look) for sight, look in ground.SIGHT_LOOKS.items()}
         self._still = layers.points("o", DARK_BLUE, "white", 5.5)
         self._other = layers.polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
@@ -176,16 +174,16 @@ class TopView:
         self._casing = layers.polygons(facecolor="none", edgecolor="white", linewidth=2.3)
         self._estimate = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.1)
         self._estimate_nose = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=0.9)
-        self._pointers = layers.polygons(facecolor="white", linewidth=1.3)
-        self._strays = layers.polygons(linewidth=1.3)
+        self._pointers = layers.polygons(facecolor="white", edgecolor=self._rgba, linewidth=1.3)
+        self._strays = layers.polygons(facecolor=self._rgba, edgecolor=self._rgba, linewidth=1.3)
         self._arrived = layers.points("*", "white", INK, 12)
         self._collided = layers.points("X", INK, "white", 11)
         landmarks = [layers.keep(name) for name in ground.name_landmarks(self._axes, self.scenario)]
         self._goals.add_names(self._axes, layers, landmarks)
-        look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
-        names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=INK, **look) for i in range(len(colours))]
-        self._names = [layers.keep(name) for name in names]
-        boxes = [name.get_window_extent() for name in names]
+        look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, "color": INK}
+        marks = (ground.vehicle_mark(i) for i in range(len(colours)))
+        self._names = [layers.keep(self._axes.text(0, 0, mark, path_effects=ground.HALO, **look)) for mark in marks]
+        boxes = [name.get_window_extent() for name in self._names]
         self._half_name = np.array([(box.width, box.height) for box in boxes]) / 2 * self._pixel
         self._moving_names = {
             i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
@@ -210,50 +208,41 @@ class TopView:
         head = f"{'':6}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':6}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
-        rows = [self._figure.text(*places[i], "", color=INK, **look) for i in range(shown)]
-        for i, corner in enumerate(places[:shown]):
-            look_of: dict[str, Any] = {"facecolor": vehicle_colour(i), "edgecolor": INK, "linewidth": 0.5}
-            side = ground.pixels(ground.SWATCH, ground.SWATCH)
-            self._figure.add_artist(Rectangle(corner, *side, transform=self._figure.transFigure, **look_of))
-        self._rows = [self._layers.keep(row) for row in rows]
+        self._rows = [self._layers.keep(self._figure.text(*place, "", color=INK, **look)) for place in places[:shown]]
+        side, rim = ground.pixels(ground.SWATCH, ground.SWATCH), {"edgecolor": INK, "linewidth": 0.5}
+        for i, place in enumerate(places[:shown]):
+            swatch = Rectangle(place, *side, transform=self._figure.transFigure, facecolor=vehicle_colour(i), **rim)
+            self._figure.add_artist(swatch)
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
         ground.draw_legend(self._figure, self._stage, shown + 1)
 
-    def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
-        shapes, semi = geometry.ellipses(self._stage.nearer(estimate[:, :2], _FARTHEST), covariance[:, :2, :2])
-        inside = np.all((estimate[:, :2] >= self._low) & (estimate[:, :2] <= self._high), axis=-1)
-        drawn = inside & (semi <= ground.LARGEST_ELLIPSE * self._side) & (not self._gain)
-        self._ellipses.set_verts(list(shapes[drawn]))
-        self._ellipses.set_facecolor(to_rgba_array(self._rgba[drawn], 0.09))
-        self._ellipses.set_edgecolor(to_rgba_array(self._rgba[drawn], 0.8))
-        return np.where(self._gain, np.nan, semi)
+    def _place_ellipses(self, frame: Frame) -> None:
+        """Place the 3-sigma ellipses of estimates in sight, but for large ones."""
+        stage, estimate = self._stage, frame.estimate_position[:, :2]
+        shapes, semi = geometry.ellipses(estimate, frame.position_covariance[:, :2, :2])
+        inside = np.all((estimate >= stage.low) & (estimate <= stage.high), axis=-1)
+        shapes[~inside | ~(semi <= ground.LARGEST_ELLIPSE * stage.side) | self._gain] = np.nan
+        self._ellipses.set_verts(shapes)
 
     def _place_bodies(self, frame: Frame) -> None:
-        L, R, position, R_hat = self._landmarks, frame.rotation, frame.position, frame.estimate_rotation
-        place, guess = position[L:, :2], self._stage.nearer(frame.estimate_position[:, :2], _FARTHEST)
-        self._truth.set_verts(geometry.outlines(R[L:], place, self._box))
-        self._truth_nose.set_verts(geometry.outlines(R[L:], place, self._nose))
-        estimated = geometry.outlines(R_hat, guess, self._box)
-        self._casing.set_verts(estimated)
-        self._estimate.set_verts(estimated)
-        self._estimate_nose.set_verts(geometry.outlines(R_hat, guess, self._nose))
-        self._other.set_verts(geometry.outlines(R[self._others], position[self._others, :2], self._other_box))
+        R, R_hat, outlines = frame.vehicle_rotation, frame.estimate_rotation, geometry.outlines
+        place = frame.vehicle_position[:, :2]
+        guess = self._stage.nearer(frame.estimate_position[:, :2], _FARTHEST)
+        self._truth.set_verts(outlines(R, place, self._box))
+        self._truth_nose.set_verts(outlines(R, place, self._nose))
+        self._casing.set_verts(outlines(R_hat, guess, self._box))
+        self._estimate.set_verts(outlines(R_hat, guess, self._box))
+        self._estimate_nose.set_verts(outlines(R_hat, guess, self._nose))
+        others = self._others
+        self._other.set_verts(outlines(frame.rotation[others], frame.position[others, :2], self._other_box))
         self._links.set_segments(list(np.stack([place, guess], axis=1)))
-        self._point_outside(self._pointers, place, guess)
-        self._point_outside(self._strays, guess, place)
-
-    def _point_outside(self, pointing: Any, origin: np.ndarray, point: np.ndarray) -> None:
-        """Point from the border to what lies outside the picture."""
-        triangles, which = geometry.pointers(origin, point, self._low, self._high, _POINTER * self._pixel)
-        pointing.set_verts(triangles)
-        pointing.set_edgecolor(self._rgba[which])
-        if pointing is self._strays:
-            pointing.set_facecolor(self._rgba[which])
+        corners, size = (self._stage.low, self._stage.high), _POINTER * self._pixel
+        self._pointers.set_verts(geometry.pointers(place, guess, *corners, size))
+        self._strays.set_verts(geometry.pointers(guess, place, *corners, size))
 
     def _place_sight(self, frame: Frame) -> None:
-        L, target, eye = self._landmarks, self._stage.targets(frame)[:, :2], self._stage.eyes(frame)[:, :2]
+        target, eye = self._stage.targets(frame)[:, :2], self._stage.eyes(frame)[:, :2]
         for kind, lines in self._sight.items():
             observer, seen = np.nonzero(frame.sight == kind)
             lines.set_segments(list(np.stack([eye[observer], target[seen]], axis=1)))
@@ -263,7 +252,7 @@ class TopView:
         if wedges is not None:
             self._wedges.set_verts(wedges[..., :2])
         moving = np.flatnonzero(self._stage.moving)
-        self._still.set_data(*np.delete(target[:L], moving, axis=0).T)
+        self._still.set_data(*np.delete(target[: frame.landmarks], moving, axis=0).T)
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
             name.set_visible(bool(np.isfinite(target[i]).all()))
@@ -272,23 +261,22 @@ class TopView:
             name.xy = (float(target[i, 0]), float(target[i, 1]) + above)
 
     def _place_marks(self, frame: Frame) -> None:
-        L, R, position, ended = self._landmarks, frame.rotation, frame.position, frame.ended
-        place = geometry.outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
-        self._arrived.set_data(*place[ended == Outcome.ARRIVED].T)
-        self._collided.set_data(*place[ended == Outcome.COLLIDED].T)
-        flank = geometry.outlines(R[L:], position[L:, :2], self._flank[:, :1])[:, 0]
-        aside = geometry.outlines(R[L:], np.zeros_like(flank), self._flank[:, 1:])[:, 0]
+        R, position = frame.vehicle_rotation, frame.vehicle_position[:, :2]
+        place = geometry.outlines(R, position, self._box.mean(axis=1, keepdims=True))[:, 0]
+        self._arrived.set_data(*place[frame.ended == Outcome.ARRIVED].T)
+        self._collided.set_data(*place[frame.ended == Outcome.COLLIDED].T)
+        flank = geometry.outlines(R, position, self._flank[:, :1])[:, 0]
+        aside = geometry.outlines(R, np.zeros_like(flank), self._flank[:, 1:])[:, 0]
         half = np.sum(np.abs(aside) * self._half_name, axis=-1, keepdims=True)  # of the name, away from the vehicle
         beside = flank + (half + _LABEL * self._pixel) * aside
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
-    def _write(self, frame: Frame, sigma: np.ndarray) -> None:
+    def _write(self, frame: Frame) -> None:
         time = float(frame.tick) / self.scenario.rates.camera
         errors = frame.position_error[frame.under_way]
         error = f"{self._error_words} {fixed(errors.mean(), 2)} m   " if len(errors) and not self._panel else ""
         self._time.set_text(f"{error}t = {time:.2f} s")
+        table = frame.table(not self._gain)
         for i, row in enumerate(self._rows):
-            error, angle = frame.position_error[i], frame.orientation_error[i]
-            mark, sees = ground.vehicle_mark(i), f"{frame.sees[i]}/{frame.could_see[i]}"
-            row.set_text(f"  {mark:<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}{sees:>6}")
+            row.set_text("  {:<4}{:>7}{:>7}{:>7}{:>6}".format(ground.vehicle_mark(i), *table[i]))

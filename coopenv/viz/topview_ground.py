@@ -45,6 +45,7 @@ ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px
 MOST_ROWS = 16
 SWATCH = 8  # px
+HALO = (withStroke(linewidth=2.2, foreground="white"),)
 _RIM = 0.9  # pt, of marks
 LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
@@ -75,14 +76,11 @@ def new_ground(stage: Stage) -> tuple[Figure, Axes]:
     figure = new_figure((WIDTH + 0.1) / DPI, (HEIGHT + 0.1) / DPI)
     ax = figure.add_axes((*pixels(LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
     ax.set_facecolor(GROUND)
-    ax.set_axisbelow(True)
+    style.tidy(ax, x_label="x [m]", y_label="y [m]")
     ax.grid(True, color="white", linewidth=0.8)
-    ax.tick_params(labelsize=SMALL, length=2.5, width=0.6, colors=INK)
-    ax.set_xlabel("x [m]", fontsize=NORMAL, color=INK, labelpad=1)
-    ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK)
+    ax.xaxis.labelpad = 1
     ax.yaxis.set_label_coords(-_WORDS / _SIDE, 0.5)
-    for spine in ax.spines.values():
-        spine.set(linewidth=0.6, color=GREY)
+    ax.spines[:].set(visible=True, linewidth=0.6, color=GREY)
     ax.set(xlim=(stage.low[0], stage.high[0]), ylim=(stage.low[1], stage.high[1]))
     ax.set_aspect("equal")
     ax.set_autoscale_on(False)
@@ -218,8 +216,7 @@ class Goals:
         self._pixel = (self._end - low) / axes.get_window_extent().width  # m
         taken = [axes.transData.inverted().transform(other.get_window_extent()) for other in others]
         self._taken = np.array(taken).reshape(-1, 2, 2)  # m, lower left and upper right corners
-        halo = [withStroke(linewidth=2.2, foreground="white")]
-        look: dict[str, Any] = {"fontsize": SMALL, "va": "center", "clip_on": True, "color": INK, "path_effects": halo}
+        look: dict[str, Any] = {"fontsize": SMALL, "va": "center", "clip_on": True, "color": INK, "path_effects": HALO}
         self._names: list[Text] = [layers.keep(axes.text(0, 0, "", **look)) for _ in self._there]
 
     def place(self, frame: Frame) -> None:

@@ -135,7 +135,7 @@ def trajectory_figure_2d(
     drawn = np.maximum((high - low)[:2] * scale, (room, 0.45 * room))
     middle, half = (low[:2] + high[:2]) / 2, drawn / scale / 2
     low[:2], high[:2] = middle - half, middle + half
-    figure, _ = style.canvas(inches, float(drawn[1]) + 0.6 + _LEGEND, "")
+    figure, _ = style.canvas(inches, float(drawn[1]) + 0.6 + _LEGEND)
     ax = figure.add_subplot()
     style.tidy(ax, x_label="x [m]", y_label="y [m]")
     if scenario is not None:
@@ -167,7 +167,7 @@ def trajectory_figure_3d(
     low, high = _scene(trajectory)
     steep = float((high - low)[2] / np.max((high - low)[:2]))
     inches = style.PAGE if width is None else width
-    figure, _ = style.canvas(inches, inches * float(np.clip(0.52 + 0.4 * steep, 0.52, 0.9)) + _LEGEND, "")
+    figure, _ = style.canvas(inches, inches * float(np.clip(0.52 + 0.4 * steep, 0.52, 0.9)) + _LEGEND)
     figure.set_layout_engine(None)  # which does not know how far labels in space reach
     ax: Any = figure.add_subplot(projection="3d")
     ax.view_init(elev=32, azim=-58)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import shown
-from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
@@ -317,11 +316,8 @@ def table_html(stage: Stage, source: Source, frame: Frame) -> str:
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
     heads = ("error [m]", "[deg]", sigma, "sees")
     cells = "".join(f'<th style="{_CELL}">{name}</th>' for name in heads)
-    rows, three_sigma, sees, could_see = [], frame.three_sigma, frame.sees, frame.could_see
-    for i in range(stage.vehicles):
-        lengths = fixed(frame.position_error[i], 3), fixed(three_sigma[i], 3)
-        angle, seen = fixed(frame.orientation_error[i], 1), f"{sees[i]}/{could_see[i]}"
-        values = lengths[0], angle, lengths[1], seen
+    rows = []
+    for i, values in enumerate(frame.table()):
         numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
         mark = f"{swatch(vehicle_colour(i))} <b>{stage.short_name(stage.landmarks + i)}</b>"
         rows.append(f'<tr><td style="white-space:nowrap">{mark}</td>{numbers}</tr>')
