@@ -55,21 +55,18 @@ class Unseen(Window):
             self._canvas.callbacks.process("key_release_event", KeyEvent("key_release_event", self._canvas, key))
 
 
-def test_watching_shows_the_episode() -> None:
-    scenario, window = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen()
-    stage = watch(scenario, load_agent("route_follower", scenario), 1, console(), window, AT_ONCE)
-    assert len(window.pictures) == 33  # the start is there twice, and so is the end
-    assert (window.pictures[2] != window.pictures[20]).any()
-    assert stage.outcomes()[0].startswith("vehicle_1: under way, position error 0.0")
-
-
-def test_watching_ends_when_the_window_is_closed() -> None:
+def test_watching_shows_the_episode_until_the_window_is_closed() -> None:
     def close(window: Unseen, number: int) -> None:
         window.open = number < 5
 
-    scenario, window = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen(close)
-    watch(scenario, load_agent("route_follower", scenario), 1, console(), window, AT_ONCE)
-    assert len(window.pictures) == 5
+    scenario, window, closed = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen(), Unseen(close)
+    policy = load_agent("route_follower", scenario)
+    stage = watch(scenario, policy, 1, console(), window, AT_ONCE)
+    assert len(window.pictures) == 33  # the start is there twice, and so is the end
+    assert (window.pictures[2] != window.pictures[20]).any()
+    assert stage.outcomes()[0].startswith("vehicle_1: under way, position error 0.0")
+    watch(scenario, policy, 1, console(), closed, AT_ONCE)
+    assert len(closed.pictures) == 5
 
 
 def test_keys_are_speed_and_steering() -> None:
@@ -114,16 +111,11 @@ def test_driving_by_hand_again_and_away() -> None:
     """The vehicle stands unless somebody presses a key; r begins anew, escape leaves."""
 
     def script(window: Unseen, number: int) -> None:
-        for at, action in {3: lambda: window.press("up"), 18: lambda: window.press("r"), 22: leave}.items():
-            if number == at:
-                action()
+        if number == 22:
+            window.release("up")
+        window.press(*{3: ["up"], 18: ["r"], 22: ["escape"]}.get(number, []))
 
     window = Unseen(script)
-
-    def leave() -> None:
-        window.release("up")
-        window.press("escape")
-
     scenario = coopenv.load_scenario(FOUR_WAY, {"vehicle_defaults.motion.initial_speed": 0.0})
     stage = drive_by_hand(scenario, 0, zero_policy(), 4, console(), window, AT_ONCE)
     assert len(window.pictures) == 22

@@ -26,6 +26,7 @@ from tests.helpers.drawn import spans, texts, xdata, ydata
 from tests.helpers.synthetic import make_trajectory
 
 NAMES = [f"{name}.png" for name in FIGURE_NAMES]
+ENDS = [50.0, 20.0, 50.0, 50.0, 50.0]
 
 
 def test_all_figures_are_written_under_their_stable_names(run: Trajectory, tmp_path: Path) -> None:
@@ -45,29 +46,24 @@ def test_short_runs_are_drawn_with_a_note(ticks: int, unwritten: list[Figure], t
 
 
 @pytest.mark.usefixtures("unwritten")
-def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
+def test_lost_observers_are_drawn(tmp_path: Path) -> None:
+    """One that states no covariance is lost after 1 s, and five are lost from the start."""
     run = make_trajectory(ticks=90)
     lost = np.where(run.t[:, None] > 1, np.nan, 1.0) * np.ones(5)
-    run = dataclasses.replace(
+    late = dataclasses.replace(
         run,
         position_estimate=run.position_estimate * lost[..., None],
         position_error=run.position_error * lost,
         covariance=np.full_like(run.covariance, np.nan),
         nees=np.full_like(run.nees, np.nan),
     )
-    assert len(save_figures(run, tmp_path)) == len(NAMES)
-    assert "no covariance declared" in texts(error_figures.consistency_figure(run))
-
-
-@pytest.mark.usefixtures("unwritten")
-def test_observers_that_are_lost_from_the_start_are_drawn(tmp_path: Path) -> None:
-    run = make_trajectory(ticks=90)
-    values = np.array([np.nan, np.inf, 1e300, np.nan, 1e300])
+    assert len(save_figures(late, tmp_path)) == len(NAMES)
+    assert "no covariance declared" in texts(error_figures.consistency_figure(late))
     fields = ("position_estimate", "rotation_estimate", "position_error", "orientation_error", "covariance", "nees")
-    lost = {name: np.empty_like(getattr(run, name)) for name in fields}
-    for array in lost.values():
-        np.moveaxis(array, 1, -1)[:] = values
-    run = dataclasses.replace(run, **lost)
+    arrays = {name: np.empty_like(getattr(run, name)) for name in fields}
+    for array in arrays.values():
+        np.moveaxis(array, 1, -1)[:] = np.nan, np.inf, 1e300, np.nan, 1e300
+    run = dataclasses.replace(run, **arrays)
     assert len(save_figures(run, tmp_path, ends=[0.0, 0.5, np.nan, 1.0, 1.5])) == len(NAMES)
     assert all("no rate to fit" in row["rate_remark"] for row in summarise(run, 0.5))
 
@@ -145,14 +141,11 @@ def test_angles_do_not_jump_by_whole_turns_and_end_near_zero() -> None:
     assert np.all(np.abs(np.nanmedian(smooth[280:], axis=0)) <= 181.0)
 
 
-def test_what_is_so_all_the_time_is_not_shaded(run: Trajectory) -> None:
+def test_what_is_so_all_the_time_is_not_shaded_and_a_run_that_does_not_settle_says_so(run: Trajectory) -> None:
     visible = run.visible.copy()
     visible[:, 0, 4] = True
-    assert spans(error_figure(dataclasses.replace(run, visible=visible)).axes[0], style.SHADE) == []
-
-
-def test_a_run_that_does_not_settle_says_so(run: Trajectory) -> None:
-    figure = error_figure(dataclasses.replace(run, position_error=run.position_error + 1.0))
+    figure = error_figure(dataclasses.replace(run, visible=visible, position_error=run.position_error + 1.0))
+    assert spans(figure.axes[0], style.SHADE) == []
     assert "above to the end" in texts(figure)
     assert not any(text.startswith("last above 0.1 m") for text in texts(figure))
 
@@ -181,11 +174,8 @@ def test_mean_nees_is_the_one_of_the_table(run: Trajectory) -> None:
     for row in summarise(run, 30.0):
         assert any(text.startswith(f"after 30 s: mean {row['mean_nees']:.3g}, ") for text in shown)
     assert any(text.startswith("after 35 s: mean ") for text in texts(error_figures.consistency_figure(run)))
-    late = error_figures.consistency_figure(run, ends=[50.0, 20.0, 50.0, 50.0, 50.0], steady_from=30.0)
+    late = error_figures.consistency_figure(run, ends=ENDS, steady_from=30.0)
     assert "ended before the steady state (30 s)" in texts(late)
-
-
-ENDS = [50.0, 20.0, 50.0, 50.0, 50.0]
 
 
 def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
@@ -243,10 +233,13 @@ def test_axes_show_two_decades_and_no_labels_between(values: tuple[float, float]
     assert all(not text.get_text() for text in ax.get_yticklabels(minor=True))
 
 
-def test_what_an_axis_cannot_show_is_left_out() -> None:
+def test_lines_are_thinned_and_without_what_an_axis_cannot_show() -> None:
     values = np.array([1.0, -1.0, 0.0, np.nan, np.inf, 1e200])
     np.testing.assert_array_equal(style.drawable(values), [1, -1, 0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(style.drawable(values, positive=True), [1] + [np.nan] * 5)
+    assert style.thinned(10).tolist() == list(range(10))
+    long = style.thinned(100_000)
+    assert len(long) <= style.MAX_POINTS and long[0] == 0 and long[-1] == 99_999
 
 
 def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> None:
@@ -262,12 +255,6 @@ def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> No
     expected = sum(i.end - i.start for v in range(5) for i in result.intervals(v) if i.observable)
     assert drawn == pytest.approx(expected)
     assert 0 < expected < 250
-
-
-def test_thinning_keeps_both_ends_and_short_records_whole() -> None:
-    assert style.thinned(10).tolist() == list(range(10))
-    long = style.thinned(100_000)
-    assert len(long) <= style.MAX_POINTS and long[0] == 0 and long[-1] == 99_999
 
 
 @pytest.mark.parametrize(

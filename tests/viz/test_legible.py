@@ -89,7 +89,7 @@ def test_a_style_gives_figures_of_the_columns_width(tmp_path: Path) -> None:
     assert dict(mpl.rcParams) == before
 
 
-def test_an_unknown_column_is_an_error_with_the_known_ones() -> None:
+def test_an_unknown_column_or_figure_is_an_error_with_the_known_ones() -> None:
     with pytest.raises(CoopenvError, match=r"unknown width 'ieee' \(did you mean 'ieee.'\?\); known: ieee1, ieee2"):
         figures.style("ieee")
     with pytest.raises(CoopenvError, match="unknown figure 'error'"):
@@ -99,12 +99,11 @@ def test_an_unknown_column_is_an_error_with_the_known_ones() -> None:
 @pytest.mark.parametrize("file_format", ["png", "pdf", "svg"])
 def test_files_have_metadata_and_are_the_same_each_time(file_format: str, tmp_path: Path) -> None:
     about = {"environment": "overtaking", "observer": "robust", "seed": 3}
-    (tmp_path / "0").mkdir()
-    (tmp_path / "1").mkdir()
+    path = tmp_path / f"f.{file_format}"
     figures = (draw_figure("trajectories_2d", make_trajectory(ticks=60), width="ieee1") for _ in range(2))
-    path, again = (style.save(f, tmp_path / f"{n}" / f"f.{file_format}", about=about) for n, f in enumerate(figures))
-    assert path.read_bytes() == again.read_bytes()
-    text = path.read_bytes().decode("latin-1")
+    content, again = (style.save(figure, path, about=about).read_bytes() for figure in figures)
+    assert content == again
+    text = content.decode("latin-1")
     assert "environment: overtaking; observer: robust; seed: 3" in text
     if file_format == "png":
         assert imread(path).shape[1] == pytest.approx(3.5 * style.DPI, abs=1)

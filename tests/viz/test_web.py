@@ -19,7 +19,7 @@ from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import linear, placed, spacing_of
-from coopenv.viz.web.page import has_viser, viser_module, write_replay
+from coopenv.viz.web.page import viser_module, write_replay
 from coopenv.viz.web.panel import GAIN
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, levels, useful_magnification
 
@@ -65,29 +65,22 @@ def test_a_page_holds_the_episode(tmp_path: Path) -> None:
     assert path.stat().st_size < 1.3e6
 
 
-def test_a_gain_is_not_called_a_covariance(tmp_path: Path) -> None:
-    page = write_replay(scene("overtaking"), tmp_path / "replay.html").read_text(encoding="utf-8")
-    assert GAIN in page and "3σ" not in page.rpartition("__VISER_EMBED_DATA__")[2].partition(";")[2]
-
-
-def test_titles_cannot_bring_code_along(tmp_path: Path) -> None:
+def test_a_gain_is_not_called_a_covariance_and_titles_bring_no_code_along(tmp_path: Path) -> None:
     record = scene("overtaking", title="<script>alert(1)</script> & more")
     page = write_replay(record, tmp_path / "replay.html").read_text(encoding="utf-8")
+    assert GAIN in page and "3σ" not in page.rpartition("__VISER_EMBED_DATA__")[2].partition(";")[2]
     assert "<script>alert" not in page and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
 
 
 @pytest.mark.parametrize("name", coopenv.list_envs())
 def test_every_environment_can_be_drawn(name: str, tmp_path: Path) -> None:
-    scenario = coopenv.load_scenario(name, {"horizon": 1.0})
-    path = write_replay(scene_of(Engine(scenario), Source.of(name, scenario, seed=1)), tmp_path / "replay.html")
+    path = write_replay(scene(name, horizon=1.0), tmp_path / "replay.html")
     length, _ = messages(path.read_text(encoding="utf-8"))
     assert length == pytest.approx(1.0, abs=0.21)
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert has_viser()
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert not has_viser()
     with pytest.raises(CoopenvError, match=r"pip install '\.\[view\]'"):
         viser_module()
 
@@ -98,13 +91,10 @@ def test_what_is_not_there_has_no_size() -> None:
     np.testing.assert_array_equal(where.positions, [[1, 2, 3], [0, 0, 0]])
 
 
-def test_colours_are_made_linear() -> None:
+def test_colours_are_made_linear_and_the_grid_has_even_spacing() -> None:
     np.testing.assert_array_equal(linear(np.array([0, 188, 255])), [0, 128, 255])
-
-
-@pytest.mark.parametrize(("side", "spacing"), [(30.0, 2.0), (100.0, 10.0), (99.0, 5.0), (4.0, 0.2), (1.0, 0.1)])
-def test_the_grid_has_even_spacing(side: float, spacing: float) -> None:
-    assert spacing_of(side) == pytest.approx(spacing)
+    sides = (30.0, 100.0, 99.0, 4.0, 1.0)
+    assert [spacing_of(side) for side in sides] == pytest.approx([2.0, 10.0, 5.0, 0.2, 0.1])
 
 
 @pytest.mark.parametrize("aspect", [1.6, 0.5])
