@@ -11,10 +11,9 @@ from coopenv.runs.live import FAULTS, Reel
 from coopenv.runs.scenes import MAX_FPS
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Stage, entries
-from coopenv.viz.web.ground import Look
 from coopenv.viz.web.page import aim
 from coopenv.viz.web.panel import LONGEST, NO_FAULT, Panel
-from coopenv.viz.web.picture import Picture, useful_magnification
+from coopenv.viz.web.picture import Picture, first_look
 
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go
@@ -36,10 +35,7 @@ class Viewer:
             raise CoopenvError(f"{reel.source.name}: has no frames to show")
         self._server, self._reel = server, reel
         self._stage = Stage(reel.scenario)
-        magnification = (
-            useful_magnification(reel.frames[0].three_sigma, self._stage.side) if reel.source.honest else 1.0
-        )
-        self._look = Look(magnification=magnification)
+        self._look = first_look(reel.frames[0].three_sigma, self._stage, reel.source)
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities, reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)

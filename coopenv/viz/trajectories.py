@@ -138,11 +138,10 @@ def trajectory_figure_2d(
     figure, _ = style.canvas(inches, float(drawn[1]) + 0.6 + _LEGEND)
     ax = figure.add_subplot()
     style.tidy(ax, x_label="x [m]", y_label="y [m]")
-    if scenario is not None:
-        draw_site(ax, Stage(scenario))
     drawing = Drawing(ax, low, high, dimensions=2)
     handles = _draw_paths(drawing, trajectory, ends, scenario)
     if scenario is not None:
+        draw_site(ax, Stage(scenario))
         handles += style.marks(
             (scenario.roads, "road", {"facecolor": ASPHALT, "edgecolor": "none"}),
             (scenario.obstacles, "building", {"facecolor": ROOF, "edgecolor": WALL, "hatch": "//"}),

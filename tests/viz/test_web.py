@@ -21,7 +21,7 @@ from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import linear, placed, spacing_of
 from coopenv.viz.web.page import viser_module, write_replay
 from coopenv.viz.web.panel import GAIN
-from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, levels, useful_magnification
+from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, levels
 
 msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
 zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
@@ -114,5 +114,8 @@ def test_the_first_camera_has_the_whole_map_in_sight(aspect: float) -> None:
 
 
 def test_small_ellipsoids_are_magnified() -> None:
-    assert [useful_magnification(np.array([s, np.nan]), 100.0) for s in (2.0, 0.2, 0.02)] == [1.0, 10.0, 100.0]
-    assert useful_magnification(np.array([np.nan]), 100.0) == 1.0
+    stage = Stage(coopenv.load_scenario("urban_crossing"))
+    source = Source(name="", observer="robust")
+    for share, factor in ((0.02, 1.0), (0.002, 10.0), (0.0002, 100.0), (np.nan, 1.0)):
+        assert first_look(np.array([share * stage.side, np.nan]), stage, source).magnification == factor
+    assert first_look(np.array([2e-4]), stage, source.model_copy(update={"honest": False})).magnification == 1.0

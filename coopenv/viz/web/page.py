@@ -23,7 +23,7 @@ from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.panel import legend_html
-from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification
+from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, first_look
 
 TOKEN_BYTES = 12
 """Random bytes of a page's address."""
@@ -179,7 +179,7 @@ def write_replay(
     record = record.of(np.unique(np.linspace(0, len(record) - 1, min(len(record), MOST_FRAMES)).round().astype(int)))
     stage = Stage(record.scenario)
     sigma = np.array([record.frame(k).three_sigma for k in range(0, len(record), max(1, len(record) // 20))])
-    look = Look(magnification=useful_magnification(sigma, stage.side) if record.source.honest else 1.0)
+    look = first_look(sigma, stage, record.source)
     with guarded_server(_LOOPBACK, 0) as (server, _):
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         aim(server.initial_camera, stage)

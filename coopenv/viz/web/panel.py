@@ -272,6 +272,7 @@ def legend_html(stage: Stage, source: Source, magnification: float) -> str:
     """Return the legend of the marks that can occur as HTML."""
     s = stage.scenario
     sensed = s.topology.mode == "sensed"
+    goals = any(vehicle.goal_radius > 0 for vehicle in s.vehicles)
     times = f", {magnification:g} times as large" if magnification != 1.0 else ""
     ellipsoid = f"3σ of the estimate{times}" if source.honest else f"observer's P{times} (gain, no covariance)"
     entries: list[tuple[object, str, str, object, str]] = [
@@ -285,13 +286,7 @@ def legend_html(stage: Stage, source: Source, magnification: float) -> str:
         (any(camera.miss_probability > 0 for camera in s.cameras), "line", BLUE, "2 4", "in view, but missed"),
         (stage.landmarks, "disc", DARK_BLUE, 1.0, "landmark"),
         (stage.vehicles > 1, "bead", BLUE, None, "V2X message on its way"),
-        (
-            any(vehicle.goal_radius > 0 for vehicle in s.vehicles),
-            "ring",
-            BLUE,
-            None,
-            "its goal, at the end of its route",
-        ),
+        (goals, "ring", BLUE, None, "its goal, at the end of its route"),
         (s.cosimulator, "block", TRAFFIC, 1.0, "other traffic"),
     ]
     svg = '<svg width="22" height="12" viewBox="0 0 22 12" style="vertical-align:middle">{}</svg>'

@@ -52,13 +52,8 @@ class Actors:
         dark = np.tile(rgb(DARK_BLUE), (stage.landmarks, 1))
         self._dots = Batch(scene, f"{ROOT}/landmarks/dots", ground.sphere(6), dark)
         self._poles = Batch(scene, f"{ROOT}/landmarks/poles", ground.pole(), dark)
-        bodies = {i: landmark.body for i, landmark in enumerate(stage.scenario.landmarks) if landmark.body}
-        self._bodies = list(bodies)
-        self._body_center, self._body_size = (
-            np.array([getattr(body, part) for body in bodies.values()], float).reshape(-1, 3)
-            for part in ("center", "size")
-        )
-        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", ground.box(), dark[self._bodies])
+        bodies = sum(landmark.body is not None for landmark in stage.scenario.landmarks)
+        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", ground.box(), dark[:bodies])
         self._marks = np.zeros((0, 3))
         self._traffic: Batch | None = None
 
@@ -103,9 +98,12 @@ class Actors:
         foot = np.column_stack([place[:, :2], np.full(L, self._floor.z)])
         thick = np.full((L, 2), 0.2 * _DOT * side)
         self._poles.put(placed(None, fine(foot, step), np.column_stack([thick, np.maximum(place - foot, 0.0)[:, 2]])))
-        R = frame.rotation[self._bodies]
-        at = frame.position[self._bodies] + (R @ self._body_center[..., None])[..., 0]
-        self._boxes.put(placed(R, fine(at, step), self._body_size))
+        boxes = [box for box in self._stage.solid(frame) if 0 <= box.agent < L]
+        if boxes:
+            R, center, size = (
+                np.array([getattr(box, part) for box in boxes]) for part in ("rotation", "center", "size")
+            )
+            self._boxes.put(placed(R, fine(center, step), size))
 
 
 _DOTS, _DASHES = 16, 9  # of a line to a target that was missed, and to an estimate
@@ -383,8 +381,12 @@ def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndar
     return stage.middle + distance * direction / np.linalg.norm(direction), stage.middle
 
 
-def useful_magnification(sigma: np.ndarray, side: float) -> float:
-    """Return the magnification, 1, 10 or 100, at which an ellipsoid of semi-axes (N,), m, can be seen."""
-    good = sigma[np.isfinite(sigma)]
-    middle = float(np.median(good)) if len(good) else side
-    return next((factor for factor in (1.0, 10.0) if factor * middle > 0.01 * side), 100.0)
+def first_look(three_sigma: np.ndarray, stage: Stage, source: Source) -> Look:
+    """Return the look with a magnification of 1, 10 or 100 at which ellipsoids of semi-axes (N,), m, can be seen.
+
+    Those of a gain matrix are not magnified.
+    """
+    good = three_sigma[np.isfinite(three_sigma)]
+    middle = float(np.median(good)) if len(good) and source.honest else stage.side
+    factor = next((factor for factor in (1.0, 10.0) if factor * middle > 0.01 * stage.side), 100.0)
+    return Look(magnification=factor)
