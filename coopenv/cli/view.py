@@ -66,8 +66,8 @@ class SceneOptions(options.SourceOptions):
         if self.agent is not None and (is_recorded(self.environment) or is_bag(self.environment, self.topics)):
             raise CoopenvError(f"--agent: is for a simulation, {self.environment} is recorded")
         changes = {**self.changes, **(more or {})}
-        watching = None if more and "observer.name" in more else self.observer
-        return open_source(self.environment, changes, watching, self.data, self.variant, self.topics)
+        observer = (more or {}).get("observer.name", self.observer)
+        return open_source(self.environment, changes, observer, self.data, self.variant, self.topics)
 
     def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
         """Return who drives in a scenario, and its name. Raises CoopenvError: it cannot drive here."""

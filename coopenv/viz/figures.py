@@ -36,10 +36,7 @@ from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 _HIDDEN = {"facecolor": "white"}
 _LOOKS: dict[Sight, tuple[str, dict[str, Any]]] = {
     Sight.VISIBLE: ("visible", {"facecolor": house.BLUE, "edgecolor": "none"}),
-    Sight.OCCLUDED_BY_BODY: (
-        "occluded by a moving body",
-        {**_HIDDEN, "edgecolor": house.VERMILION, "hatch": "//////"},
-    ),
+    Sight.OCCLUDED_BY_BODY: ("occluded by a moving body", {**_HIDDEN, "edgecolor": house.VERMILION, "hatch": "//////"}),
     Sight.OCCLUDED_BY_BUILDING: ("occluded by a building", {**_HIDDEN, "edgecolor": house.ORANGE, "hatch": "......"}),
     Sight.OUT_OF_VIEW: ("out of view", {"facecolor": house.GREY, "edgecolor": "none"}),
     Sight.MISSED: ("a frame missed", {"color": house.INK, "linestyle": "none", "marker": "|", "markersize": 3.0}),

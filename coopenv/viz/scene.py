@@ -236,9 +236,7 @@ class SceneRecord:
         for name, values in self.fields.items():
             whole = name in _WHOLE
             small = values.astype(np.int32 if whole else np.float32)
-            same = len(small) > 1 and np.array_equal(
-                small, np.broadcast_to(small[:1], small.shape), equal_nan=not whole
-            )
+            same = np.array_equal(small[1:], small[:-1], equal_nan=not whole)
             arrays[name] = small[:1] if same else small  # an array that never changes is kept once
         scenario = without_own_terms(jsonable(self.scenario))
         header = {"frames": len(self), "source": self.source.model_dump(), "scenario": scenario}
