@@ -50,6 +50,10 @@ def test_another_observer_sees_the_same_episode() -> None:
     for old, new in zip(before, reel.frames, strict=True):
         np.testing.assert_array_equal(old.position, new.position)
     assert (before[-1].estimate_position != reel.frames[-1].estimate_position).any()
+    before = reel.frames
+    with pytest.raises(CoopenvError, match="unknown observer"):
+        reel.change(observer="nobody")
+    assert reel.frames is before and reel.source.observer == "dead_reckoning" and reel.more()
     reel.close()
 
 
@@ -70,16 +74,6 @@ def test_a_fault_begins_now(fault: str) -> None:
     run_to(reel, 40)
     if "detections" not in fault:  # here every neighbour is always measured
         assert (wrong.estimate_position != reel.frames[-1].estimate_position).any()
-    reel.close()
-
-
-def test_what_cannot_be_changed_stays() -> None:
-    reel = reel_of("busy_intersection")
-    run_to(reel, 5)
-    before = reel.frames
-    with pytest.raises(CoopenvError, match="unknown observer"):
-        reel.change(observer="nobody")
-    assert reel.frames is before and reel.source.observer == "riccati" and reel.more()
     reel.close()
 
 
@@ -119,22 +113,17 @@ def test_the_user_goes_through_the_episode(viewer: Viewer) -> None:
     assert viewer._frame.tick == 0 and not viewer.playing
 
 
-def test_the_view_goes_along_with_the_picked_vehicle(viewer: Viewer) -> None:
-    wish(viewer, ("play", None), ("seek", 1.0), ("vehicle", 2))
-    place = viewer._frame.vehicle_position[2, :2] + viewer._picture.ground.root.position[:2]
-    np.testing.assert_allclose(place, viewer._middle[:2], atol=1e-3)
-    wish(viewer, ("show follow", False))
-    np.testing.assert_allclose(viewer._picture.ground.root.position, 0.0)
-
-
-def test_switches_change_what_is_shown(viewer: Viewer) -> None:
-    wish(viewer, ("play", None), ("seek", 1.0), ("magnification", 1.0))
-    small = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
-    wish(viewer, ("magnification", 10.0), ("show names", False), ("show views", False))
-    large = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
+def test_switches_change_what_is_shown_and_the_view_goes_along_with_the_picked_vehicle(viewer: Viewer) -> None:
+    picture, root = viewer._picture, viewer._picture.ground.root
+    wish(viewer, ("play", None), ("seek", 1.0), ("magnification", 1.0), ("vehicle", 2))
+    place = viewer._frame.vehicle_position[2, :2] + root.position[:2]
+    np.testing.assert_allclose(place, viewer._stage.middle[:2], atol=1e-3)
+    small = np.array(picture.actors._ellipsoids.handle.batched_scales)
+    wish(viewer, ("magnification", 10.0), *((f"show {name}", False) for name in ("names", "views", "follow")))
+    np.testing.assert_allclose(root.position, 0.0)
+    large = np.array(picture.actors._ellipsoids.handle.batched_scales)
     np.testing.assert_allclose(large[small > 0.05] / small[small > 0.05], 10.0, rtol=0.05)
-    assert not any(label.visible for label in viewer._picture._labels._cars)
-    assert not any(view.visible for view in viewer._picture._views)
+    assert not any(node.visible for node in (*picture._labels._cars, *picture._views))
 
 
 def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,13 +147,6 @@ def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest
     picture.show(later)
     for kept, handle in zip(by_turns, picture._views, strict=True):
         np.testing.assert_array_equal(kept, handle.vertices)
-
-
-def test_wrong_wishes_are_answered_and_the_view_goes_on(viewer: Viewer) -> None:
-    wish(viewer, ("play", None), ("observer", "nobody"))
-    assert "That cannot be: unknown observer" in viewer._panel._status.content
-    wish(viewer, ("observer", "dead_reckoning"))
-    assert "observer dead" in viewer._panel._head.content and not viewer._panel._status.visible
 
 
 def client(url: str, **more: Any) -> Any:
@@ -284,8 +266,11 @@ def test_any_error_of_a_wish_is_told_and_the_view_goes_on(viewer: Viewer, monkey
     assert "That cannot be: RuntimeError: the observer fails" in viewer._panel._status.content.replace("\\", "")
     assert viewer._reel.frames is kept and viewer._reel.source.observer == "robust"
     before = len(kept)
-    wish(viewer, ("seek", 2.0))
+    wish(viewer, ("seek", 2.0), ("observer", "nobody"))
     assert len(viewer._reel.frames) > before
+    assert "That cannot be: unknown observer" in viewer._panel._status.content
+    wish(viewer, ("observer", "dead_reckoning"))
+    assert "observer dead" in viewer._panel._head.content and not viewer._panel._status.visible
 
 
 def test_the_end_is_told(viewer: Viewer) -> None:
