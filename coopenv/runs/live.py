@@ -71,11 +71,8 @@ class Keyboard:
         actions = np.array(self._others(observations), dtype=float)
         pedal, wheel = self.keys.direction("up", "down"), self.keys.direction("left", "right")
         if self._longitudinal.name == "speed":
-            self._level = float(
-                np.clip(self._level + pedal * (1.0 - self._still) * self._period / FULL_SPEED, -1.0, 1.0)
-            )
-            if pedal < 0.0 and self._longitudinal.low == 0.0:
-                self._level = max(self._level, self._still)
+            step = pedal * (1.0 - self._still) * self._period / FULL_SPEED
+            self._level = float(np.clip(self._level + step, -1.0, 1.0))
         else:
             self._level = pedal
         step = self._period / FULL_STEERING

@@ -131,18 +131,15 @@ def _draw_targets(draw: ImageDraw.ImageDraw, stage: Stage, frame: Frame, vehicle
     pixels = lens.pixels(lens.in_camera(stage.targets(frame)))
     width, height = lens.size
     radius, colour = 3.5 * _SCALE, vehicle_colour(vehicle)
+    rims = {Sight.VISIBLE: "white", Sight.MISSED: colour, Sight.OCCLUDED_BY_BUILDING: GREY, Sight.OCCLUDED_BY_BODY: INK}
     for target in np.flatnonzero(np.isfinite(pixels).all(axis=1)):
         (u, v), kind = pixels[target], frame.sight[vehicle, target]
         inside = -4 <= u <= width + 4 and -4 <= v <= height + 4
-        if not inside or kind in (Sight.NOT_A_NEIGHBOUR, Sight.OUT_OF_VIEW):
+        if not inside or kind not in rims:
             continue
         x, y = _SCALE * float(u), _SCALE * float(v)
         around = [x - radius, y - radius, x + radius, y + radius]
-        if kind == Sight.VISIBLE:
-            draw.ellipse(around, fill=colour, outline="white", width=_SCALE)
-        else:
-            ring = {Sight.MISSED: colour, Sight.OCCLUDED_BY_BUILDING: GREY}.get(Sight(kind), INK)
-            draw.ellipse(around, outline=ring, width=_SCALE)
+        draw.ellipse(around, fill=colour if kind == Sight.VISIBLE else None, outline=rims[kind], width=_SCALE)
         hider = stage.hider(frame, vehicle, int(target))
         words = stage.short_name(int(target)) + (f" behind {hider}" if hider else "")
         side = "rs" if x > _SCALE * width * 0.7 else "ls"

@@ -122,7 +122,6 @@ def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
     """Explain the marks that can occur in a scenario, under a table of `rows` rows."""
     scenario, largest = stage.scenario, LARGEST_ELLIPSE * stage.side
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
-    moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
     honest = states_covariance(scenario.observer.name)
     way = ", and its way" if np.any(ways(scenario)) else ""
@@ -139,7 +138,7 @@ def draw_legend(figure: Figure, stage: Stage, rows: int) -> None:
         (sensed, "hidden by a body", shown[Sight.OCCLUDED_BY_BODY]),
         (any(camera.miss_probability > 0 for camera in scenario.cameras), "in view, but missed", shown[Sight.MISSED]),
         (True, "landmark", mark_look("o", DARK_BLUE, DARK_BLUE, 5, _RIM)),
-        (moving, "moving landmark", mark_look("D", DARK_BLUE, DARK_BLUE, 4.5, _RIM)),
+        (stage.moving.any(), "moving landmark", mark_look("D", DARK_BLUE, DARK_BLUE, 4.5, _RIM)),
         (scenario.cosimulator, "other traffic", {"facecolor": TRAFFIC, "edgecolor": "white", "linewidth": 0.8}),
         (goals, "goal", mark_look("o", GREY, "white", 7, _RIM)),
         (goals and end.arrival, "arrived", mark_look("*", INK, "white", 9, _RIM)),

@@ -331,9 +331,8 @@ def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
             found.append(stage.short_name(int(target)) + (f" (by {hider})" if hider else ""))
         return found
 
-    lines = [("sees", names(Sight.VISIBLE))]
-    lines.append(("hidden", [*names(Sight.OCCLUDED_BY_BODY), *names(Sight.OCCLUDED_BY_BUILDING)]))
-    lines.append(("missed", names(Sight.MISSED)))
+    hidden = [*names(Sight.OCCLUDED_BY_BODY), *names(Sight.OCCLUDED_BY_BUILDING)]
+    lines = ("sees", names(Sight.VISIBLE)), ("hidden", hidden), ("missed", names(Sight.MISSED))
     mark = stage.short_name(stage.landmarks + vehicle)
     listed = "; ".join(f"{word} {_plain(', '.join(found))}" for word, found in lines if found)
     return f"**{mark}** {listed or 'sees nothing'}"
