@@ -137,7 +137,8 @@ def free_lengths(origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float
     `reach` is one for all, or (N,) of each camera. Rays are unit vectors in the map frame.
     """
     enter = entries(np.repeat(origin, rays.shape[1], axis=0), rays.reshape(-1, 3), boxes)
-    return np.minimum(enter.min(axis=0, initial=np.inf).reshape(rays.shape[:2]), np.reshape(reach, (-1, 1)))
+    free = enter.min(axis=0, initial=np.inf).reshape(rays.shape[:2])
+    return np.asarray(np.minimum(free, np.reshape(reach, (-1, 1))))
 
 
 def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
