@@ -122,7 +122,7 @@ class Viewer:
         paths = [(eye, place - eye) for eye in eyes for place in places]
         start, path = np.array(paths).reshape(-1, 2, 3).swapaxes(0, 1)
         between = entries(start, path, self._stage.buildings) < 1.0
-        self._picture.ground.fade(between.any(axis=1))
+        self._picture.ground.fade(np.asarray(between.any(axis=1)))
 
     def _welcome(self, client: Any) -> None:
         """Start farther away in a narrow window."""

@@ -180,9 +180,10 @@ class TopView:
         self._collided = layers.points("X", INK, "white", 11)
         landmarks = [layers.keep(name) for name in ground.name_landmarks(self._axes, self.scenario)]
         self._goals.add_names(self._axes, layers, landmarks)
-        look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, "color": INK}
+        look: dict[str, Any] = {"fontsize": NORMAL, "weight": "bold", "color": INK, "path_effects": ground.HALO}
+        look |= {"ha": "center", "va": "center", "clip_on": True}
         marks = (ground.vehicle_mark(i) for i in range(len(colours)))
-        self._names = [layers.keep(self._axes.text(0, 0, mark, path_effects=ground.HALO, **look)) for mark in marks]
+        self._names = [layers.keep(self._axes.text(0, 0, mark, **look)) for mark in marks]
         boxes = [name.get_window_extent() for name in self._names]
         self._half_name = np.array([(box.width, box.height) for box in boxes]) / 2 * self._pixel
         self._moving_names = {
@@ -209,9 +210,10 @@ class TopView:
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
         self._rows = [self._layers.keep(self._figure.text(*place, "", color=INK, **look)) for place in places[:shown]]
-        side, rim = ground.pixels(ground.SWATCH, ground.SWATCH), {"edgecolor": INK, "linewidth": 0.5}
+        side = ground.pixels(ground.SWATCH, ground.SWATCH)
+        rim: dict[str, Any] = {"edgecolor": INK, "linewidth": 0.5, "transform": self._figure.transFigure}
         for i, place in enumerate(places[:shown]):
-            swatch = Rectangle(place, *side, transform=self._figure.transFigure, facecolor=vehicle_colour(i), **rim)
+            swatch = Rectangle(place, *side, facecolor=vehicle_colour(i), **rim)
             self._figure.add_artist(swatch)
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)

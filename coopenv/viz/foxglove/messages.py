@@ -184,7 +184,7 @@ def _transforms(view: RunView, k: int) -> Any:
         for child, (parent, R, p) in poses.items():
             if np.isfinite(R).all() and np.isfinite(p).all():
                 place = {"translation": _xyz(fox.Vector3, p), "rotation": _quaternion(R)}
-                frames = {"parent_frame_id": parent, "child_frame_id": child}
+                frames: dict[str, Any] = {"parent_frame_id": parent, "child_frame_id": child}
                 found.append(fox.FrameTransform(timestamp=view.stamp(k), **frames, **place))
     return fox.FrameTransforms(transforms=found)
 
