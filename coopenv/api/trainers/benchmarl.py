@@ -9,15 +9,14 @@ from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import NUMBERS, PlainInfos
 
 try:
-    from benchmarl.environments.common import TaskClass
-    from torchrl.data import Composite
+    from benchmarl.environments.pettingzoo.common import PettingZooClass
     from torchrl.envs import EnvBase
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 except ImportError as error:
     raise ImportError("coopenv.api.trainers.benchmarl needs BenchMARL: pip install '.[benchmarl]'") from error
 
 
-class CooperativeTask(TaskClass):
+class CooperativeTask(PettingZooClass):
     """One world per environment, all vehicles in the group `vehicle`; `task(name, **options)` builds it."""
 
     def get_env_fun(
@@ -48,26 +47,6 @@ class CooperativeTask(TaskClass):
     def has_render(self, env: EnvBase) -> bool:
         return bool(env.unwrapped.render_mode == "rgb_array")
 
-    def group_map(self, env: EnvBase) -> dict[str, list[str]]:
-        return dict(env.group_map)
-
-    def observation_spec(self, env: EnvBase) -> Composite:
-        return _only(env, "observation")
-
-    def info_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of `coopenv.api.parallel_env.NUMBERS`."""
-        return _only(env, "info")
-
-    def state_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of the truth, which a central critic may see."""
-        return Composite({"state": env.observation_spec["state"].clone()})
-
-    def action_spec(self, env: EnvBase) -> Composite:
-        return env.full_action_spec
-
-    def action_mask_spec(self, env: EnvBase) -> None:
-        return None
-
     @staticmethod
     def env_name() -> str:
         return "coopenv"
@@ -92,13 +71,3 @@ def task(name_or_path: str | Path, **options: Any) -> CooperativeTask:
         options: those of `coopenv.parallel_env`.
     """
     return CooperativeTask(name=Path(str(name_or_path)).stem, config={"env": name_or_path, **options})
-
-
-def _only(env: EnvBase, kept: str) -> Composite:
-    """Return the group's part of the observation spec with one entry left."""
-    spec = env.observation_spec.clone()
-    del spec["state"]
-    for key in list(spec["vehicle"].keys()):
-        if key != kept:
-            del spec["vehicle"][key]
-    return spec
