@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.arguments import RewardFunction, Step, check_function, reward_of
-from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.layout import Layout, observation_layout
 from coopenv.api.terms.own import OwnTerms
 from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results
 from coopenv.backends.base import Backend, SensingWorld
@@ -274,6 +274,53 @@ class Engine:
         self.refresh()
         overwrite(memory, checked)
         self.begun = bool(has_begun(self.view("start_rotation")).all())
+
+
+class Saved:
+    """What the environments of an engine share: its layout, and states that are saved and restored."""
+
+    engine: Engine
+    scenario: Scenario
+    metadata: dict[str, Any]
+    _arguments: dict[str, Any]
+    """Those that build an equal environment."""
+
+    @property
+    def observation_layout(self) -> Layout:
+        """Name, slice, unit and scale of every field of the flat observation."""
+        return self.engine.layout.copy()
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the next step depends on, random streams included; see `set_state`."""
+        return {"scenario": self.scenario, **self.engine.get_state()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `get_state`, of this or an equal environment.
+
+        A state is data except for plug-in observers, which are objects: a pickled state of unknown origin is as
+        dangerous as any pickle.
+
+        Raises:
+            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
+        """
+        try:
+            if not isinstance(state, Mapping):
+                raise CoopenvError(f"not a mapping, but {type(state).__name__}")
+            if state.get("scenario") != self.scenario:
+                raise CoopenvError("it is of another scenario")
+            self._restore(state)
+        except CoopenvError as error:
+            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        self.engine.set_state(state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"arguments": self._arguments, "state": self.get_state()}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__init__(**saved["arguments"])  # type: ignore[misc]
+        self.set_state(saved["state"])
 
 
 class PlugIns:

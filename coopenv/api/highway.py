@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.backends.highway import Followed, FollowedWorld, flipped, poses_of
+from coopenv.backends.highway import Followed, flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array, position_covariance
@@ -96,7 +96,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         if seed is not None:
             self._rng = np.random.default_rng(checked_seed(seed))
         self._board()
-        self._world.present = self._poses()
+        self._follow()
         self._engine.reset([int(self._rng.integers(2**63))])
         return self.highway.observation_type.observe(), self._with_localisation(info)
 
@@ -120,39 +120,34 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.highway.observation_type.observe = partial(self._observe, self.highway.observation_type.observe)
         if self.lane_keeping:
             agent.act = partial(self._act, agent.act)
+        key = (len(self._cars), self._most)
+        if key not in self._engines:
+            self._engines[key] = self._build(*key)
+        self._engine = self._engines[key]
+        self._world: Any = self._engine.world
 
     def _step_road(self, step: Any, dt: float) -> None:
         step(dt)
-        self._world.present = self._poses()
+        self._follow()
         self._engine.step(ticks=1)
 
     def _act(self, act: Any, action: Any = None) -> None:
         with moved_to({self._cars[-1]: self._estimated(len(self._cars) - 1)}):
             act(action)
 
-    @property
-    def _engine(self) -> Engine:
-        """Sensors and observers for as many cars as there are, among at most so many."""
-        count, most = len(self._cars), self._most
-        if (count, most) not in self._engines:
-            frequency = float(self.highway.config["simulation_frequency"])
-            cars = [{"motion": {"kind": "traffic"}}] * (count - 1) + [{"motion": {"kind": "driven"}}]
-            rates = {"rates.camera": frequency, "rates.decision": frequency, "rates.odometry": 5.0 * frequency}
-            fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], "highway.most_vehicles": most, **rates}
-            scenario: Scenario = self._load({**self._overrides, **fixed})
-            self._engines[count, most] = Engine(scenario, 1, backend=Followed(scenario))
-        return self._engines[count, most]
+    def _build(self, count: int, most: int) -> Engine:
+        """Return sensors and observers for so many cars among at most so many."""
+        frequency = float(self.highway.config["simulation_frequency"])
+        cars = [{"motion": {"kind": "traffic"}}] * (count - 1) + [{"motion": {"kind": "driven"}}]
+        rates = {"rates.camera": frequency, "rates.decision": frequency, "rates.odometry": 5.0 * frequency}
+        fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], "highway.most_vehicles": most, **rates}
+        scenario: Scenario = self._load({**self._overrides, **fixed})
+        return Engine(scenario, 1, backend=Followed(scenario))
 
-    @property
-    def _world(self) -> FollowedWorld:
-        world = self._engine.world
-        assert isinstance(world, FollowedWorld)
-        return world
-
-    def _poses(self) -> Any:
-        scenario = self._world.scenario
-        assert scenario.highway is not None
-        return poses_of(self._cars, self.highway.road, np.array(scenario.map.origin), scenario.highway.most_vehicles)
+    def _follow(self) -> None:
+        """Put the vehicles of the world where the cars are."""
+        origin = np.array(self._world.scenario.map.origin)
+        self._world.present = poses_of(self._cars, self.highway.road, origin, self._most)
 
     def _observe(self, observe: Any) -> Any:
         """Return the observation that highway-env makes when all cars have their estimated poses."""

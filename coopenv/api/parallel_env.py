@@ -19,8 +19,8 @@ from coopenv.api.arguments import (
     outcome_words,
     world_parameters,
 )
-from coopenv.api.engine import Engine
-from coopenv.api.terms.layout import Layout, action_space, observation_space
+from coopenv.api.engine import Engine, Saved
+from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
 from coopenv.base.errors import ActionError, CoopenvError, shown, suggest, world_keys
@@ -42,7 +42,7 @@ LIMIT = 1e6
 """m and m/s, far beyond any scene."""
 
 
-class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
+class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     """Connected vehicles at an intersection, each estimating its own pose.
 
     Observation (per agent): a flat float32 Box whose entries `observation_layout` names, or a one-level Dict of the
@@ -118,23 +118,15 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             self._np_random = seeding.np_random(None)[0]
         return self._np_random
 
-    @property
-    def observation_layout(self) -> Layout:
-        """Name, slice, unit and scale of every field of the flat observation."""
-        return self.engine.layout.copy()
-
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's observation space, the same object at every call."""
-        self._check_agent(agent)
+        check_choice("agent", agent, self._index)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's action space, the same object at every call."""
-        self._check_agent(agent)
-        return self.action_spaces[agent]
-
-    def _check_agent(self, agent: str) -> None:
         check_choice("agent", agent, self._index)
+        return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode.
@@ -312,39 +304,15 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
-        own = {"agents": list(self._agents), "scenario": self.scenario}
-        return {**own, **self.engine.get_state()}
+        return {"agents": list(self._agents), **super().get_state()}
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`, of this or an equal environment.
-
-        A state is data except for plug-in observers, which are objects: a pickled state of unknown origin is as
-        dangerous as any pickle.
-
-        Raises:
-            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
-        """
-        where = f"this state does not fit {self.metadata['name']}"
-        if not isinstance(state, Mapping):
-            raise CoopenvError(f"{where}: not a mapping, but {type(state).__name__}")
-        if state.get("scenario") != self.scenario:
-            raise CoopenvError(f"{where}: it is of another scenario")
+    def _restore(self, state: Mapping[str, Any]) -> None:
         agents: Any = state.get("agents")
         plain = isinstance(agents, list) and all(isinstance(agent, str) for agent in agents)
         if not plain or agents != [agent for agent in self.possible_agents if agent in agents]:
-            raise CoopenvError(f"{where}: its agents are {shown(agents)}, not some of {shown(self.possible_agents)}")
-        try:
-            self.engine.set_state(state)
-        except CoopenvError as error:
-            raise CoopenvError(f"{where}: {error}") from None
+            raise CoopenvError(f"its agents are {shown(agents)}, not some of {shown(self.possible_agents)}")
+        super()._restore(state)
         self._agents = list(agents)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"arguments": self._arguments, "state": self.get_state()}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__init__(**saved["arguments"])  # type: ignore[misc]
-        self.set_state(saved["state"])
 
 
 NUMBERS = ("position_error", "orientation_error", "nees", "arrived", "collided")

@@ -1,7 +1,7 @@
 """The batched Gymnasium environment: rows are (world, vehicle), for policies that all vehicles share."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from importlib.util import find_spec
 from typing import Any, Literal
@@ -22,8 +22,8 @@ from coopenv.api.arguments import (
     host_actions,
     world_parameters,
 )
-from coopenv.api.engine import Engine
-from coopenv.api.terms.layout import Layout, action_space, observation_space
+from coopenv.api.engine import Engine, Saved
+from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.base.errors import ActionError, CoopenvError, world_keys
 from coopenv.scenario import Scenario
 
@@ -37,7 +37,7 @@ since the start of the episode. `alive` is false for vehicles that had ended bef
 1 arrived, 2 collided, from 3 on a condition of the scenario's own; errors in m and deg."""
 
 
-class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
     """`num_worlds` worlds; row r is vehicle r % vehicles of world r // vehicles.
 
     A vehicle that ends (collision, arrival) reports `terminated` once; it stays in its world, parked, with reward 0 and
@@ -108,11 +108,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The batch of `single_action_space`."""
         return batch_space(self.single_action_space, self.num_envs)
-
-    @property
-    def observation_layout(self) -> Layout:
-        """Name, slice, unit and scale of every field of an observation row."""
-        return self.engine.layout.copy()
 
     def world_major(self, rows: Any) -> Any:
         """Return rows (num_envs, ...) as (num_worlds, vehicles, ...), without a copy."""
@@ -299,34 +294,11 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         pictures = [self.engine.picture(world) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
-    def get_state(self) -> dict[str, Any]:
-        """Return everything that the next step depends on, random streams included."""
-        return {"scenario": self.scenario, **self.engine.get_state()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`; on states of unknown origin see `CooperativeLocalisationEnv.set_state`.
-
-        Raises:
-            CoopenvError: it is of another kind of environment, or not valid; nothing has changed then.
-        """
-        where = f"this state does not fit {self.metadata['name']}"
-        if not isinstance(state, Mapping) or state.get("scenario") != self.scenario:
-            raise CoopenvError(f"{where}: it is of another scenario")
-        try:
-            self.engine.set_state(state)
-        except CoopenvError as error:
-            raise CoopenvError(f"{where}: {error}") from None
-
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            "arguments": self._arguments,
-            "state": self.get_state(),
-            "random": (self._np_random, self._np_random_seed),
-        }
+        return {**super().__getstate__(), "random": (self._np_random, self._np_random_seed)}
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__init__(**saved["arguments"])  # type: ignore[misc]
-        self.set_state(saved["state"])
+        super().__setstate__(saved)
         self._np_random, self._np_random_seed = saved["random"]
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -6,6 +6,7 @@ Hinkley, Bootstrap Methods and their Application, 1997, 3.8 (resampling of clust
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -145,27 +146,22 @@ def _counted(episodes: Episodes, start: float) -> np.ndarray:
     return np.asarray(episodes.under_way & (episodes.time >= start - 1e-9)[:, None, None])
 
 
-def _quantile(name: str, share: float, start: float) -> Callable[[Episodes], Statistic]:
-    def of(episodes: Episodes) -> Statistic:
-        counted = _counted(episodes, start)
-        return Quantile(getattr(episodes, name)[counted], np.nonzero(counted)[1], episodes.worlds, share)
-
-    return of
+def _over_moments(counted: np.ndarray, values: np.ndarray, root: bool = False) -> Ratio:
+    """Return the mean of values (K, W, N) over the moments that count."""
+    return Ratio(np.where(counted, values, 0.0).sum(axis=(0, 2)), counted.sum(axis=(0, 2)), root)
 
 
-def _rmse(name: str, start: float) -> Callable[[Episodes], Statistic]:
-    def of(episodes: Episodes) -> Statistic:
-        counted = _counted(episodes, start)
-        squares = np.where(counted, getattr(episodes, name).astype(float) ** 2, 0.0)
-        return Ratio(squares.sum(axis=(0, 2)), counted.sum(axis=(0, 2)), root=True)
+def _quantile(name: str, share: float, start: float, episodes: Episodes) -> Statistic:
+    counted = _counted(episodes, start)
+    return Quantile(getattr(episodes, name)[counted], np.nonzero(counted)[1], episodes.worlds, share)
 
-    return of
+
+def _rmse(name: str, start: float, episodes: Episodes) -> Statistic:
+    return _over_moments(_counted(episodes, start), getattr(episodes, name).astype(float) ** 2, root=True)
 
 
 def _few_targets(episodes: Episodes) -> Statistic:
-    counted = _counted(episodes, SETTLED_FROM)
-    few = counted & (episodes.targets_in_view < FEW_TARGETS)
-    return Ratio(few.sum(axis=(0, 2)), counted.sum(axis=(0, 2)))
+    return _over_moments(_counted(episodes, SETTLED_FROM), episodes.targets_in_view < FEW_TARGETS)
 
 
 def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, Metric]:
@@ -175,9 +171,9 @@ def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, 
         span = f"from {SETTLED_FROM:g} s on" if start else "over the whole episode"
         for short, share, word in (("e50", 0.5, "Median"), ("e95", 0.95, "95th percentile")):
             meaning = f"{word} of the {quantity} error {span}"
-            found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, _quantile(name, share, start))
+            found[f"{prefix}{short}{when}_{unit}"] = Metric(meaning, unit, partial(_quantile, name, share, start))
         meaning = f"Root mean square of the {quantity} error {span}"
-        found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, _rmse(name, start))
+        found[f"{prefix}rmse{when}_{unit}"] = Metric(meaning, unit, partial(_rmse, name, start))
     return found
 
 
@@ -240,15 +236,11 @@ def score(episodes: Episodes, seed: int = 0) -> list[Result]:
         statistic = metric.of(episodes)
         low, high = interval(statistic.resampled(counts)) if statistic.worlds > 1 else (np.nan, np.nan)
         if metric.is_share and low == high:  # nothing to resample: all worlds agree
-            low, high = _certain(statistic.value, statistic.worlds)
+            # Vehicles of a world count as one trial.
+            widest = wilson_interval(round(statistic.value * statistic.worlds), statistic.worlds)
+            low, high = min(*widest, statistic.value), max(*widest, statistic.value)
         results.append(Result(name, statistic.value, low, high, statistic.worlds))
     return results
-
-
-def _certain(share: float, worlds: int) -> Interval:
-    """Return the interval of a share that was the same in every world; vehicles of a world count as one trial."""
-    low, high = wilson_interval(round(share * worlds), worlds)
-    return Interval(min(low, share), max(high, share))
 
 
 def compare_paired(episodes: Episodes, other: Episodes, seed: int = 0) -> list[Difference]:

@@ -41,10 +41,6 @@ class _Path(NamedTuple):
         along = self.along + stride * np.cos(heading - bend)
         return _Path(self.x + dx, self.y + dy, heading, along, self.aside + stride * np.sin(heading - bend)), dx, dy
 
-    def repeated(self, count: int) -> "_Path":
-        """Return every plan so many times in a row."""
-        return _Path(*(np.repeat(part, count, axis=1) for part in self))
-
 
 class LookAhead(RouteFollower):
     """The route follower with the heading of the best of many plans.
@@ -120,7 +116,9 @@ class LookAhead(RouteFollower):
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
                 count = len(self._offsets)
-                now, covariance, cost = now.repeated(count), covariance.repeated(count), np.repeat(cost, count, axis=1)
+                now = _Path(*(np.repeat(part, count, axis=1) for part in now))
+                covariance = PlanarCovariance(*(np.repeat(part, count, axis=1) for part in covariance))
+                cost = np.repeat(cost, count, axis=1)
                 offsets = np.tile(self._offsets, count)
             bend = np.take_along_axis(pieces, np.searchsorted(bends, now.along, side="right") - 1, axis=1)
             wanted = bend + np.where(offsets == 0.0, -np.arctan(now.aside / self.look_ahead), offsets)

@@ -100,10 +100,6 @@ class PlanarCovariance(NamedTuple):
             self.hh - gain * h * h,
         )
 
-    def repeated(self, count: int) -> "PlanarCovariance":
-        """Return every entry (rows, P) so many times in a row, (rows, P count)."""
-        return PlanarCovariance(*(np.repeat(part, count, axis=1) for part in self))
-
     @property
     def std(self) -> np.ndarray:
         """Standard deviation of the position, (...), m: the root of the trace."""

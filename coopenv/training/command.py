@@ -6,7 +6,9 @@ while writing keeps the one before.
 """
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel, Field
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
@@ -126,10 +129,9 @@ def train(
     check_settings(out, plan, environment)
     if onnx:
         check_onnx()
-    trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
-    judge = partial(_judge, trainer, threads, report)
-    try:
+    with closing(Trainer(plan, scenario, threads)) as trainer:
+        judge = partial(_judge, trainer, threads, report)
         with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.log_to(str(tensorboard))
@@ -147,8 +149,6 @@ def train(
             raise DivergedError(f"{error}; {left}, remove it to begin anew with other settings") from None
         with replacing_folder(out, (*NAMES, environment.name)) as folder:
             export(folder, out, trainer, environment, results, curve, onnx)
-    finally:
-        trainer.close()
     return results
 
 
@@ -177,30 +177,28 @@ def _learn(
 
 def _judge(trainer: Trainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
     """Return how the mean action drives in held-out worlds."""
-    engine = Engine(trainer.scenario, len(seeds), threads=threads)
-    try:
+    with closing(Engine(trainer.scenario, len(seeds), threads=threads)) as engine:
         results = score(drive(engine, trainer.mean_action, seeds))
-    finally:
-        engine.close()
     report.judged(trainer.status.steps, results)
     return results
 
 
-@dataclass(frozen=True)
-class Checkpoint:
+class Checkpoint(BaseModel):
     """What a file holds."""
 
     path: Path
     plan: Plan
     scenario: str
     """JSON of the scenario, to find out whether it is still the same."""
-    progress: dict[str, Any]
-    curve: list[dict[str, float]]
-    onnx: bool
+    progress: dict[str, int | float]
+    """`steps`, `seconds` and `cpu_seconds`."""
+    curve: list[dict[str, int | float]]
+    onnx: bool = False
     """Whether an ONNX model is to be written, too, as the command line said."""
-    logs: Path | None
+    logs: Path | None = None
     """Its folder for TensorBoard; None: in the agent's folder."""
-    arrays: Arrays
+    arrays: dict[str, dict[str, Any]] = Field(repr=False)
+    """By what they restore, and by name."""
 
 
 def save(
@@ -241,17 +239,15 @@ def read(path: Path) -> Checkpoint:
     if not path.is_file():
         raise CoopenvError(f"nothing to resume: there is no {path}")
     try:
+        arrays: dict[str, Arrays] = defaultdict(dict)
         with safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {})[HEADER])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            for key in file.keys():  # noqa: SIM118 (not a dict)
+                group, _, name = key.partition("/")
+                arrays[group][name] = file.get_tensor(key)
         if header["format"] != FORMAT:
             raise CoopenvError(f"{path}: a checkpoint of format {header['format']}, expected {FORMAT}")
-        plan = Plan.of_document(header["plan"])
-        counts = header["progress"]
-        progress = {"steps": int(counts["steps"]), **{name: float(counts[name]) for name in ("seconds", "cpu_seconds")}}
-        logs = header.get("logs")  # checkpoints of before there was such an entry go on without
-        outputs = bool(header.get("onnx")), None if logs is None else Path(logs)
-        return Checkpoint(path, plan, header["scenario"], progress, header["curve"], *outputs, arrays)
+        return Checkpoint.model_validate({**header, "path": path, "arrays": arrays})
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, CoopenvError):
             raise
@@ -267,28 +263,47 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
     if checkpoint.scenario != trainer.scenario.model_dump_json():
         name = trainer.plan.environment
         raise CoopenvError(f"{checkpoint.path}: {name} has changed since; remove the file to start anew")
+    policy, statistics, arrays = trainer.model.policy, trainer.env.statistics, checkpoint.arrays
     try:
-        _restore(checkpoint, trainer)
+        policy.load_state_dict(_tensors(arrays["policy"]), strict=True)
+        moments: dict[int, dict[str, torch.Tensor]] = defaultdict(dict)
+        for name, values in _tensors(arrays.get("optimiser", {})).items():
+            index, _, moment = name.partition("/")
+            moments[int(index)][moment] = values
+        policy.optimizer.load_state_dict({**policy.optimizer.state_dict(), "state": moments})
+        for name in ("mean", "var"):
+            found = arrays["statistics"][name]
+            if found.shape != statistics.mean.shape:
+                raise ValueError(f"statistics/{name} has shape {found.shape}")
+            setattr(statistics, name, found)
+        statistics.count = float(arrays["statistics"]["count"])
+        torch.set_rng_state(torch.from_numpy(arrays["random"]["torch"]))
+        key, position = np.split(arrays["random"]["numpy"], [-1])
+        np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
+        trainer.model.num_timesteps = checkpoint.progress["steps"]
+        trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
+        if "world" in arrays:
+            trainer.env.go_on_from(trainer.batch.set_state(arrays["world"]))
+        else:
+            trainer.batch.seed(trainer.plan.seed + trainer.model.num_timesteps)
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise CoopenvError(f"{checkpoint.path}: does not fit: {error}; remove it to start anew") from None
-    trainer.model.num_timesteps = checkpoint.progress["steps"]
-    trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
 
 
 def _arrays(trainer: Trainer) -> Arrays:
     policy, statistics = trainer.model.policy, trainer.env.statistics
-    arrays = {f"policy/{name}": values.numpy() for name, values in policy.state_dict().items()}
-    for index, moments in policy.optimizer.state_dict()["state"].items():
-        arrays |= {f"optimiser/{index}/{name}": values.numpy() for name, values in moments.items()}
-    arrays |= {
-        "statistics/mean": statistics.mean,
-        "statistics/var": statistics.var,
-        "statistics/count": np.array(statistics.count),
-    }
+    moments = policy.optimizer.state_dict()["state"].items()
     _, key, position, *_ = np.random.get_state()
-    arrays |= {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.append(key, np.uint32(position))}
-    arrays |= {f"world/{name}": values for name, values in _worlds(trainer).items()}
-    return {name: np.array(values, order="C") for name, values in arrays.items()}
+    groups: dict[str, Mapping[str, Any]] = {
+        "policy": policy.state_dict(),
+        "optimiser": {f"{index}/{name}": values for index, row in moments for name, values in row.items()},
+        "statistics": {name: getattr(statistics, name) for name in ("mean", "var", "count")},
+        "random": {"torch": torch.get_rng_state(), "numpy": np.append(key, np.uint32(position))},
+        "world": _worlds(trainer),
+    }
+    return {
+        f"{group}/{name}": np.array(values, order="C") for group, row in groups.items() for name, values in row.items()
+    }
 
 
 def _worlds(trainer: Trainer) -> Arrays:
@@ -301,34 +316,6 @@ def _worlds(trainer: Trainer) -> Arrays:
     state: Mapping[str, object] = trainer.batch.get_state()
     arrays = {name: values for name, values in state.items() if isinstance(values, np.ndarray)}
     return arrays if len(arrays) == len(state) else {}
-
-
-def _restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
-    policy, statistics = trainer.model.policy, trainer.env.statistics
-    policy.load_state_dict(_tensors(_under("policy/", checkpoint.arrays)), strict=True)
-    moments: dict[int, dict[str, torch.Tensor]] = {}
-    for name, values in _tensors(_under("optimiser/", checkpoint.arrays)).items():
-        index, _, moment = name.partition("/")
-        moments.setdefault(int(index), {})[moment] = values
-    policy.optimizer.load_state_dict({**policy.optimizer.state_dict(), "state": moments})
-    for name in ("mean", "var"):
-        found = checkpoint.arrays[f"statistics/{name}"]
-        if found.shape != statistics.mean.shape:
-            raise ValueError(f"statistics/{name} has shape {found.shape}")
-        setattr(statistics, name, found)
-    statistics.count = float(checkpoint.arrays["statistics/count"])
-    torch.set_rng_state(torch.from_numpy(checkpoint.arrays["random/torch"]))
-    key, position = np.split(checkpoint.arrays["random/numpy"], [-1])
-    np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
-    world = _under("world/", checkpoint.arrays)
-    if world:
-        trainer.env.go_on_from(trainer.batch.set_state(world))
-    else:
-        trainer.batch.seed(trainer.plan.seed + checkpoint.progress["steps"])
-
-
-def _under(prefix: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
-    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
 
 
 def _tensors(arrays: Arrays) -> dict[str, torch.Tensor]:

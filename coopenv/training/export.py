@@ -104,27 +104,30 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         settings=settings,
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
-    document = tomlkit.document()
-    document["title"] = f"Learned driver of {environment.title}"
-    document["description"] = f"PPO, one policy for all vehicles{arm}, seed {plan.seed}."
-    document["kind"] = "learned"
-    document["entry"] = ENTRY
-    document["environments"] = [environment.name]
-    document["network"] = _with_rows(card.model_dump(), "observation", "action")
-    document["training"] = {
-        # trains the same once more, in the agent's folder
-        "command": join(["coopenv", "train", environment.name, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)]),
-        "environment": environment.name,
-        "seed": plan.seed,
-        "scenario": scenario_digest(trainer.scenario),
-        "settings": settings_digest(plan),
-        **({"arm": plan.arm} if plan.arm else {}),
-        "steps": trainer.status.steps,
-        "minutes": round(trainer.status.seconds / 60.0, 2),
-        "cpu_minutes": round(trainer.cpu_seconds / 60.0, 2),
-        "versions": {"coopenv": version(), **versions(*PACKAGES)},
+    document = {
+        "title": f"Learned driver of {environment.title}",
+        "description": f"PPO, one policy for all vehicles{arm}, seed {plan.seed}.",
+        "kind": "learned",
+        "entry": ENTRY,
+        "environments": [environment.name],
+        "network": _with_rows(card.model_dump(), "observation", "action"),
+        "training": {
+            # trains the same once more, in the agent's folder
+            "command": join(
+                ["coopenv", "train", environment.name, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)]
+            ),
+            "environment": environment.name,
+            "seed": plan.seed,
+            "scenario": scenario_digest(trainer.scenario),
+            "settings": settings_digest(plan),
+            **({"arm": plan.arm} if plan.arm else {}),
+            "steps": trainer.status.steps,
+            "minutes": round(trainer.status.seconds / 60.0, 2),
+            "cpu_minutes": round(trainer.cpu_seconds / 60.0, 2),
+            "versions": {"coopenv": version(), **versions(*PACKAGES)},
+        },
+        "results": _with_rows({"figures": _figures(results)}, "figures"),
     }
-    document["results"] = _with_rows({"figures": _figures(results)}, "figures")
     return tomlkit.dumps(document)
 
 

@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, model_validator
 
 from coopenv.base.errors import CoopenvError, OutputError, suggest
 from coopenv.base.files import writing
@@ -134,14 +134,6 @@ class Plan:
         """Return it as plain data."""
         document: dict[str, Any] = TypeAdapter(Plan).dump_python(self, mode="json")
         return document
-
-    @classmethod
-    def of_document(cls, document: Mapping[str, Any]) -> "Plan":
-        """Return the plan of what `document` returned. Raises CoopenvError: it is none."""
-        try:
-            return TypeAdapter(Plan).validate_json(json.dumps(document), strict=True)
-        except (ValidationError, TypeError) as error:
-            raise CoopenvError(f"not the plan of a training: {type(error).__name__}") from None
 
 
 def read_settings(

@@ -14,11 +14,9 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from coopenv.api.terms.layout import action_fields
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
@@ -157,45 +155,6 @@ class NormalisedEnv(VecEnvWrapper):
 BATCH = 512  # rows per gradient step
 
 
-def imitate(
-    policy: ActorCriticPolicy,
-    env: NormalisedEnv,
-    clone: Clone,
-    plan: Plan,
-    report: Callable[[str], None],
-) -> None:
-    """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
-
-    Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that its
-    corrections of deviations are recorded (Laskey et al. 2017).
-
-    Args:
-        policy: to be fitted.
-        env: whose statistics are to be filled.
-        clone: driver and number of episodes.
-        plan: with the discount, the scale of rewards, and the seed of the worlds, the noise and the order of rows.
-        report: called with a line on the progress.
-    """
-    ppo = plan.settings.ppo
-    raw, actions, returns = watch(env.venv.envs, clone, ppo.gamma, plan.seed, report)
-    env.statistics.update(raw)
-    observations = torch.from_numpy(env.normalise(raw))
-    targets = torch.from_numpy(actions.astype(np.float32))
-    values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
-    optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
-    shuffle = torch.Generator().manual_seed(plan.seed)
-    for epoch in range(clone.epochs):
-        report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
-        for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
-            latent_policy, latent_value = policy.mlp_extractor(observations[rows])
-            action_error = policy.action_net(latent_policy) - targets[rows]
-            value_error = policy.value_net(latent_value).squeeze(-1) - values[rows]
-            loss = (action_error**2).mean() + (value_error**2).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-
-
 def watch(
     like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, report: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -211,7 +170,7 @@ def watch(
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
         report(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
-        action = decide(driver, observation, len(action_fields(scenario)))
+        action = decide(driver, observation, scenario.action.size)
         tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way
         observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
@@ -293,8 +252,33 @@ class Trainer:
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
         """Clone another driver, if settings name one, and start the first episodes; `report` gets progress lines."""
         if self.plan.settings.clone is not None:
-            imitate(self.model.policy, self.env, self.plan.settings.clone, self.plan, report)
+            self._imitate(self.plan.settings.clone, report)
         self.env.start()
+
+    def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
+        """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
+
+        Its observations are also the first in the statistics for normalisation. Noise is added to its actions, so that
+        its corrections of deviations are recorded (Laskey et al. 2017).
+        """
+        policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
+        raw, actions, returns = watch(self.batch.envs, clone, ppo.gamma, seed, report)
+        self.env.statistics.update(raw)
+        observations = torch.from_numpy(self.env.normalise(raw))
+        targets = torch.from_numpy(actions.astype(np.float32))
+        values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
+        optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
+        shuffle = torch.Generator().manual_seed(seed)
+        for epoch in range(clone.epochs):
+            report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
+            for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
+                latent_policy, latent_value = policy.mlp_extractor(observations[rows])
+                action_error = policy.action_net(latent_policy) - targets[rows]
+                value_error = policy.value_net(latent_value).squeeze(-1) - values[rows]
+                loss = (action_error**2).mean() + (value_error**2).mean()
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.

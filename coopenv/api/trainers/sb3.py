@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.arguments import outcome_words
+from coopenv.api.engine import Engine
 from coopenv.api.make import make_vec
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv, RecordVehicleEpisodes
@@ -52,7 +53,7 @@ class CooperativeSB3VecEnv(VecEnv):
     def __init__(self, envs: CooperativeVectorEnv) -> None:
         """Show a batch with the autoreset mode SAME_STEP and NumPy arrays; `make_sb3_vec_env` builds one by name."""
         self.envs = envs
-        self.scenario, self.engine, self.vehicles = envs.scenario, envs.engine, envs.vehicles
+        self.scenario, self.vehicles = envs.scenario, envs.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
         self.acted = np.zeros(envs.num_envs, dtype=bool)
         """(num_envs,) whether the row's vehicle was under way in the last step."""
@@ -61,6 +62,11 @@ class CooperativeSB3VecEnv(VecEnv):
         self._recorder = RecordVehicleEpisodes(envs)
         self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    @property
+    def engine(self) -> Engine:
+        """That of the batch; a copy of a batch builds its own."""
+        return self.envs.engine
 
     @property
     def observation_layout(self) -> Layout:
@@ -167,13 +173,6 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def __copy__(self) -> "CooperativeSB3VecEnv":
         return copy.deepcopy(self)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "engine"}
-
-    def __setstate__(self, saved: dict[str, Any]) -> None:
-        self.__dict__.update(saved)
-        self.engine = self.envs.engine
 
     def _all(self, indices: VecEnvIndices, what: str) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
