@@ -351,22 +351,12 @@ class RecordVehicleEpisodes(VectorWrapper):
         if self._batch.arrays != "numpy":
             raise CoopenvError("RecordVehicleEpisodes needs NumPy arrays: make_vec(arrays='numpy')")
         self._names = ("r", "l", *self._batch.engine.reward_terms)
-        self._sums = np.zeros((len(self._names), self.num_envs))
+        self.sums = np.zeros((len(self._names), self.num_envs))
+        """Return, decisions and reward terms of the episodes under way, (2 + terms, num_envs)."""
         self._waiting = np.zeros(self.num_envs, dtype=bool)
         self.episode_count = 0
         self.return_queue: deque[float] = deque(maxlen=buffer_length)
         self.length_queue: deque[int] = deque(maxlen=buffer_length)
-
-    @property
-    def sums(self) -> np.ndarray:
-        """Return, decisions and reward terms of the episodes under way, (2 + terms, num_envs), for a saved state."""
-        return self._sums.copy()
-
-    @sums.setter
-    def sums(self, sums: np.ndarray) -> None:
-        if sums.shape != self._sums.shape or not np.isfinite(sums).all():
-            raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._sums.shape}")
-        self._sums[...] = sums
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the batch, and the sums of the rows that were reset."""
@@ -375,7 +365,7 @@ class RecordVehicleEpisodes(VectorWrapper):
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
         if chosen.shape != (self.num_envs,):
             chosen = np.repeat(chosen, self._batch.vehicles)
-        self._sums[:, chosen] = 0.0
+        self.sums[:, chosen] = 0.0
         self._waiting[chosen] = False
         return result
 
@@ -385,13 +375,13 @@ class RecordVehicleEpisodes(VectorWrapper):
         step = infos.get("final_info", infos)
         acted, over = step["alive"] & ~self._waiting, terminated | truncated
         terms = (step["reward_terms"][name] for name in self._names[2:])
-        self._sums += np.where(acted, [rewards, np.ones_like(rewards), *terms], 0.0)
+        self.sums += np.where(acted, [rewards, np.ones_like(rewards), *terms], 0.0)
         if self._batch.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._waiting = over
         ended = acted & over
         if ended.any():
-            sums: dict[str, Any] = dict(zip(self._names, np.where(ended, self._sums, 0.0), strict=True))
-            self._sums[:, ended] = 0.0
+            sums: dict[str, Any] = dict(zip(self._names, np.where(ended, self.sums, 0.0), strict=True))
+            self.sums[:, ended] = 0.0
             of_terms = {name: sums.pop(name) for name in self._names[2:]}
             episode = {"r": sums["r"], "l": sums["l"].astype(int), "reward_terms": of_terms}
             infos = {**infos, "episode": episode, "_episode": ended}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -84,19 +83,18 @@ class AgentCard(BaseModel):
     """What it reached on held-out maps when it was trained."""
 
 
-@dataclass(frozen=True)
-class Agent:
-    """A driver that has been found, not yet built."""
+class Agent(AgentCard):
+    """A driver that has been found, not yet built: what its card holds, as it means the same from any folder.
+
+    One of an import path has no more than a name and an entry: a class, which is built with the scenario and the
+    options, or else a policy.
+    """
 
     name: str
     """What tables call it."""
-    entry: str
-    """A class, which is built with the scenario and the options, or else a policy."""
-    kind: Kind = "scripted"  # see `Kind`
+    title: str = ""
+    description: str = ""
     environments: tuple[str, ...] = ()
-    """Names, or paths of TOML files."""
-    options: Mapping[str, Any] = field(default_factory=dict)  # that its class is built with
-    description: str = ""  # what it does, in a sentence
     folder: Path | None = None
     """Where its `agent.toml` and its card are; None for an import path."""
 
@@ -106,12 +104,11 @@ class Agent:
         Raises:
             CoopenvError: there is no such code, or it cannot drive this environment.
         """
-        factory: Any = installation.load_reference(self.entry)
-        if not isinstance(factory, type):
-            if self.options or not callable(factory):
+        made: Any = installation.load_reference(self.entry)
+        if not isinstance(made, type):
+            if self.options or not callable(made):
                 raise CoopenvError(f"agent '{self.name}': {self.entry} is not a class, nor a function without options")
-            return cast(Policy, factory)
-        made: Any = factory
+            return cast(Policy, made)
         try:
             policy: Policy = made(scenario, **self.options)
         except (Exception, SystemExit) as error:  # code of a user
@@ -164,20 +161,19 @@ def find_agent(name_or_place: str | Path) -> Agent:
     """
     name, names = str(name_or_place), list_agents()
     if name not in names and installation.is_reference(name):
-        return Agent(name.rpartition(":")[2], installation.absolute_reference(name))
+        return Agent(name=name.rpartition(":")[2], entry=installation.absolute_reference(name))
     check_agent(name)
     folder = data_directory("agents") / name if name in names else Path(name)
     card = read_card(folder)
     if not installation.is_reference(card.entry):
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
-    entry = installation.absolute_reference(card.entry, folder)
-    known = card.model_dump(exclude={"title", "entry", "network", "training", "results"})
-    known["environments"] = tuple(
-        str(folder / environment) if environment.endswith(".toml") else environment for environment in card.environments
-    )
-    if card.network is not None:
-        known["options"] |= {"folder": folder, "network": card.network}
-    return Agent(folder.resolve().name, entry, folder=folder, **known)
+    network = {} if card.network is None else {"folder": folder, "network": card.network}
+    absolute = {
+        "entry": installation.absolute_reference(card.entry, folder),
+        "environments": tuple(str(folder / name) if name.endswith(".toml") else name for name in card.environments),
+        "options": {**card.options, **network},
+    }
+    return Agent(**{**dict(card), **absolute}, name=folder.resolve().name, folder=folder)
 
 
 def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> None:

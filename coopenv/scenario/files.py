@@ -90,32 +90,32 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
 
 def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
     """Merge the table `vehicle_defaults` under every entry of `vehicles`. Raises ScenarioError: it is not a table."""
-    merged = dict(raw)
-    defaults = merged.pop(DEFAULTS_KEY, {})
+    filled = dict(raw)
+    defaults = filled.pop(DEFAULTS_KEY, {})
     if not isinstance(defaults, dict):
         raise ScenarioError(f"{where}: {DEFAULTS_KEY}: must be a table, got {shown(defaults)}")
-    vehicles = merged.get("vehicles")
+    vehicles = filled.get("vehicles")
     if isinstance(vehicles, list):
-        merged["vehicles"] = [_with_defaults(defaults, v) if isinstance(v, dict) else v for v in vehicles]
-    return merged
+        filled["vehicles"] = [_with_defaults(defaults, v) if isinstance(v, dict) else v for v in vehicles]
+    return filled
 
 
 def _with_defaults(defaults: Mapping[str, Any], vehicle: Mapping[str, Any]) -> dict[str, Any]:
-    result: dict[str, Any] = _merged(defaults, vehicle)
+    result: dict[str, Any] = merged(defaults, vehicle)
     motion = result.get("motion")
     if isinstance(motion, dict) and motion.get("kind") == "waypoints" and "initial_pose" not in vehicle:
         result.pop("initial_pose", None)  # such a motion starts at its first waypoint
     return result
 
 
-def _merged(under: Any, over: Any) -> Any:
+def merged(under: Any, over: Any) -> Any:
     """Return `over` on top of `under`; tables are merged unless they are of different kinds."""
     if (
         not (isinstance(under, Mapping) and isinstance(over, Mapping))
         or over.get("kind", kind := under.get("kind")) != kind
     ):
         return over
-    return {**under, **{key: _merged(under.get(key), value) for key, value in over.items()}}
+    return {**under, **{key: merged(under.get(key), value) for key, value in over.items()}}
 
 
 def override(raw: Any, overrides: Mapping[str, Any]) -> None:
@@ -135,7 +135,7 @@ def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "")
             node[place] = dict(below) if isinstance(below, dict) else below
             _descend(node[place], rest, value, key, head)
         else:
-            node[place] = _merged(below, value) if isinstance(node, dict) else value
+            node[place] = merged(below, value) if isinstance(node, dict) else value
 
 
 def _indices(node: list[Any], head: str, key: str, parent: str) -> Iterable[int]:

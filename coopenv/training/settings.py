@@ -18,6 +18,7 @@ from coopenv.base.installation import is_scene, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.scenario.base import NonNegative, Positive, Probability
+from coopenv.scenario.files import merged
 from coopenv.scenario.own_terms import SECTIONS, located
 from coopenv.scenario.scenes import scene_text
 
@@ -167,7 +168,7 @@ def read_settings(
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
     for place, change in changed.items():
         scenario = _flat(change.get("scenario", {}), f"{where}: {place}")
-        raw = _merged(raw, {**change, "scenario": scenario})
+        raw = merged(raw, {**change, "scenario": scenario})
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
@@ -189,15 +190,6 @@ def _flat(tables: Any, where: str) -> dict[str, Any]:
         inner = _flat(value, where) if isinstance(value, dict) else None
         flat.update({key: value} if inner is None else {f"{key}.{name}": each for name, each in inner.items()})
     return flat
-
-
-def _merged(base: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table with the values of another before its own, tables within it alike."""
-    merged = dict(base)
-    for key, value in change.items():
-        inner = merged.get(key)
-        merged[key] = _merged(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
-    return merged
 
 
 class EnvironmentFile(NamedTuple):

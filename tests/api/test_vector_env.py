@@ -24,6 +24,13 @@ def actions_for(env: coopenv.CooperativeVectorEnv, rng: np.random.Generator) -> 
     return rng.uniform(-1.0, 1.0, (env.num_envs, 2)).astype(np.float32)
 
 
+def busy(num_worlds: int = 2, **options: Any) -> tuple[coopenv.CooperativeVectorEnv, np.ndarray]:
+    """Return a batch that has been reset with seed 1, and actions of zero for its rows."""
+    env = coopenv.make_vec("busy_intersection", num_worlds=num_worlds, **options)
+    env.reset(seed=1)
+    return env, np.zeros((env.num_envs, 2), dtype=np.float32)
+
+
 @pytest.mark.parametrize("name", ENVS)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
@@ -73,10 +80,9 @@ def test_threads_do_not_matter(autoreset: str) -> None:
 
 
 def test_next_step_mode() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5})
+    env, zero = busy(overrides={"horizon": 0.5})
     assert env.metadata["autoreset_mode"] is env.autoreset_mode is AutoresetMode.NEXT_STEP
     first, _ = env.reset(seed=1)
-    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
     for _ in range(4):
         _, _, terminated, truncated, _ = env.step(zero)
         assert not (terminated | truncated).any()
@@ -89,11 +95,7 @@ def test_next_step_mode() -> None:
 
 
 def test_same_step_mode() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5}, autoreset="same_step")
-    twin = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5}, autoreset="disabled")
-    env.reset(seed=1)
-    twin.reset(seed=1)
-    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    (env, zero), (twin, _) = (busy(overrides={"horizon": 0.5}, autoreset=mode) for mode in ("same_step", "disabled"))
     for step in range(1, 11):
         observation, reward, _, truncated, infos = env.step(zero)
         expected = twin.step(zero)
@@ -110,9 +112,7 @@ def test_same_step_mode() -> None:
 
 
 def test_disabled_mode_resets_by_mask() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=3, autoreset="disabled")
-    env.reset(seed=1)
-    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    env, zero = busy(3, autoreset="disabled")
     for _ in range(3):
         before, *_ = env.step(zero)
     mask = np.zeros(env.num_envs, dtype=bool)
@@ -127,9 +127,7 @@ def test_disabled_mode_resets_by_mask() -> None:
 
 
 def test_over_worlds_wait_in_disabled_mode() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=1, overrides={"horizon": 0.2}, autoreset="disabled")
-    env.reset(seed=1)
-    zero = np.zeros((5, 2), dtype=np.float32)
+    env, zero = busy(1, overrides={"horizon": 0.2}, autoreset="disabled")
     env.step(zero)
     at_end, _, _, truncated, _ = env.step(zero)
     still, reward, _, truncated_again, infos = env.step(zero)
@@ -161,9 +159,7 @@ def test_dead_rows(autoreset: str) -> None:
 
 
 def test_results_are_fresh_arrays() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2)
-    env.reset(seed=0)
-    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    env, zero = busy()
     first, second = env.step(zero), env.step(zero)
     for a, b in zip(first[:4], second[:4], strict=True):
         assert not np.shares_memory(a, b) and not np.shares_memory(a, env.engine.view("observation"))
@@ -182,21 +178,6 @@ def test_observations_are_in_their_space(name: str) -> None:
         observation, reward, terminated, truncated, _ = env.step(actions_for(env, rng))
         assert observation.dtype == np.float32 and reward.dtype == np.float32
         assert terminated.dtype == truncated.dtype == bool
-
-
-def test_saved_state() -> None:
-    env = coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 1.5})
-    env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    actions = [actions_for(env, rng) for _ in range(40)]
-    for action in actions[:13]:
-        env.step(action)
-    saved = env.get_state()
-    first = [env.step(action) for action in actions[13:]]
-    env.reset(seed=9)
-    env.set_state(saved)
-    for expected, action in zip(first, actions[13:], strict=True):
-        assert all(np.array_equal(a, b) for a, b in zip(env.step(action)[:4], expected[:4], strict=True))
 
 
 def test_rendering() -> None:
@@ -229,10 +210,8 @@ def bad(value: Any, dtype: Any = np.float32) -> np.ndarray:
     ],
 )
 def test_wrong_actions(actions: np.ndarray, message: str) -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2)
-    env.reset(seed=0)
     with pytest.raises(coopenv.ActionError, match=message):
-        env.step(actions)
+        busy()[0].step(actions)
 
 
 def test_nan_on_the_device_harms_nobody_else() -> None:
@@ -269,9 +248,7 @@ def test_wrong_options(options: dict[str, Any], message: str) -> None:
 
 
 def test_batch_goes_on_after_a_fork() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=64, threads=2)
-    env.reset(seed=0)
-    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    env, zero = busy(64, threads=2)
     env.step(zero)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Python warns of forking a process that has threads
@@ -281,23 +258,29 @@ def test_batch_goes_on_after_a_fork() -> None:
 
 
 def _reward_of_a_step(state: dict[str, Any]) -> np.ndarray:
-    env = coopenv.make_vec("busy_intersection", num_worlds=64, threads=2)
+    env, zero = busy(64, threads=2)
     env.set_state(state)
-    return env.step(np.zeros((env.num_envs, 2), dtype=np.float32))[1]
+    return env.step(zero)[1]
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("arguments", "message"),
     [
-        ({"reset_mask": np.zeros(2, dtype=bool)}, "at least one True"),
-        ({"reset_mask": [0, 1]}, "array of bool"),
+        ({"options": {"reset_mask": np.zeros(2, dtype=bool)}}, "at least one True"),
+        ({"options": {"reset_mask": [0, 1]}}, "array of bool"),
+        ({"options": {"reset_mask": np.arange(10) == 3}}, "splits world 0"),
+        ({"options": {"reset_mask": np.ones(3, dtype=bool)}}, r"reset_mask has shape \(3,\)"),
+        ({"seed": [1, 2, 3]}, "3 seeds for 2 worlds"),
     ],
 )
-def test_wrong_reset_options(options: Any, message: str) -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2)
-    env.reset(seed=0)
+def test_wrong_resets(arguments: Any, message: str) -> None:
     with pytest.raises(coopenv.CoopenvError, match=message):
-        env.reset(options=options)
+        busy()[0].reset(**arguments)
+
+
+def test_a_step_before_any_reset() -> None:
+    with pytest.raises(coopenv.CoopenvError, match="before reset"):
+        coopenv.make_vec("busy_intersection", num_worlds=2).step(np.zeros((10, 2)))
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "a", [1, -2], True])
@@ -309,25 +292,11 @@ def test_wrong_seeds(seed: Any) -> None:
 
 
 def test_states_of_other_scenarios_do_not_fit() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2)
-    other = coopenv.make_vec("busy_intersection_mirror", num_worlds=2)
+    (env, _), other = busy(), coopenv.make_vec("busy_intersection_mirror", num_worlds=2)
     other.reset(seed=0)
-    for state in (other.get_state(), None, 5, {}):
-        with pytest.raises(coopenv.CoopenvError, match="another scenario"):
+    for state, message in ((other.get_state(), "another scenario"), ({}, "another scenario"), (None, "not a mapping")):
+        with pytest.raises(coopenv.CoopenvError, match=f"this state does not fit busy_intersection_v0: .*{message}"):
             env.set_state(state)
-
-
-def test_wrong_resets() -> None:
-    env = coopenv.make_vec("busy_intersection", num_worlds=2)
-    with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        env.step(np.zeros((10, 2)))
-    env.reset(seed=0)
-    with pytest.raises(coopenv.CoopenvError, match="splits world 0"):
-        env.reset(options={"reset_mask": np.arange(10) == 3})
-    with pytest.raises(coopenv.CoopenvError, match=r"reset_mask has shape \(3,\)"):
-        env.reset(options={"reset_mask": np.ones(3, dtype=bool)})
-    with pytest.raises(coopenv.CoopenvError, match="3 seeds for 2 worlds"):
-        env.reset(seed=[1, 2, 3])
 
 
 def test_counts_may_be_of_numpy() -> None:
@@ -336,7 +305,15 @@ def test_counts_may_be_of_numpy() -> None:
     assert gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=np.int64(10)).num_envs == 10
 
 
-@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def restored(env: coopenv.CooperativeVectorEnv) -> coopenv.CooperativeVectorEnv:
+    other = coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 1.0})
+    other.reset(seed=4)
+    other.step(np.ones((12, 2), np.float32))
+    other.set_state(env.get_state())
+    return other
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), restored])
 def test_copies_go_on_alike_and_apart(duplicate: Callable[[Any], Any]) -> None:
     env = coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 1.0})
     env.reset(seed=4)

@@ -86,7 +86,7 @@ class CooperativeSB3VecEnv(VecEnv):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return what the next step depends on as arrays, for `set_state`; plug-in observers cannot be among it."""
-        return {**self.engine.get_state(), "episode_sums": self._recorder.sums}
+        return {**self.engine.get_state(), "episode_sums": self._recorder.sums.copy()}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
         """Go on from what `get_state` returned, and return the observations that came with it.
@@ -94,8 +94,11 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             CoopenvError: it does not fit.
         """
+        sums = state["episode_sums"]
+        if sums.shape != self._recorder.sums.shape or not np.isfinite(sums).all():
+            raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._recorder.sums.shape}")
         self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
-        self._recorder.sums = state["episode_sums"]
+        self._recorder.sums[...] = sums
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
 
     def step_async(self, actions: np.ndarray) -> None:

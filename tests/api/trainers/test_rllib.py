@@ -88,16 +88,12 @@ def drive(env: CooperativeMultiAgentEnv) -> tuple[dict[str, int], int, dict[str,
     return ended, step, terminated, truncated
 
 
-def test_deaths_end_single_vehicles() -> None:
+def test_a_death_ends_a_single_vehicle_in_the_step_of_the_horizon_too() -> None:
+    """Only the vehicle that ended by itself is flagged as terminated; the others are cut off at the horizon."""
     ended, steps, terminated, truncated = drive(CooperativeMultiAgentEnv({"env": FOUR_WAY}))
     assert len(ended) == 4 and len(set(ended.values())) > 1
     assert steps == max(ended.values())
     assert terminated["__all__"] and not truncated["__all__"]
-
-
-def test_step_that_mixes_a_death_and_the_horizon() -> None:
-    """Only the vehicle that ended by itself is flagged as terminated; the others are cut off."""
-    ended, *_ = drive(CooperativeMultiAgentEnv({"env": FOUR_WAY}))
     first, step = min(ended.items(), key=lambda item: item[1])
     config = {"env": FOUR_WAY, "overrides": {"horizon": step / 10}}
     _, steps, terminated, truncated = drive(CooperativeMultiAgentEnv(config))

@@ -78,8 +78,6 @@ def test_seeding() -> None:
     env.seed(7)
     assert np.array_equal(env.reset(), first)
     assert not np.array_equal(first, second)
-    single, _ = coopenv.parallel_env(FOUR_WAY).reset(seed=7, options={"world": 1})
-    assert np.array_equal(first[4:8], np.stack(list(single.values())))  # world 1 of the batch
 
 
 def test_options_of_a_reset_count_once_and_its_settings_hold() -> None:

@@ -67,9 +67,11 @@ def actor(env: PettingZooWrapper) -> ProbabilisticActor:
 
 
 def test_specs() -> None:
-    env = crossing()
+    env, rows = crossing(), batched_env(FOUR_WAY, **OPTIONS)
     assert env.group_map == {"vehicle": [f"vehicle_{i}" for i in range(1, 5)]}
-    check_env_specs(env)
+    assert rows.batch_size == torch.Size([12])
+    for each in (env, rows):
+        check_env_specs(each)
 
 
 def test_rollout_goes_on_over_deaths() -> None:
@@ -145,12 +147,6 @@ def test_ppo_trains_on_living_rows() -> None:
 
 OPTIONS = {"num_worlds": 3, "overrides": {"horizon": 6.0}}
 STEPS = 150
-
-
-def test_specs_of_a_batch() -> None:
-    env = batched_env(FOUR_WAY, **OPTIONS)
-    assert env.batch_size == torch.Size([12])
-    check_env_specs(env)
 
 
 def test_episodes_are_those_of_vehicles() -> None:
