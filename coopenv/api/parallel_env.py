@@ -32,12 +32,6 @@ Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
 
 RENDER_MODES = ("rgb_array", "human")
-PER_AGENT = 12
-"""Of the state, of every agent: position (3), first two columns of R (6), linear velocity (3), all of truth."""
-PER_VEHICLE = 9
-"""Of every vehicle: estimated position (3) and first two columns of Rhat (6)."""
-LASTING = 12
-"""Of every vehicle with lasting errors: scale (1), gyro bias (3), slip (2), turn and shift of the camera (6)."""
 LIMIT = 1e6
 """m and m/s, far beyond any scene."""
 
@@ -99,9 +93,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         space = observation_space(self.engine.layout, observation)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
-        per_vehicle = PER_VEHICLE + (LASTING if scenario.has_lasting_errors else 0)
-        size = PER_AGENT * len(scenario.target_names) + per_vehicle * len(names) + 1
-        self.state_space = spaces.Box(-LIMIT, LIMIT, shape=(size,), dtype=np.float32)
+        self.state_space = spaces.Box(-LIMIT, LIMIT, shape=self.state().shape, dtype=np.float32)
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
         lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
         self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
@@ -273,8 +265,10 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     def state(self) -> np.ndarray:
         """Return every agent's truth (landmarks first), every vehicle's estimate, and the share of the episode.
 
-        Where the scenario has lasting errors of sensors, those of every vehicle come last. Truth that a recording does
-        not know reads 0.
+        Of every agent: position (3), first two columns of R (6), linear velocity (3). Of every vehicle: estimated
+        position (3) and first two columns of Rhat (6). Where the scenario has lasting errors of sensors, those of every
+        vehicle come last: scale (1), gyro bias (3), slip (2), turn and shift of the camera (6). Truth that a recording
+        does not know reads 0.
         """
         view = self.engine.view
         R, position, velocity = (view(name)[0] for name in ("rotation", "position", "velocity"))

@@ -181,8 +181,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if self.arrays == "numpy" and not ended.any():
             return flags, infos
         observation = self._owned(self._observations())
-        final = {"final_obs": observation, "_final_obs": ended, "_final_info": ended}
-        final["final_info"] = self._owned(infos)
+        final = {"final_obs": observation, "_final_obs": ended, "_final_info": ended, "final_info": self._owned(infos)}
         self.engine.restart_finished()
         return flags, {**self._infos(), **final}
 
@@ -350,8 +349,8 @@ class RecordVehicleEpisodes(VectorWrapper):
         self._batch = env.unwrapped
         if self._batch.arrays != "numpy":
             raise CoopenvError("RecordVehicleEpisodes needs NumPy arrays: make_vec(arrays='numpy')")
-        self._names = ("r", "l", *self._batch.engine.reward_terms)
-        self.sums = np.zeros((len(self._names), self.num_envs))
+        self._names = self._batch.engine.reward_terms
+        self.sums = np.zeros((2 + len(self._names), self.num_envs))
         """Return, decisions and reward terms of the episodes under way, (2 + terms, num_envs)."""
         self._waiting = np.zeros(self.num_envs, dtype=bool)
         self.episode_count = 0
@@ -374,18 +373,18 @@ class RecordVehicleEpisodes(VectorWrapper):
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         step = infos.get("final_info", infos)
         acted, over = step["alive"] & ~self._waiting, terminated | truncated
-        terms = (step["reward_terms"][name] for name in self._names[2:])
+        terms = (step["reward_terms"][name] for name in self._names)
         self.sums += np.where(acted, [rewards, np.ones_like(rewards), *terms], 0.0)
         if self._batch.autoreset_mode == AutoresetMode.NEXT_STEP:
             self._waiting = over
         ended = acted & over
         if ended.any():
-            sums: dict[str, Any] = dict(zip(self._names, np.where(ended, self.sums, 0.0), strict=True))
+            returned, length, *sums = np.where(ended, self.sums, 0.0)
             self.sums[:, ended] = 0.0
-            of_terms = {name: sums.pop(name) for name in self._names[2:]}
-            episode = {"r": sums["r"], "l": sums["l"].astype(int), "reward_terms": of_terms}
+            by_name = dict(zip(self._names, sums, strict=True))
+            episode = {"r": returned, "l": length.astype(int), "reward_terms": by_name}
             infos = {**infos, "episode": episode, "_episode": ended}
             self.episode_count += int(ended.sum())
-            self.return_queue.extend(infos["episode"]["r"][ended].tolist())
-            self.length_queue.extend(infos["episode"]["l"][ended].tolist())
+            self.return_queue.extend(episode["r"][ended].tolist())
+            self.length_queue.extend(episode["l"][ended].tolist())
         return observations, rewards, terminated, truncated, infos

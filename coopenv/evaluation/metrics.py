@@ -7,7 +7,7 @@ Hinkley, Bootstrap Methods and their Application, 1997, 3.8 (resampling of clust
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,21 +17,6 @@ from coopenv.evaluation.episodes import Episodes
 
 RESAMPLES = 2000
 _BINS = 2000
-
-
-class Statistic(Protocol):
-    """A figure of many worlds that can be computed anew with each world counted several times, or not at all."""
-
-    @property
-    def value(self) -> float:
-        """The figure of all worlds."""
-
-    @property
-    def worlds(self) -> int:
-        """Number of worlds with a value."""
-
-    def resampled(self, counts: np.ndarray) -> np.ndarray:
-        """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +31,16 @@ class Ratio:
 
     @property
     def value(self) -> float:
-        """See `Statistic`."""
+        """The figure of all worlds."""
         return float(self.resampled(np.ones((1, len(self.count))))[0])
 
     @property
     def worlds(self) -> int:
-        """See `Statistic`."""
+        """Number of worlds with a value."""
         return int(np.count_nonzero(self.count))
 
     def resampled(self, counts: np.ndarray) -> np.ndarray:
-        """See `Statistic`."""
+        """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = (counts @ self.total) / (counts @ self.count)
         return np.asarray(np.sqrt(mean) if self.root else mean)
@@ -72,7 +57,7 @@ class Quantile:
         """
         self._share = share
         self.value = float(np.quantile(values, share)) if len(values) else np.nan
-        """See `Statistic`."""
+        """The figure of all worlds."""
         edges = np.quantile(values, np.linspace(0.0, 1.0, bins + 1)) if len(values) else np.zeros(2)
         self._edges = np.unique(edges)
         some = max(1, len(self._edges) - 1)
@@ -81,11 +66,11 @@ class Quantile:
 
     @property
     def worlds(self) -> int:
-        """See `Statistic`."""
+        """Number of worlds with a value."""
         return int(np.count_nonzero(self._seen.any(axis=1)))
 
     def resampled(self, counts: np.ndarray) -> np.ndarray:
-        """See `Statistic`."""
+        """See `Ratio.resampled`."""
         if len(self._edges) < 2:
             return np.where(counts @ self._seen[:, 0] > 0, self.value, np.nan)
         reached = np.cumsum(counts @ self._seen, axis=1)
@@ -97,6 +82,10 @@ class Quantile:
             inside = np.where(end > begin, (wanted - begin) / (end - begin), 0.0)
         low, high = self._edges[place], self._edges[place + 1]
         return np.asarray(np.where(reached[:, -1:] > 0, low + inside * (high - low), np.nan)[:, 0])
+
+
+Statistic = Ratio | Quantile
+"""A figure of many worlds that can be computed anew with each world counted several times, or not at all."""
 
 
 def resamples(worlds: int, seed: int, count: int = RESAMPLES) -> np.ndarray:

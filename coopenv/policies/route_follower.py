@@ -55,14 +55,12 @@ class Driver(ABC):
 
     def reset(self, mask: np.ndarray) -> None:
         """Begin new episodes in the rows of a mask: what is remembered of them is 0."""
-        if len(mask) != self._memory.shape[1]:
-            self._memory = np.zeros((self.remembers, len(mask)), dtype=int)
-        self._memory[:, mask] = 0
+        self.memory(mask)[:, mask] = 0
 
-    def memory(self, observations: np.ndarray) -> np.ndarray:
-        """Return what is remembered, (remembers, rows)."""
-        if len(observations) != self._memory.shape[1]:
-            self.reset(np.ones(len(observations), dtype=bool))
+    def memory(self, rows: np.ndarray) -> np.ndarray:
+        """Return what is remembered, (remembers, rows); 0 where there are more or fewer rows than before."""
+        if len(rows) != self._memory.shape[1]:
+            self._memory = np.zeros((self.remembers, len(rows)), dtype=int)
         return self._memory
 
     @abstractmethod
@@ -297,21 +295,17 @@ class IntelligentDriver(RouteFollower):
         """Return the gap to the nearest vehicle on the route, (rows,) in m, and how fast it closes, m/s."""
         mask, place, forward = self.received(observations)
         points, distance = self.route_points(observations)
-        gap, closing = np.full(len(own), np.inf), np.zeros(len(own))
-        for k in range(len(distance) - 1):
-            leg = points[:, k + 1] - points[:, k]
-            along = leg / np.maximum(np.linalg.norm(leg, axis=1, keepdims=True), 1e-9)
-            offset = place - points[:, k][:, None]
-            ahead = (offset * along[:, None]).sum(axis=-1)
-            aside = np.abs(along[:, None, 0] * offset[..., 1] - along[:, None, 1] * offset[..., 0])
-            on_it = mask & (aside < self.half_width) & (ahead > 0.0) & (ahead <= distance[k + 1] - distance[k])
-            length = np.where(on_it, ahead + distance[k] - self.length, np.inf)
-            rows, which = np.arange(len(own)), np.argmin(length, axis=1)
-            nearer = length[rows, which] < gap
-            theirs = self.cruise * (forward * along[:, None]).sum(axis=-1)[rows, which]
-            gap = np.where(nearer, length[rows, which], gap)
-            closing = np.where(nearer, own - theirs, closing)
-        return gap, closing
+        leg = np.diff(points, axis=1)
+        along = leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-9)
+        offset = place[:, None] - points[:, :-1, None]
+        ahead = (offset * along[:, :, None]).sum(axis=-1)
+        aside = np.abs(along[..., :1] * offset[..., 1] - along[..., 1:] * offset[..., 0])
+        on_it = mask[:, None] & (aside < self.half_width) & (ahead > 0.0) & (ahead <= np.diff(distance)[:, None])
+        gaps = np.where(on_it, ahead + distance[:-1, None] - self.length, np.inf)
+        theirs = self.cruise * (forward[:, None] * along[:, :, None]).sum(axis=-1)
+        first = np.argmin(gaps.reshape(len(own), -1), axis=1)
+        gap, speed = (part.reshape(len(own), -1)[np.arange(len(own)), first] for part in (gaps, theirs))
+        return gap, np.where(np.isfinite(gap), own - speed, 0.0)
 
 
 class StopWhenLost(RouteFollower):

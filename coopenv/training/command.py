@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, TypeAdapter
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
+from stable_baselines3.common.logger import configure
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
@@ -134,7 +135,7 @@ def train(
         judge = partial(_judge, trainer, threads, report)
         with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
             check_file(path)
-            trainer.log_to(str(tensorboard))
+            trainer.model.set_logger(configure(str(tensorboard), ["tensorboard"]))
         if kept is not None:
             restore(kept, trainer)
         else:
@@ -211,7 +212,7 @@ def save(
     """
     header = {
         "format": FORMAT,
-        "plan": trainer.plan.document(),
+        "plan": TypeAdapter(Plan).dump_python(trainer.plan, mode="json"),
         "scenario": trainer.scenario.model_dump_json(),
         "progress": {
             "steps": trainer.model.num_timesteps,

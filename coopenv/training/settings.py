@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, OutputError, suggest
 from coopenv.base.files import writing
@@ -130,11 +130,6 @@ class Plan:
     def all_overrides(self) -> dict[str, Any]:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
-
-    def document(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        document: dict[str, Any] = TypeAdapter(Plan).dump_python(self, mode="json")
-        return document
 
 
 def read_settings(

@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
@@ -244,10 +244,6 @@ class Trainer:
         )
         self.model.set_logger(Logger(None, []))
         self._watch = Watch(self.batch)
-
-    def log_to(self, folder: str) -> None:
-        """Write for TensorBoard from now on, to a folder that is there."""
-        self.model.set_logger(configure(folder, ["tensorboard"]))
 
     def begin(self, report: Callable[[str], None] = lambda line: None) -> None:
         """Clone another driver, if settings name one, and start the first episodes; `report` gets progress lines."""

@@ -206,16 +206,12 @@ def test_saved_states_go_on_as_if_nothing_had_happened(observer: str) -> None:
         assert np.array_equal(first[agent], again[agent]) and np.array_equal(first[agent], other[agent])
 
 
-def test_what_cannot_be_copied_is_told() -> None:
-    env = short("locked")
-    env.reset(seed=0)
+def test_what_cannot_be_copied_is_told_and_a_state_without_observers_does_not_fit() -> None:
+    locked, env = short("locked"), short("mekf")
+    for each in (locked, env):
+        each.reset(seed=0)
     with pytest.raises(CoopenvError, match="observers' state cannot be copied: TypeError"):
-        env.get_state()
-
-
-def test_a_state_of_the_embedded_observer_is_not_a_plugins() -> None:
-    env = short("mekf")
-    env.reset(seed=0)
+        locked.get_state()
     state = env.get_state()
     del state["observers"]
     with pytest.raises(CoopenvError, match="no observers 'mekf' in it"):

@@ -146,12 +146,9 @@ def test_mistakes_are_one_line(reward: Any, message: str) -> None:
     assert str(caught.value).isprintable()
 
 
-def test_what_is_no_function_is_refused() -> None:
+def test_what_is_no_function_is_refused_and_a_gpu_has_no_arrays_for_one() -> None:
     with pytest.raises(CoopenvError, match="reward: expected a function of a step, got 'mine'"):
         coopenv.parallel_env("crossing_path", reward="mine")  # type: ignore[arg-type]
-
-
-def test_a_gpu_has_no_arrays_for_it() -> None:
     check_function(None, "cuda:0")
     with pytest.raises(CoopenvError, match="runs on the host; use device='cpu' instead of 'cuda:0'"):
         check_function(minus_error, "cuda:0")

@@ -53,15 +53,12 @@ def test_the_route_follower_arrives_without_touching() -> None:
     worlds = range(500, 520)
     engine = Engine(scenario, len(worlds))
     follower, still = (
-        drive(engine, policy, worlds) for policy in (load_agent("route_follower", scenario), stand_still)
+        drive(engine, policy, worlds)
+        for policy in (load_agent("route_follower", scenario), lambda rows: np.tile([-1.0, 0.0], (len(rows), 1)))
     )
     assert not (follower.outcome == Outcome.COLLIDED).any()
     assert (follower.outcome == Outcome.ARRIVED).mean() >= 0.95
     assert still.reward.sum() < follower.reward.sum()
-
-
-def stand_still(observations: np.ndarray) -> np.ndarray:
-    return np.tile(np.float32([-1.0, 0.0]), (len(observations), 1))
 
 
 @pytest.mark.parametrize(("top", "reverse"), [(1.0, False), (1.53, False), (2.0, True)])
@@ -71,12 +68,6 @@ def test_the_route_follower_drives_at_its_speed_whatever_the_car_can_do(top: flo
     for cruise, expected in ((0.6, 0.6), (None, top)):
         trajectory = rollout(scenario, seed=1, policy=RouteFollower(scenario, cruise=cruise), steps=60)
         assert np.abs(trajectory.velocity[:, :, 0]).max() == pytest.approx(expected, abs=0.02)
-
-
-def test_the_route_follower_refuses_to_choose_accelerations() -> None:
-    scenario = coopenv.load_scenario(FOUR_WAY, {"action.longitudinal": "acceleration"})
-    with pytest.raises(coopenv.CoopenvError, match=r"agent 'route_follower' cannot be built: it chooses speeds"):
-        load_agent("route_follower", scenario)
 
 
 def test_policies_by_name() -> None:
@@ -165,6 +156,9 @@ def test_bad_agents(tmp_path: Path) -> None:
         coopenv.CoopenvError, match=r"unknown agent 'routefollower' \(did you mean 'route_follower'\?\)"
     ):
         load_agent("routefollower", scenario)
+    accelerating = coopenv.load_scenario(FOUR_WAY, {"action.longitudinal": "acceleration"})
+    with pytest.raises(coopenv.CoopenvError, match=r"agent 'route_follower' cannot be built: it chooses speeds"):
+        load_agent("route_follower", accelerating)
     for text, message in (
         ('title = "x"', r"agent\.toml: description: Field required"),
         (CARD.format("RouteFollower"), r"agent\.toml: entry: expected file\.py:Class or package\.module:Class"),

@@ -43,9 +43,9 @@ def test_lookouts_know_their_place_better_at_little_time(engine: Engine) -> None
     assert peek["arrival_rate"] >= 0.95
 
 
-def observation(**fields: object) -> np.ndarray:
+def observation(scenario: Scenario = SCENARIO, **fields: object) -> np.ndarray:
     """Return one row that holds these values, in their units."""
-    layout = RouteFollower(SCENARIO).layout
+    layout = observation_layout(scenario)
     row = np.zeros((1, layout.size), dtype=np.float32)
     for name, value in fields.items():
         field = layout[name]
@@ -228,12 +228,11 @@ def test_it_steers_cars_of_highway_env_on_the_circle_that_it_pursues() -> None:
 @pytest.mark.parametrize(("brakes", "speed"), [(5.0, -1.0), (20.0, 1.0)])
 def test_who_stops_slowly_stops_for_one_across_its_way_that_may_stand(brakes: float, speed: float) -> None:
     """Driving at full speed the other would be gone in time."""
-    driver = RouteFollower(load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes}))
-    row = np.zeros((1, max(field.stop for field in driver.layout.values())), dtype=np.float32)
-    for name, values in (("message_mask", [1.0]), ("message_position", [12.0 / 60.0]), ("message_forward", [0.0, 1.0])):
-        start = driver.layout[name].start
-        row[0, start : start + len(values)] = values
-    assert driver(row)[0, 0] == speed
+    scenario = load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes})
+    first = np.arange(len(scenario.vehicles) - 1) == 0
+    place, forward = (np.outer(first, vector) for vector in ((12.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    row = observation(scenario, message_mask=first, message_position=place, message_forward=forward)
+    assert RouteFollower(scenario)(row)[0, 0] == speed
 
 
 HOUSE = {"name": "house", "center": [2.0, 1.0, 1.0], "size": [2.0, 1.0, 2.0], "yaw": 0.4}
@@ -288,30 +287,17 @@ def test_boxes_are_those_of_the_map_and_the_messages() -> None:
     assert len(few.boxes(read)) == 1  # who does not see where it is knows of no building
 
 
-def behind_the_truck() -> tuple[Scenario, np.ndarray]:
-    """Return two observations of a car that is lost: of landmarks ahead and to the left; a truck is heard in one."""
+def test_what_the_truck_hides_is_worth_nothing() -> None:
+    """A car is lost, with landmarks ahead and to the left; a truck ahead is heard in one of two observations."""
     scenario = load_scenario("behind_truck")
-    layout = observation_layout(scenario)
     fields: dict[str, Any] = {
         **{name: 0.0 for name in ("position_std", "axis_std", "heading_std")},  # 1 m and 1 rad: it is lost
         "map_position": [[3.0, 0.2], [3.0, -0.2], [3.5, 0.0], [4.0, 0.1], [0.7, 2.9], [0.9, 2.7]],
         "message_position": [[0.9, 0.0]],
         "message_forward": [[1.0, 0.0]],
     }
-    rows = np.zeros((2, layout.size), dtype=np.float32)
-    for k, heard in enumerate((0.0, 1.0)):
-        for field, values in {**fields, "message_mask": [heard]}.items():
-            rows[k, layout[field].slice] = ((np.array(values) - layout[field].center) / layout[field].scale).ravel()
-    return scenario, rows
-
-
-def test_peek_turns_to_what_the_truck_does_not_hide() -> None:
-    scenario, rows = behind_the_truck()
+    rows = np.concatenate([observation(scenario, **fields, message_mask=[heard]) for heard in (0.0, 1.0)])
     straight, aside = load_agent("peek", scenario)(rows)[:, 1]
     assert abs(straight) < 0.3 and aside > 0.6  # to the left
-
-
-def test_a_plan_straight_on_is_worth_less_behind_a_truck() -> None:
-    scenario, rows = behind_the_truck()
-    free, hidden = LookAhead(scenario).costs(rows)[:, 0]
+    free, hidden = LookAhead(scenario).costs(rows)[:, 0]  # of the plan straight on
     assert hidden > free + 1.0

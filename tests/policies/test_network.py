@@ -69,44 +69,41 @@ def test_drives_where_there_is_more_to_see(tmp_path: Path) -> None:
     assert np.array_equal(wide(np.stack(list(shown.values()))), narrow(np.stack(list(hidden.values()))))
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"observation.position_scale": 9.0}, r"another observation: 'estimate_position' had scale 8\.0 and has 9\.0"),
-        ({"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
-        ({"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
-        ({"action.longitudinal": "acceleration"}, r"another action: 'speed' is not in this environment"),
-    ],
-)
-def test_another_layout_is_refused_by_its_first_field(overrides: dict[str, Any], message: str, tmp_path: Path) -> None:
-    card = write(tmp_path, tensors_for(132))
-    with pytest.raises(coopenv.CoopenvError, match=message):
-        Network(coopenv.load_scenario(ENV, overrides), folder=tmp_path, network=card)
-
-
-WHOLE = ["route", "clearance", "uncertainty", "messages", "quality"]
+WHOLE = {"observation.include": ["route", "clearance", "uncertainty", "messages", "quality"]}
+SLOW = {**WHOLE, "action.longitudinal": "acceleration"}
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("common", "overrides", "message"),
     [
-        ({"observation.centers.route_offset": 0.8}, r"'route_offset' had center 0\.0 and has 0\.8 here"),
-        ({"observation.route_step": 1.0}, r"another observation\.route_step, 0\.5, and it is 1\.0 here"),
-        ({"observer.gramian_window": 2.0}, r"another observer\.gramian_window, 1\.0, and it is 2\.0 here"),
-        ({"observer.gramian_distance": 3.0}, r"another observer\.gramian_distance, None, and it is 3\.0 here"),
-        ({"reward.observability_floor": 1e-4}, r"another reward\.observability_floor, 1e-05, and it is 0\.0001 here"),
-        ({"rates.decision": 5.0}, r"another rates\.decision, 10\.0, and it is 5\.0 here"),
-        ({"dynamics.max_speed": 1.5, "action.longitudinal": "acceleration"}, r"another dynamics\.max_speed, 1\.0"),
+        (
+            {},
+            {"observation.position_scale": 9.0},
+            r"another observation: 'estimate_position' had scale 8\.0 and has 9\.0",
+        ),
+        ({}, {"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
+        ({}, {"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
+        ({}, {"action.longitudinal": "acceleration"}, r"another action: 'speed' is not in this environment"),
+        (WHOLE, {"observation.centers.route_offset": 0.8}, r"'route_offset' had center 0\.0 and has 0\.8 here"),
+        (WHOLE, {"observation.route_step": 1.0}, r"another observation\.route_step, 0\.5, and it is 1\.0 here"),
+        (WHOLE, {"observer.gramian_window": 2.0}, r"another observer\.gramian_window, 1\.0, and it is 2\.0 here"),
+        (WHOLE, {"observer.gramian_distance": 3.0}, r"another observer\.gramian_distance, None, and it is 3\.0 here"),
+        (
+            WHOLE,
+            {"reward.observability_floor": 1e-4},
+            r"another reward\.observability_floor, 1e-05, and it is 0\.0001 here",
+        ),
+        (WHOLE, {"rates.decision": 5.0}, r"another rates\.decision, 10\.0, and it is 5\.0 here"),
+        (SLOW, {"dynamics.max_speed": 1.5}, r"another dynamics\.max_speed, 1\.0"),
     ],
 )
 def test_what_gives_entries_another_meaning_is_refused_with_both_values(
-    overrides: dict[str, Any], message: str, tmp_path: Path
+    common: dict[str, Any], overrides: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    """The size of the observation is the same: without this an agent would drive by what it misreads."""
-    common = {"observation.include": WHOLE, **({k: v for k, v in overrides.items() if k == "action.longitudinal"})}
-    size = observation_layout(coopenv.load_scenario(ENV, common)).size
-    card = write(tmp_path, tensors_for(size), common)
-    Network(coopenv.load_scenario(ENV, common), folder=tmp_path, network=card)
+    """The size of the observation may be the same: without this an agent would drive by what it misreads."""
+    scenario = coopenv.load_scenario(ENV, common)
+    card = write(tmp_path, tensors_for(observation_layout(scenario).size), common)
+    Network(scenario, folder=tmp_path, network=card)
     with pytest.raises(coopenv.CoopenvError, match=message):
         Network(coopenv.load_scenario(ENV, {**common, **overrides}), folder=tmp_path, network=card)
 

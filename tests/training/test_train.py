@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
+from subprocess import Popen
 
 import numpy as np
 import pytest
@@ -56,6 +57,30 @@ def command(*more: str) -> list[str]:
 
 def fresh(*more: str) -> list[str]:
     return command("--settings", "train.toml", "--seed", "5", *more)
+
+
+def begun(folder: Path, words: list[str]) -> Popen[str]:
+    """Return a training once it has its first checkpoint."""
+    process = start((*COOPENV, *words), folder)
+    path = folder / "agent" / "checkpoint.safetensors"
+    wait_until(lambda: path.is_file() or process.poll() is not None)
+    assert path.is_file(), process.communicate()[1]
+    return process
+
+
+def killed(folder: Path, words: list[str]) -> None:
+    """Kill a training once it has its first checkpoint."""
+    process = begun(folder, words)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def resumed(folder: Path, *words: str) -> str:
+    """Resume a training, and return what it prints as errors."""
+    process = start((*COOPENV, *(words or command()), "--resume"), folder)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return errors
 
 
 def finished(folder: Path) -> dict[str, np.ndarray]:
@@ -115,20 +140,16 @@ def test_killed_and_resumed_learns_the_same(here: Path, reference: Path) -> None
     assert (here / "agent" / "checkpoint.safetensors").is_file()
     assert not (here / "agent" / "agent.toml").exists()
     assert main(fresh()) == 2  # it does not begin anew by mistake
-    process = start((*COOPENV, *command("--resume")), here)
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert " 800 steps" not in errors  # at most what came after the last checkpoint was done twice
+    assert " 800 steps" not in resumed(here)  # at most what came after the last checkpoint was done twice
     same(finished(here / "agent"), finished(reference))
 
 
 @pytest.mark.slow
 def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> None:
     pytest.importorskip("onnx", reason="needs the extra 'onnx'")
-    killed_at_the_start(here, "--onnx", "--logs", "logs")
+    killed(here, fresh("--onnx", "--logs", "logs"))
     before = len(list((here / "logs").glob("events.*")))
-    process = start((*COOPENV, *command("--resume")), here)
-    assert process.wait(300) == 0
+    resumed(here)
     assert (here / "agent" / "policy.onnx").is_file()
     assert len(list((here / "logs").glob("events.*"))) == before + 1
     assert not (here / "agent" / "tensorboard").exists()
@@ -172,22 +193,14 @@ def test_worlds_of_highway_env_begin_anew_where_a_killed_training_goes_on(here: 
     """Their state is objects, which no checkpoint holds."""
     pytest.importorskip("highway_env", reason="needs the extra 'highway'")
     (here / "small.toml").write_text(SETTINGS.replace("= 6.0", "= 3.0").replace("vehicles = 16", "vehicles = 4"))
-    training = (*COOPENV, "train", "highway_roundabout", "--out", "agent")
-    first = start((*training, "--settings", "small.toml", "--steps", "300"), here)
-    kept = here / "agent" / "checkpoint.safetensors"
-    wait_until(lambda: kept.is_file() or first.poll() is not None)
-    assert kept.is_file(), first.communicate()[1]
-    os.killpg(first.pid, signal.SIGKILL)
-    first.communicate()
-    second = start((*training, "--resume"), here)
-    _, errors = second.communicate(timeout=300)
-    assert second.returncode == 0, errors
+    training = ["train", "highway_roundabout", "--out", "agent"]
+    killed(here, [*training, "--settings", "small.toml", "--steps", "300"])
+    resumed(here, *training)
     load_agent(here / "agent", coopenv.load_scenario("highway_roundabout"))
 
 
 def test_interrupted_says_how_to_go_on(here: Path) -> None:
-    process = start((*COOPENV, *fresh()), here)
-    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
+    process = begun(here, fresh())
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -197,20 +210,13 @@ def test_interrupted_says_how_to_go_on(here: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("left", [0, 100, 20_000])
 def test_a_truncated_checkpoint_is_one_line(left: int, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    killed_at_the_start(here)
+    killed(here, fresh())
     path = here / "agent" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:left])
     assert main(command("--resume")) == 2
     told = capsys.readouterr().err
     assert told.startswith("error: agent/checkpoint.safetensors: damaged, or not a checkpoint")
     assert told.count("\n") == 1
-
-
-def killed_at_the_start(here: Path, *more: str) -> None:
-    process = start((*COOPENV, *fresh(*more)), here)
-    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
 
 
 @pytest.mark.slow
@@ -223,7 +229,7 @@ def test_nothing_to_resume_and_options_that_cannot_change(
     assert "leave out --seed, --steps" in capsys.readouterr().err
     assert main(["train", "urban_crossing", "--out", str(reference), "--resume"]) == 2
     assert "holds a finished agent and no checkpoint" in capsys.readouterr().err
-    killed_at_the_start(here)
+    killed(here, fresh())
     assert main(["train", "overtaking", "--out", "agent", "--resume"]) == 2
     assert "agent holds a training of urban_crossing, not of overtaking" in capsys.readouterr().err
 
@@ -237,14 +243,13 @@ def test_a_full_disk_keeps_the_last_checkpoint(here: Path, reference: Path) -> N
     assert process.returncode == 2
     assert errors.splitlines()[-1].startswith("error: cannot write to agent/checkpoint.safetensors")
     assert not (here / "agent" / "agent.toml").exists()
-    killed_at_the_start(here)
+    killed(here, fresh())
     before = (here / "agent" / "checkpoint.safetensors").read_bytes()
     process = start((*limited, *COOPENV, *command("--resume")), here)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 2 and "cannot write to agent/checkpoint.safetensors" in errors
     assert (here / "agent" / "checkpoint.safetensors").read_bytes() == before
-    process = start((*COOPENV, *command("--resume")), here)
-    assert process.wait(300) == 0
+    resumed(here)
     same(finished(here / "agent"), finished(reference))
 
 
@@ -252,10 +257,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(here: Path, reference: Path) -> N
 def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = coopenv.base.installation.data_directory("envs") / "urban_crossing.toml"
     (here / "mine.toml").write_text(source.read_text())
-    first = start((*COOPENV, "train", "mine.toml", "--settings", "train.toml", "--out", "agent"), here)
-    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or first.poll() is not None)
-    os.killpg(first.pid, signal.SIGKILL)
-    first.communicate()
+    killed(here, ["train", "mine.toml", "--settings", "train.toml", "--out", "agent"])
     (here / "mine.toml").write_text(source.read_text().replace("range = 6.0", "range = 5.0"))
     assert main(["train", "mine.toml", "--out", "agent", "--resume"]) == 2
     assert "mine.toml has changed since; remove the file to start anew" in capsys.readouterr().err
@@ -317,10 +319,9 @@ def test_a_forced_training_replaces_an_agent_and_its_cards_at_its_end(here: Path
     (here / "agent").mkdir()
     for name in ("agent.toml", "card.json", "card.md", "mine.py"):
         (here / "agent" / name).write_text("mine")
-    killed_at_the_start(here, "--force")
+    killed(here, fresh("--force"))
     assert {(here / "agent" / name).read_text() for name in ("agent.toml", "card.json", "card.md")} == {"mine"}
-    process = start((*COOPENV, *command("--resume")), here)
-    assert process.wait(300) == 0
+    resumed(here)
     finished(here / "agent")
     assert (here / "agent" / "mine.py").read_text() == "mine"
     assert not list((here / "agent").glob("card.*"))
