@@ -296,10 +296,10 @@ def _arrays(trainer: Trainer) -> Arrays:
     moments = policy.optimizer.state_dict()["state"].items()
     _, key, position, *_ = np.random.get_state()
     groups: dict[str, Mapping[str, Any]] = {
-        "policy": policy.state_dict(),
-        "optimiser": {f"{index}/{name}": values for index, row in moments for name, values in row.items()},
+        "policy": {name: values.numpy() for name, values in policy.state_dict().items()},
+        "optimiser": {f"{index}/{name}": values.numpy() for index, row in moments for name, values in row.items()},
         "statistics": {name: getattr(statistics, name) for name in ("mean", "var", "count")},
-        "random": {"torch": torch.get_rng_state(), "numpy": np.append(key, np.uint32(position))},
+        "random": {"torch": torch.get_rng_state().numpy(), "numpy": np.append(key, np.uint32(position))},
         "world": _worlds(trainer),
     }
     return {
