@@ -130,7 +130,8 @@ def simulation_of(scenario: Scenario) -> Simulated:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
     """
     if scenario.cosimulator is not None:
-        return resolve_name(scenario.cosimulator.backend)(scenario)
+        made: Simulated = resolve_name(scenario.cosimulator.backend)(scenario)
+        return made
     from coopenv.backends.simulated import Simulated
 
     return Simulated(scenario)
