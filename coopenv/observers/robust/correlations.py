@@ -19,8 +19,18 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Correlation, Pose, Regressor, SenderReport, mat66d, mat66f, vec3d
-from coopenv.observers.robust.tracklets import arrived, clear_messages, depends_on_own, marker_jacobian, receive, send
+from coopenv.observers.robust.memory import (
+    Correlation,
+    Pose,
+    Regressor,
+    SenderReport,
+    fill,
+    fill_rows,
+    mat66d,
+    mat66f,
+    vec3d,
+)
+from coopenv.observers.robust.tracklets import arrived, depends_on_own, marker_jacobian, receive, send
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
 
@@ -32,21 +42,10 @@ def factor(P: Any):
     return algebra.lower_blocks(L11, L21, L22)
 
 
-@wp.func
-def bit_count(mask: wp.uint64) -> int:
-    """Return how many bits are set."""
-    count = int(0)
-    rest = wp.uint64(mask)
-    while rest != wp.uint64(0):
-        rest = rest & (rest - wp.uint64(1))
-        count += 1
-    return count
-
-
 @device_function
 def rank(model: Any, vehicle: int, report: SenderReport) -> int:
     """Return a number that is larger for vehicles that depend on more others, and then for later ones."""
-    return bit_count(report.depends_on) * model.vehicles + vehicle
+    return int(wp.bit_count(report.depends_on)) * model.vehicles + vehicle
 
 
 @device_function
@@ -133,18 +132,12 @@ def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick
 
 
 @device_function
-def clear_broadcasts(model: Any, memory: Any, world: int, i: int):
-    """Clear all sent and received messages."""
-    clear_messages(model, memory, world, i)
-    for c in range(memory.correlation.shape[3]):
-        for slot in range(model.radio.slots):
-            memory.outbox_correlation[world, i, slot, c] = no_correlation()
-        for sender in range(model.vehicles):
-            memory.correlation[world, i, sender, c] = no_correlation()
-    for a in range(memory.known.shape[1]):
-        memory.known[world, a] = Regressor()
-        for b in range(memory.known.shape[1]):
-            memory.factor[world, a, b] = mat66d()
+def clear_broadcasts(memory: Any, world: int, i: int):
+    """Clear all sent and received correlations and scratch arrays."""
+    fill_rows(memory.outbox_correlation[world, i], no_correlation())
+    fill_rows(memory.correlation[world, i], no_correlation())
+    fill(memory.known[world], Regressor())
+    fill_rows(memory.factor[world], mat66d())
 
 
 @device_function

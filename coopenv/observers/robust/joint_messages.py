@@ -17,6 +17,8 @@ from coopenv.observers.robust.memory import (
     CommonMemory,
     Pose,
     are_joint,
+    fill,
+    fill_rows,
     mat66d,
     rules_for,
     vec3d,
@@ -26,7 +28,6 @@ from coopenv.observers.robust.tracklets import (
     arrived,
     bit_of,
     broadcast_report,
-    clear_messages,
     marker_jacobian,
     own_report,
     receive,
@@ -133,34 +134,23 @@ MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
 @device_function
 def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
-    """Clear all sent and received messages, contacts and scratch arrays."""
-    clear_messages(model, memory, world, i)
-    for c in range(memory.contact.shape[2]):
-        memory.contact[world, i, c] = Contact()
-        memory.contact[world, i, c].sender = -1
-        for n in range(MAX_BROADCAST):
-            memory.contact_broadcast[world, i, c, n] = BroadcastVehicle()
-            memory.blocks[world, c, n] = mat66d()
-        for e in range(memory.contact_P.shape[3]):
-            memory.contact_P[world, i, c, e] = mat66d()
-    for n in range(MAX_BROADCAST):
-        memory.broadcast[world, n] = BroadcastVehicle()
-        memory.step[world, n] = Pose()
-        for x in range(memory.matrix.shape[1]):
-            for k in range(MAX_BROADCAST):
-                memory.matrix[world, x, n, k] = mat66d()
-    for slot in range(model.radio.slots):
-        memory.outbox_joint[world, i, slot] = JointHeader()
-        for n in range(MAX_BROADCAST - 1):
-            memory.outbox_broadcast[world, i, slot, n] = BroadcastVehicle()
-        for k in range(memory.outbox_factor.shape[3]):
-            memory.outbox_factor[world, i, slot, k] = wp.float32(0.0)
-    for sender in range(model.vehicles):
-        memory.inbox_joint[world, i, sender] = JointHeader()
-        for n in range(MAX_BROADCAST - 1):
-            memory.inbox_broadcast[world, i, sender, n] = BroadcastVehicle()
-        for k in range(memory.inbox_factor.shape[3]):
-            memory.inbox_factor[world, i, sender, k] = wp.float32(0.0)
+    """Clear all joint messages, contacts and scratch arrays."""
+    none = Contact()
+    none.sender = -1
+    fill(memory.contact[world, i], none)
+    fill_rows(memory.contact_broadcast[world, i], BroadcastVehicle())
+    fill_rows(memory.contact_P[world, i], mat66d())
+    fill(memory.outbox_joint[world, i], JointHeader())
+    fill_rows(memory.outbox_broadcast[world, i], BroadcastVehicle())
+    fill_rows(memory.outbox_factor[world, i], wp.float32(0.0))
+    fill(memory.inbox_joint[world, i], JointHeader())
+    fill_rows(memory.inbox_broadcast[world, i], BroadcastVehicle())
+    fill_rows(memory.inbox_factor[world, i], wp.float32(0.0))
+    fill(memory.broadcast[world], BroadcastVehicle())
+    fill(memory.step[world], Pose())
+    fill_rows(memory.blocks[world], mat66d())
+    for x in range(memory.matrix.shape[1]):
+        fill_rows(memory.matrix[world, x], mat66d())
 
 
 @device_function

@@ -231,25 +231,36 @@ MOUNTING = 2  # the member that stands for the error of the camera's mounting, w
 SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
 
 
+@wp.func
+def fill(row: Any, value: Any):
+    """Set all entries of an array."""
+    for n in range(row.shape[0]):
+        row[n] = value
+
+
+@wp.func
+def fill_rows(rows: Any, value: Any):
+    """Set all entries of an array with two axes."""
+    for n in range(rows.shape[0]):
+        fill(rows[n], value)
+
+
 @device_function
-def clear(model: Any, memory: Any, world: int, i: int):
-    """Clear an earlier episode, scratch included: equal states are equal in every bit."""
+def clear(memory: Any, world: int, i: int):
+    """Clear an earlier episode, messages and scratch included: equal states are equal in every bit."""
     memory.belief[world, i] = JointBelief()
     memory.search[world, i] = Search()
-    members = memory.member.shape[2]
-    for n in range(members):
-        memory.member[world, i, n] = Member()
-        memory.scratch[world, n] = Scratch()
-        for k in range(members):
-            memory.P[world, i, n, k] = mat66d()
-    for h in range(memory.hypothesis.shape[2]):
-        memory.hypothesis[world, i, h] = Hypothesis()
-    for sender in range(model.vehicles):
-        memory.monitor[world, i, sender] = SenderMonitor()
-    for n in range(model.agents):
-        memory.measurement[world, n] = BearingMeasurement()
-        for k in range(members):
-            memory.gain[world, n, k] = mat26d()
+    fill(memory.member[world, i], Member())
+    fill_rows(memory.P[world, i], mat66d())
+    fill(memory.hypothesis[world, i], Hypothesis())
+    fill(memory.monitor[world, i], SenderMonitor())
+    fill(memory.outbox[world, i], SenderReport())
+    never = SenderReport()
+    never.tick = -1
+    fill(memory.inbox[world, i], never)
+    fill(memory.scratch[world], Scratch())
+    fill(memory.measurement[world], BearingMeasurement())
+    fill_rows(memory.gain[world], mat26d())
 
 
 LARGE = numbers(LARGEST**3)

@@ -261,7 +261,7 @@ def make_start(begin_messages: Any, receive: Any) -> Any:
 
         An estimate that is too uncertain to linearise about is only a prior for the search.
         """
-        clear(model, memory, world, i)
+        clear(memory, world, i)
         memory.belief[world, i].others = 1
         begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))

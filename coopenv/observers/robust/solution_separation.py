@@ -206,7 +206,7 @@ def begin_broadcasts(model: Any, memory: Any, world: int, i: int):
 
     A search may use every sender. An initial estimate depends on no sender.
     """
-    clear_broadcasts(model, memory, world, i)
+    clear_broadcasts(memory, world, i)
     memory.landmark_only[world, i] = LandmarkOnlySolution()
     if memory.search[world, i].active == 0:
         memory.belief[world, i].depends_on = wp.uint64(0)

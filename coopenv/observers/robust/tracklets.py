@@ -56,16 +56,6 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
 
 
 @device_function
-def clear_messages(model: Any, memory: Any, world: int, i: int):
-    """Clear all sent and received reports."""
-    for slot in range(model.radio.slots):
-        memory.outbox[world, i, slot] = SenderReport()
-    for sender in range(model.vehicles):
-        memory.inbox[world, i, sender] = SenderReport()
-        memory.inbox[world, i, sender].tick = -1
-
-
-@device_function
 def broadcast_report(model: Any, state: Any, world: int, i: int, report: SenderReport):
     """Return a report as a vehicle broadcasts it, its `lie` faults included, see `[faults]`."""
     R, p = as_broadcast(model, state, world, i, report.pose.R, report.pose.p)
