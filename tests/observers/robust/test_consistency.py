@@ -16,9 +16,8 @@ from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_scenes import with_small_errors
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import watched
 
 SEEDS = range(5200, 5232)
 SCENES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -41,22 +40,12 @@ EXPECTED = {"a turned camera": (0.7, 1.2)}
 """Least and most of ANEES / 6 where the errors that are estimated with the pose are not small."""
 
 
-def nees_by_world(name: str, overrides: dict[str, Any], first: int, last: int) -> np.ndarray:
-    """Return (W, N) the mean NEES / 6 of each vehicle from one second to another."""
-    made = load_scenario(name, {"observer.name": "robust", "horizon": last + 1.0, **overrides})
-    world = simulate(made, len(SEEDS), "float32")
-    reset(world, SEEDS)
-    rate, found = round(made.rates.camera), []
-    for second in range(last):
-        world.advance(rate)
-        if second >= first:
-            found.append(nees_of(world)[0])
-    return np.nanmean(found, axis=0)
-
-
 @pytest.mark.parametrize("scene", SCENES)
 def test_errors_are_as_large_as_their_covariances_say(scene: str) -> None:
-    nees = nees_by_world(*SCENES[scene], 3, 12)
+    name, overrides = SCENES[scene]
+    made = load_scenario(name, {"observer.name": "robust", "horizon": 13.0, **overrides})
+    nees = watched(made, SEEDS, 12, round(made.rates.camera), skipped=3, dtype="float32")[0]
+    nees = np.nanmean(nees, axis=0)  # of each vehicle
     mean, error = nees.mean(axis=0), nees.std(axis=0, ddof=1) / np.sqrt(len(nees))
     least, most = EXPECTED.get(scene, (0.7, 1.05))
     assert (mean - 3.0 * error < most).all(), (mean, error)

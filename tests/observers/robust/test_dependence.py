@@ -7,12 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.api.engine import Engine
-from coopenv.evaluation import held_out_seeds
-from coopenv.policies import decide, find_agent, restart
 from coopenv.scenario.files import load_scenario
 from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import nees_of, steps_of
 
 ROBUST = {"observer.name": "robust"}
 
@@ -44,17 +41,10 @@ def test_nobody_in_a_lane_is_met_again() -> None:
         assert (memory.member.numpy()["correlation_unknown"] == 0).all()
 
 
-def meeting(worlds: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def meeting(worlds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ANEES/6 (W,), the position error (W,) in m and how often a member in view is marked, sixteen cars."""
-    scenario = load_scenario("large_crossing", ROBUST | overrides)
-    engine, policy = Engine(scenario, worlds), find_agent("route_follower").policy(scenario)
-    engine.reset(held_out_seeds(3, worlds))
-    actions, observed, found, marked = engine.world.actions.numpy(), engine.view("observation"), [], []
-    restart(policy, np.ones(engine.view("alive").size, dtype=bool))
-    while not engine.view("over").all():
-        rows = observed.reshape(-1, observed.shape[-1])
-        actions[...] = decide(policy, rows, actions.shape[-1]).reshape(actions.shape)
-        engine.step()
+    found, marked = [], []
+    for engine in steps_of("route_follower", load_scenario("large_crossing", ROBUST), worlds, 3):
         found.append(nees_of(engine.world))
         memory: Any = engine.world.memory
         marked.append(memory.member.numpy()["correlation_unknown"].mean())

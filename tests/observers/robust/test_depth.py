@@ -5,14 +5,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 from coopenv.scenario import load_scenario
-from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import watched
 
 EDGES = (2, 5, 10, 20, 35, 60)  # s
 DEEP = {
@@ -36,20 +33,11 @@ def by_window(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (windows, W, N) the mean NEES/6 and (windows, N) the RMS position error, m, between seconds."""
     made = load_scenario(name, {"observer.name": "robust", "horizon": float(edges[-1]) + 1.0, **overrides})
-    world = simulate(made, len(seeds))
-    reset(world, seeds)
     half = round(made.rates.camera) // 2
-    world.advance(2 * half * edges[0])
-    nees, errors = [], []
-    for start, end in pairwise(edges):
-        found = []
-        for _ in range(2 * (end - start)):
-            world.advance(half)
-            found.append(nees_of(world))
-        n, e = map(np.array, zip(*found, strict=True))
-        nees.append(n.mean(axis=0))
-        errors.append(np.sqrt((e**2).mean(axis=(0, 1))))
-    return np.array(nees), np.array(errors)
+    nees, errors, _ = watched(made, seeds, 2 * edges[-1], half, skipped=2 * edges[0])
+    windows = 2 * (np.array(edges[1:-1]) - edges[0])
+    means = [part.mean(axis=0) for part in np.split(nees, windows)]
+    return np.array(means), np.array([np.sqrt((part**2).mean(axis=(0, 1))) for part in np.split(errors, windows)])
 
 
 @pytest.mark.parametrize("name", ["lane:8", "random:12,seed=4", "tree:9"])

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from coopenv.scenario import Scenario, load_scenario
-from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import watched
 
 WINDOWS = ((5, 10), (10, 20), (20, 40))  # s
 WORLDS = 8
@@ -94,14 +93,10 @@ def built(drawn: Drawn) -> Scenario:
 
 def consistency(drawn: Drawn) -> np.ndarray:
     """Return (windows, W, N) the mean NEES/6; NaN where a vehicle never knows its pose."""
-    world = simulate(built(drawn), WORLDS)
-    reset(world, range(31000, 31000 + WORLDS))
     half = int(drawn.overrides["rates.camera"]) // 2
-    nees, at = [], np.arange(1, 81) * half / drawn.overrides["rates.camera"]
-    for _ in at:
-        world.advance(half)
-        nees.append(nees_of(world)[0])
-    parts = [np.array(nees)[(at > start) & (at <= end)] for start, end in WINDOWS]
+    at = np.arange(1, 81) * half / drawn.overrides["rates.camera"]
+    nees = watched(built(drawn), range(31000, 31000 + WORLDS), len(at), half)[0]
+    parts = [nees[(at > start) & (at <= end)] for start, end in WINDOWS]
     counts = [np.isfinite(part).sum(axis=0) for part in parts]
     return np.array([np.nansum(p, axis=0) / np.where(n > 0, n, np.nan) for p, n in zip(parts, counts, strict=True)])
 

@@ -6,13 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
-from tests.helpers.builders import reset, simulate
 from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.robust_worlds import estimates, watched
 from tests.helpers.warp_calls import DTYPES
 
 Driver = Callable[[World, int, np.ndarray], np.ndarray | float]
@@ -32,12 +31,6 @@ def square(**overrides: object) -> Scenario:
     return load_scenario(FOUR_WAY, {**open_space, **start, "observer.name": "robust", **overrides})
 
 
-def estimates(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Return R (W, N, 3, 3) and p (W, N, 3) as estimated."""
-    R = world.view("estimate_rotation").astype(float)
-    return R, np.einsum("wnij,wnj->wni", R, world.view("estimate_position").astype(float))
-
-
 def weaving(world: World, k: int, phase: np.ndarray) -> np.ndarray:
     """Return actions (W, N, 2) of drivers that weave along their lanes."""
     R, p = estimates(world)
@@ -55,35 +48,19 @@ def turning_hard(world: World, k: int, phase: np.ndarray) -> np.ndarray:
     return np.stack([np.full(phase.shape, 0.5), np.sign(np.sin(0.09 * k + phase))], -1)
 
 
-def nees_of(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Return NEES / 6 (W, N) and position errors in m of vehicles under way; NaN of others and in a search."""
-    (R, p), L, memory = estimates(world), world.model.landmarks, world.memory
-    assert np.isfinite(p).all()
-    away = world.view("position")[:, L:].astype(float) - p
-    turned = Rotation.from_matrix((np.swapaxes(R, -1, -2) @ world.view("rotation")[:, L:]).reshape(-1, 3, 3))
-    e = np.concatenate([turned.as_rotvec().reshape(p.shape), np.einsum("wnji,wnj->wni", R, away)], -1)
-    searching = memory.search.numpy()["active"] == 1
-    P = np.where(searching[..., None, None], np.eye(6), memory.P.numpy()[:, :, 0, 0])
-    assert (np.linalg.eigvalsh(P)[..., 0] > 0.0).all()
-    under_way = (world.view("ended") == 0) & ~searching
-    found = np.einsum("wni,wni->wn", e, np.linalg.solve(P, e[..., None])[..., 0]) / 6.0
-    return np.where(under_way, found, np.nan), np.where(under_way, np.linalg.norm(away, axis=-1), np.nan)
-
-
 def driven(
     scenario: Scenario, driver: Driver, worlds: int, dtype: str, seconds: int
 ) -> tuple[np.ndarray, np.ndarray, World]:
     """Return NEES / 6 (K, W, N) and position errors in m of vehicles under way, and the world in the end."""
-    world = simulate(scenario, worlds, dtype)
-    reset(world, range(1000, 1000 + worlds))
-    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (worlds, world.model.vehicles))
-    found = []
-    for k in range(10 * seconds):
-        world.actions.numpy()[...] = np.clip(driver(world, k, phase), -1, 1)
-        world.advance(6)
-        found.append(nees_of(world))
-    nees, errors = zip(*found, strict=True)
-    return np.array(nees), np.array(errors), world
+    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (worlds, len(scenario.vehicles)))
+    return watched(
+        scenario,
+        range(1000, 1000 + worlds),
+        10 * seconds,
+        6,
+        dtype=dtype,
+        act=lambda world, k: np.asarray(driver(world, k, phase)),
+    )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -15,9 +15,8 @@ from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from coopenv.observers.runner import Run
 from coopenv.scenario import load_scenario
-from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_scenes import noise_free, small_errors
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import watched
 
 TURN, SHIFT = Rotation.from_rotvec([0.4, -0.7, 2.0]).as_matrix(), np.array([30.0, -80.0, 7.0])
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -171,13 +170,7 @@ def test_half_the_frames_of_half_the_variance(name: str) -> None:
             name,
             {"observer.name": "robust", "horizon": 20.0, "rates.odometry": 60.0, "rates.decision": 10.0, **changes},
         )
-        world = simulate(made, 24, "float32")
-        reset(world, range(300, 324))
-        found = []
-        for _ in range(12):
-            world.advance(round(made.rates.camera))
-            found.append(nees_of(world))
-        nees, errors = (np.array(part)[4:] for part in zip(*found, strict=True))
+        nees, errors, _ = watched(made, range(300, 324), 12, round(made.rates.camera), skipped=4, dtype="float32")
         sizes.append((np.nanmean(nees), np.sqrt(np.nanmean(errors**2, axis=(0, 1)))))
     assert abs(sizes[0][0] - sizes[1][0]) < 0.35
     assert_allclose(sizes[1][1], sizes[0][1], rtol=0.35)

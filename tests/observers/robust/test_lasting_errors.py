@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.api.engine import Engine
-from coopenv.evaluation import held_out_seeds
-from coopenv.policies import decide, find_agent, restart
 from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import driven, nees_of, square, weaving
+from tests.helpers.robust_worlds import nees_of, steps_of
+from tests.observers.robust.test_driving import driven, square, weaving
 
 LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.0087}
 YAW_ONLY = LASTING | {"noise.gyro_bias": [0.0, 0.0, 0.0087]}
@@ -82,16 +80,7 @@ def test_a_whole_episode_on_prescribed_paths(lasting: dict[str, Any]) -> None:
 @pytest.mark.parametrize("environment", ["open_square", "facade", "behind_truck", "urban_crossing"])
 def test_drivers_know_their_errors(environment: str, agent: str, lasting: dict[str, Any]) -> None:
     scenario = load_scenario(environment, ROBUST | lasting)
-    engine, policy = Engine(scenario, 128), find_agent(agent).policy(scenario)
-    engine.reset(held_out_seeds(0, 128))
-    actions, observed, found = engine.world.actions.numpy(), engine.view("observation"), []
-    restart(policy, np.ones(engine.view("alive").size, dtype=bool))
-    while not engine.view("over").all():
-        actions[...] = decide(policy, observed.reshape(-1, observed.shape[-1]), actions.shape[-1]).reshape(
-            actions.shape
-        )
-        engine.step()
-        found.append(nees_of(engine.world))
+    found = [nees_of(engine.world) for engine in steps_of(agent, scenario, 128, 0)]
     nees, errors = (np.array(part)[20:] for part in zip(*found, strict=True))
     known = np.isfinite(nees).sum(axis=0)
     # By world, so that one that strays until the end counts as the others do; not there at all: NaN.

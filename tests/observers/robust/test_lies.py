@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from coopenv.scenario import Scenario, load_scenario
-from tests.helpers.builders import errors, reset, simulate
+from tests.helpers.builders import reset, simulate
+from tests.helpers.robust_worlds import position_errors
 
 SEEN = (
     ("SL1", "SL2", "SL3"),
@@ -55,9 +56,7 @@ def mean_errors(made: Scenario, seeds: range, seconds: int, start: float) -> np.
     for k in range(2 * seconds):
         world.advance(30)
         if (k + 1) / 2 > start:
-            state = {name: world.view(name).copy() for name in ("rotation", "position")}
-            state |= {name: world.view(name).copy() for name in ("estimate_rotation", "estimate_position")}
-            found.append(errors(world, state)[0])
+            found.append(position_errors(world))
     return np.mean(found, axis=0)
 
 
@@ -97,9 +96,7 @@ def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.nd
     world = simulate(made, 1)
     reset(world, [seed])
     world.advance(60 * seconds)
-    state = {name: world.view(name).copy() for name in ("rotation", "position")}
-    state |= {name: world.view(name).copy() for name in ("estimate_rotation", "estimate_position")}
-    return world.memory.monitor.numpy()["exclusions"][0], errors(world, state)[0][0]
+    return world.memory.monitor.numpy()["exclusions"][0], position_errors(world)[0]
 
 
 @pytest.mark.parametrize(

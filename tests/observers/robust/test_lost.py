@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import estimates, nees_of
+from tests.helpers.robust_worlds import estimates, nees_of, position_errors
 
 NEAR, TURN = 0.5, np.radians(5.0)  # m and rad
 WRONG = 20.0  # NEES/6
@@ -52,9 +52,8 @@ def outcome(scenario: Scenario, seeds: range, seconds: float) -> Outcome:
     near, nees = [], []
     for _ in range(round(5 * seconds)):
         world.advance(ticks)
-        R, p = estimates(world)
-        away = np.linalg.norm(world.view("position")[:, L:] - p, axis=-1)
-        turned = np.swapaxes(R, -1, -2) @ world.view("rotation")[:, L:]
+        away = position_errors(world)
+        turned = np.swapaxes(estimates(world)[0], -1, -2) @ world.view("rotation")[:, L:]
         turn = Rotation.from_matrix(turned.reshape(-1, 3, 3)).magnitude().reshape(away.shape)
         near.append((away < NEAR) & (turn < TURN))
         nees.append(nees_of(world)[0])

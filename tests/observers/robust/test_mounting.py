@@ -13,40 +13,26 @@ import pytest
 from coopenv.observers.robust.memory import MOUNTING
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
-from tests.helpers.builders import reset, simulate
-from tests.observers.robust.test_driving import nees_of
+from tests.helpers.robust_worlds import watched
 
 TURNED = {"camera.extrinsics_error": 0.01745}  # rad per axis: 1 deg
 
 
-def worlds(name: str, seeds: range, **overrides: Any) -> World:
+def judged(name: str, seeds: range, start: int, end: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, World]:
+    """Return (W, N) the mean NEES/6 and error in m of each vehicle from one second to another; and the world."""
     made = load_scenario(name, {"observer.name": "robust", **TURNED, **overrides})
-    world = simulate(made, len(seeds))
-    reset(world, seeds)
-    return world
-
-
-def judged(world: World, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (W, N) the mean NEES/6 and the mean error in m of each vehicle from one second to another."""
-    found = []
-    rate = round(world.scenario.rates.camera)
-    for second in range(end):
-        world.advance(rate)
-        if second >= start:
-            found.append(nees_of(world))
-    nees, error = np.mean(found, axis=0)
-    return nees, error
+    nees, errors, world = watched(made, seeds, end, round(made.rates.camera), skipped=start)
+    return nees.mean(axis=0), errors.mean(axis=0), world
 
 
 def test_it_is_as_sure_as_it_may_be() -> None:
-    nees, _ = judged(worlds("busy_intersection_tracking", range(16)), 10, 30)
+    nees, _, _ = judged("busy_intersection_tracking", range(16), 10, 30)
     assert (nees.mean(axis=0) < 2.5).all()
 
 
 def test_it_finds_out_how_the_camera_is_turned() -> None:
     """A car that goes straight on tells its heading from the camera's by where its odometry leads."""
-    world = worlds("busy_intersection_tracking", range(16))
-    world.advance(60 * 40)
+    _, _, world = judged("busy_intersection_tracking", range(16), 39, 40)
     R = world.memory.member.numpy()["pose"]["R"][:, 0, MOUNTING]
     turn = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
     true = world.view("camera_turn")[:, 0]
@@ -62,8 +48,8 @@ def test_it_finds_out_how_the_camera_is_turned() -> None:
 @pytest.mark.parametrize("name", ["busy_intersection_tracking", "lane:8", "tree:15"])
 def test_figures_in_other_worlds(name: str) -> None:
     seeds = range(700, 732)
-    nees, error = judged(worlds(name, seeds), 10, 40)
-    without, good = judged(worlds(name, seeds, **{"camera.extrinsics_error": 0.0}), 10, 40)
+    nees, error, _ = judged(name, seeds, 10, 40)
+    without, good, _ = judged(name, seeds, 10, 40, **{"camera.extrinsics_error": 0.0})
     print(f"\n{name}: ANEES/6 {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
     assert (nees.mean(axis=0) < 2.5).all()
 

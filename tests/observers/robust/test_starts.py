@@ -10,7 +10,7 @@ from coopenv.api.engine import Engine
 from coopenv.estimation.poses import Coordinates
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
-from tests.observers.robust.test_driving import estimates, nees_of
+from tests.helpers.robust_worlds import estimates, nees_of
 
 EMBEDDING = [name for name in coopenv.list_envs() if load_scenario(name).observer.name == "robust"]
 
