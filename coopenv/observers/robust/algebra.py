@@ -51,7 +51,7 @@ def log_so3(R: Any):
 @wp.func
 def position_variance(P: Any):
     """Return the sum of the variances of a position, m^2, of a covariance, 6x6."""
-    return wp.float64(P[3, 3] + P[4, 4] + P[5, 5])
+    return wp.float64(P[3, 3]) + wp.float64(P[4, 4]) + wp.float64(P[5, 5])
 
 
 @wp.func
@@ -212,6 +212,12 @@ def with_noise(P: Any, noise: Any):
 
 
 @wp.func
+def inflated(P: Any, share: Any):
+    """Return P, 6x6, with a share of its diagonal added to the diagonal."""
+    return P + wp.diag(share * wp.get_diag(P))
+
+
+@wp.func
 def carried(estimate: PoseEstimate, step: Pose, noise: Any):
     """Return an estimate after an increment of odometry with noise."""
     return PoseEstimate(moved(estimate.pose, step), with_noise(propagated(estimate.P, step), noise))
@@ -298,19 +304,10 @@ def entry(memory: Any, world: int, x: int, k: int, j: int):
 
 
 @device_function
-def swap_rows(memory: Any, world: int, x: int, k: int, j: int, count: int):
-    """Swap two rows of the matrix x."""
+def add_row(memory: Any, world: int, x: int, k: int, j: int, factor: Any, count: int):
+    """Add a multiple of row k of the matrix x to its row j."""
     for b in range(count):
-        row = memory.matrix[world, x, k // 6, b][k % 6]
-        memory.matrix[world, x, k // 6, b][k % 6] = memory.matrix[world, x, j // 6, b][j % 6]
-        memory.matrix[world, x, j // 6, b][j % 6] = row
-
-
-@device_function
-def subtract_row(memory: Any, world: int, x: int, k: int, j: int, factor: Any, count: int):
-    """Subtract a multiple of row k of the matrix x from its row j."""
-    for b in range(count):
-        row = memory.matrix[world, x, j // 6, b][j % 6] - factor * memory.matrix[world, x, k // 6, b][k % 6]
+        row = memory.matrix[world, x, j // 6, b][j % 6] + factor * memory.matrix[world, x, k // 6, b][k % 6]
         memory.matrix[world, x, j // 6, b][j % 6] = row
 
 
@@ -323,22 +320,26 @@ def invert(memory: Any, world: int, x: int, y: int, count: int):
             memory.matrix[world, y, a, b] = mat66d()
         memory.matrix[world, y, a, a] = wp.identity(6, wp.float64)
     for k in range(n):
+        pivot = entry(memory, world, x, k, k)
         best = int(k)
         for j in range(k + 1, n):
             if wp.abs(entry(memory, world, x, j, k)) > wp.abs(entry(memory, world, x, best, k)):
                 best = j
-        if best != k:
-            swap_rows(memory, world, x, k, best, count)
-            swap_rows(memory, world, y, k, best, count)
-        scale = wp.float64(1.0) / entry(memory, world, x, k, k)
-        for b in range(count):
-            memory.matrix[world, x, k // 6, b][k % 6] = memory.matrix[world, x, k // 6, b][k % 6] * scale
-            memory.matrix[world, y, k // 6, b][k % 6] = memory.matrix[world, y, k // 6, b][k % 6] * scale
+        if best != k:  # its row is added: the pivot becomes the sum of both magnitudes
+            sign = wp.where(
+                pivot * entry(memory, world, x, best, k) < wp.float64(0.0), wp.float64(-1.0), wp.float64(1.0)
+            )
+            add_row(memory, world, x, best, k, sign, count)
+            add_row(memory, world, y, best, k, sign, count)
         for j in range(n):
-            factor = entry(memory, world, x, j, k)
+            factor = -entry(memory, world, x, j, k) / entry(memory, world, x, k, k)
             if j != k and factor != wp.float64(0.0):
-                subtract_row(memory, world, x, k, j, factor, count)
-                subtract_row(memory, world, y, k, j, factor, count)
+                add_row(memory, world, x, k, j, factor, count)
+                add_row(memory, world, y, k, j, factor, count)
+    for k in range(n):
+        for b in range(count):
+            row = memory.matrix[world, y, k // 6, b][k % 6] / entry(memory, world, x, k, k)
+            memory.matrix[world, y, k // 6, b][k % 6] = row
 
 
 @device_function

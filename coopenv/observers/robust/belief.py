@@ -38,17 +38,27 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 
 @device_function
+def set_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
+    """Set the covariance at (k, j) to a block, and to its transpose at (j, k)."""
+    memory.P[world, i, k, j] = block
+    memory.P[world, i, j, k] = wp.transpose(block)
+
+
+@device_function
+def decorrelate(memory: Any, world: int, i: int, n: int):
+    """Set the covariances of a member's error with those of the earlier members to zero."""
+    for k in range(n):
+        set_block(memory, world, i, n, k, mat66d())
+
+
+@device_function
 def begin_belief(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Begin the belief with the vehicle itself; the calibration states are kept without correlations."""
-    others = memory.belief[world, i].others
-    memory.belief[world, i].members = others
-    for k in range(1, others):
-        for j in range(k):
-            memory.P[world, i, j, k] = mat66d()
-            memory.P[world, i, k, j] = mat66d()
+    memory.belief[world, i].members = memory.belief[world, i].others
+    for k in range(1, memory.belief[world, i].others):
+        decorrelate(memory, world, i, k)
     memory.member[world, i, 0].vehicle = i
-    memory.member[world, i, 0].pose = estimate.pose
-    memory.P[world, i, 0, 0] = estimate.P
+    put_own(memory, world, i, estimate)
 
 
 @device_function
@@ -70,9 +80,7 @@ def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
     for k in range(memory.belief[world, i].members):
         if k != n:
-            block = forward(step, memory.P[world, i, n, k])
-            memory.P[world, i, n, k] = block
-            memory.P[world, i, k, n] = wp.transpose(block)
+            set_block(memory, world, i, n, k, forward(step, memory.P[world, i, n, k]))
     memory.P[world, i, n, n] = with_noise(propagated(memory.P[world, i, n, n], step), noise)
 
 
@@ -121,8 +129,7 @@ def apply_corrections(memory: Any, world: int, i: int):
                 block = wp.transpose(diagonal_by_rows(memory.scratch[world, j].recentring, wp.transpose(block)))
             else:
                 continue
-            memory.P[world, i, k, j] = block
-            memory.P[world, i, j, k] = wp.transpose(block)
+            set_block(memory, world, i, k, j, block)
 
 
 @device_function
@@ -131,17 +138,14 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
     left = memory.P[world, i, k, j] - block
     if k == j:
         left = symmetric_part(left)
-    memory.P[world, i, k, j] = left
-    memory.P[world, i, j, k] = wp.transpose(left)
+    set_block(memory, world, i, k, j, left)
 
 
 @device_function
 def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: Any):
     """Add a member whose error is independent of those of the others; there must be room. Nothing else is set."""
     n = memory.belief[world, i].members
-    for k in range(n):
-        memory.P[world, i, n, k] = mat66d()
-        memory.P[world, i, k, n] = mat66d()
+    decorrelate(memory, world, i, n)
     memory.P[world, i, n, n] = P
     member = Member()
     member.vehicle = vehicle

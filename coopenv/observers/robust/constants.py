@@ -29,11 +29,10 @@ ERRORS_TIME = 1.0
 """s for which a lasting odometry error is correlated where it counts as noise. Chosen."""
 SHARE_OF_CHANGE, LEAST_CHANGE = 0.2, 0.05
 """Share and m/s by which a velocity must change before the effect of clock offsets is updated. Chosen."""
-MIN_MOUNTING_STD = 1e-6  # rad and m, of an error of the mounting that is not declared beside one that is
 MOUNTING_WALK = 0.02
 """Share of its declared deviation by which the mounting walks in a second. Without turns, heading and mounting
 are not separately observable, and linearisation makes both covariances slightly too small. Tuned."""
-MIN_ERROR_STD = 1e-6  # rad/s and a share: of an error that is not declared beside one that is
+MIN_ERROR_STD = 1e-6  # rad/s, a share, rad and m: of a calibration state that is not declared beside one that is
 
 # Tests
 
@@ -117,7 +116,6 @@ LEAST_LEFT = 0.003
 """Least share of a sender's variance, in all directions, that known correlations do not explain. Tuned."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message is not fused."""
-MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; usually below 1.1
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
 MAX_BROADCAST = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
 SUPERSEDING_TIME = 1.0  # s, for which a joint message replaces the messages of the vehicles in it. Chosen

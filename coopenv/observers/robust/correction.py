@@ -7,8 +7,8 @@ import warp as wp
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
-from coopenv.observers.robust.measurements import innovation_cross_covariance, linearise, project
-from coopenv.observers.robust.memory import BearingFrame, mat66d, vec6d
+from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
+from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function
 
 
@@ -35,17 +35,11 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
     for n in range(frame.bearings):
         if memory.measurement[world, n].fits == 1:
             linearise(frame, memory, world, i, n)
-            member = memory.measurement[world, n].member
-            H = memory.measurement[world, n].jacobian
-            memory.measurement[world, n].jacobian = by_rows(H, memory.scratch[world, 0].recentring)
-            if member > 0 and is_free(memory, world, i, member):
-                H = memory.measurement[world, n].member_jacobian
-                memory.measurement[world, n].member_jacobian = by_rows(H, memory.scratch[world, member].recentring)
-            if frame.mounting > 0:
-                H = memory.measurement[world, n].mounting_jacobian
-                memory.measurement[world, n].mounting_jacobian = by_rows(
-                    H, memory.scratch[world, frame.mounting].recentring
-                )
+            for part in range(DERIVATIVES):
+                member = memory.derivative[world, n, part].member
+                if member >= 0 and is_free(memory, world, i, wp.max(member, 0)):
+                    H = by_rows(memory.derivative[world, n, part].jacobian, memory.scratch[world, member].recentring)
+                    memory.derivative[world, n, part].jacobian = H
 
 
 @device_function
@@ -57,10 +51,7 @@ def set_gain(memory: Any, world: int, i: int, n: int):
             share = innovation_cross_covariance(memory, world, n, m) * memory.measurement[world, m].weight
             for k in range(members):
                 memory.gain[world, n, k] = memory.gain[world, n, k] - share * memory.gain[world, m, k]
-    S = memory.measurement[world, n].noise * wp.identity(2, wp.float64) + innovation_cross_covariance(
-        memory, world, n, n
-    )
-    memory.measurement[world, n].weight = wp.inverse(S)
+    memory.measurement[world, n].weight = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
 
 
 @device_function
@@ -70,12 +61,6 @@ def hold_considered(memory: Any, world: int, i: int):
         if not is_free(memory, world, i, k):
             memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
             memory.scratch[world, k].correction = vec6d()
-
-
-@device_function
-def error_left(memory: Any, world: int, k: int):
-    """Return the linearisation point less the correction so far."""
-    return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
 
 
 @device_function
@@ -95,16 +80,12 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                 project(memory, world, i, n)
             set_gain(memory, world, i, n)
             member = memory.measurement[world, n].member
-            residual = memory.measurement[world, n].residual + memory.measurement[world, n].jacobian * error_left(
-                memory, world, 0
-            )
-            if member > 0:
-                residual = residual + memory.measurement[world, n].member_jacobian * error_left(memory, world, member)
-            mounting = memory.measurement[world, n].mounting
-            if mounting > 0:
-                residual = residual + memory.measurement[world, n].mounting_jacobian * error_left(
-                    memory, world, mounting
-                )
+            residual = memory.measurement[world, n].residual
+            for part in range(DERIVATIVES):
+                k = memory.derivative[world, n, part].member
+                if k >= 0:
+                    left = memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
+                    residual = residual + memory.derivative[world, n, part].jacobian * left
             weighted = memory.measurement[world, n].weight * residual
             nis = wp.dot(weighted, residual)
             if gating and member > 0 and nis > wp.float64(BEARING_GATE):

@@ -16,7 +16,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
+from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
 from coopenv.observers.robust.constants import LEAST_CHANGE, SHARE_OF_CHANGE
 from coopenv.observers.robust.correlations import correlation_index, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
@@ -67,8 +67,7 @@ def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
 def set_row(memory: Any, world: int, i: int, n: int):
     """Write `scratch.row` to row and column n of the covariance."""
     for k in range(memory.belief[world, i].members):
-        memory.P[world, i, n, k] = memory.scratch[world, k].row
-        memory.P[world, i, k, n] = wp.transpose(memory.scratch[world, k].row)
+        set_block(memory, world, i, n, k, memory.scratch[world, k].row)
 
 
 @device_function
@@ -78,10 +77,6 @@ def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     memory.member[world, i, n].pose = report.pose
     memory.member[world, i, n].considered = 1
-    for k in range(memory.belief[world, i].members):
-        memory.P[world, i, n, k] = mat66d()
-        memory.P[world, i, k, n] = mat66d()
-    memory.P[world, i, n, n] = after
     regress(model, memory, world, i, n, after, False)
     set_row(memory, world, i, n)
 
@@ -112,9 +107,7 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
         gain = wp.transpose(memory.scratch[world, k].column) * inverse
         memory.scratch[world, k].correction = gain * d
         for j in range(k, members):
-            block = memory.P[world, i, k, j] - gain * memory.scratch[world, j].column
-            memory.P[world, i, k, j] = block
-            memory.P[world, i, j, k] = wp.transpose(block)
+            set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, j].column)
     for k in range(others, members):
         memory.scratch[world, k].correction = vec6d()
     apply_corrections(memory, world, i)
@@ -135,24 +128,18 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
     for k in range(members):
-        block = memory.P[world, i, n, k]
-        if k == n:
-            block = algebra.recentred(G, block, G)
-        else:
-            block = algebra.diagonal_by_rows(G, block)
-        memory.P[world, i, n, k] = block
-        memory.P[world, i, k, n] = wp.transpose(block)
+        if k != n:
+            set_block(memory, world, i, n, k, algebra.diagonal_by_rows(G, memory.P[world, i, n, k]))
     d = G * news
-    before = mat66d(memory.P[world, i, n, n])
+    before = algebra.recentred(G, memory.P[world, i, n, n], G)
+    memory.P[world, i, n, n] = before
     memory.member[world, i, n].pose = report.pose
     more = regress(model, memory, world, i, n, after, True)
     for k in range(members):
         memory.scratch[world, k].column = memory.P[world, i, n, k] - memory.scratch[world, k].row
     memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
-    N = before - after + more
-    for k in range(6):
-        N[k, k] = N[k, k] + wp.float64(constants.LEAST_NEWS) * before[k, k]
+    N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
     variance = algebra.position_variance(before)
     reach = wp.float64(constants.MAX_SENDER_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):

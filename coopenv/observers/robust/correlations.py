@@ -30,8 +30,7 @@ from coopenv.observers.robust.memory import (
     mat66f,
     vec3d,
 )
-from coopenv.observers.robust.tracklets import arrived, depends_on_own, marker_jacobian, receive, send
-from coopenv.world.v2x import content_tick
+from coopenv.observers.robust.tracklets import dependents, depends_on_own, make_receive, marker_jacobian, own_report
 from coopenv.world.warp_internals import device_function
 
 
@@ -105,28 +104,28 @@ def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
 def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: int):
     """Broadcast the correlations with the members that depend on most others."""
     memory.outbox[world, i, slot].news = 1
+    fill(memory.outbox_correlation[world, i, slot], no_correlation())
     n = int(0)
     for c in range(memory.correlation.shape[3]):
-        broadcast = no_correlation()
-        if c == 0 or n > 0:
-            n = next_broadcast(model, memory, world, i, n)
-            if n > 0:
-                broadcast.vehicle = memory.member[world, i, n].vehicle
-                broadcast.tick = memory.member[world, i, n].report.tick
-                broadcast.matrix = own_correlation(model, memory, world, i, n)
+        n = next_broadcast(model, memory, world, i, n)
+        if n == 0:
+            break
+        member = memory.member[world, i, n].vehicle
+        tick = memory.member[world, i, n].report.tick
+        broadcast = Correlation(member, tick, own_correlation(model, memory, world, i, n))
         memory.outbox_correlation[world, i, slot, c] = broadcast
 
 
 @device_function
 def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due; the first of an interval has news and carries correlations."""
-    send(model, state, memory, world, i, tick)
     if tick % model.radio.period == 0:
         slot = tick % model.radio.slots
-        odometry = memory.outbox[world, i, slot].odometry
-        turn = vec3d(wp.vec3f(algebra.log_so3(odometry.R)))  # in single precision
-        memory.outbox[world, i, slot].odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(odometry.p)))
-        if memory.outbox[world, i, slot].valid == 1:
+        report = own_report(model, state, memory, world, i, tick)
+        turn = vec3d(wp.vec3f(algebra.log_so3(report.odometry.R)))  # in single precision
+        report.odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(report.odometry.p)))
+        memory.outbox[world, i, slot] = report
+        if report.valid == 1:
             if has_news(model, memory, world, i, tick):
                 broadcast_correlations(model, memory, world, i, slot)
 
@@ -141,19 +140,15 @@ def clear_broadcasts(memory: Any, world: int, i: int):
 
 
 @device_function
-def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Receive the messages that the radio delivers at this tick."""
-    for n in range(model.target_count[i]):
-        sender = model.targets[i, n] - model.landmarks
-        sent = arrived(state, memory, world, i, sender)
-        if sent >= 0:
-            slot = content_tick(model, state, world, sender, sent) % model.radio.slots
-            if memory.outbox[world, sender, slot].news == 1:
-                later = state.inbox_stamp[world, i, sender] - memory.outbox[world, sender, slot].tick
-                for c in range(memory.correlation.shape[3]):
-                    memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
-                    memory.correlation[world, i, sender, c].tick += later  # ages are broadcast, not ticks
-    receive(model, state, memory, world, i)
+def copy_correlations(memory: Any, world: int, i: int, sender: int, slot: int, later: int):
+    """Copy the correlations of a message, if it carries them, with ticks `later`: ages are broadcast, not ticks."""
+    if memory.outbox[world, sender, slot].news == 1:
+        for c in range(memory.correlation.shape[3]):
+            memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
+            memory.correlation[world, i, sender, c].tick += later
+
+
+receive_broadcast = make_receive(copy_correlations)
 
 
 @device_function
@@ -212,16 +207,6 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     return most >= wp.float64(0.0), False, shared
 
 
-INFLATION = 1.0 + constants.RELATIVE_NOISE
-
-
-@device_function
-def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
-    """Store the covariance with a member's error as known regressor `at`."""
-    memory.known[world, at].member = member
-    memory.known[world, at].covariance = covariance
-
-
 @device_function
 def note_correlations(
     model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool, count: int, broadcast: bool
@@ -232,65 +217,10 @@ def note_correlations(
         if k != n and memory.member[world, i, k].considered == 1:  # otherwise it does not have its reported pose
             known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
             if known and is_broadcast == broadcast:
-                note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
+                covariance = A * X * wp.transpose(factor(memory.P[world, i, k, k]))
+                memory.known[world, count] = Regressor(k, covariance, mat66d())
                 count += 1
     return count
-
-
-@device_function
-def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
-    """Store all known covariances of member n's new error: with its previous one, broadcast, approximate.
-
-    Return their number, and the number without the approximate ones.
-    """
-    count = int(0)
-    if received:
-        note_known(memory, world, 0, n, after)
-        count = 1
-    sure = note_correlations(model, memory, world, i, n, after, received, count, True)
-    return note_correlations(model, memory, world, i, n, after, received, sure, False), sure
-
-
-@wp.func
-def inflated(P: Any):
-    """Return a covariance with `RELATIVE_NOISE` added to its diagonal."""
-    more = mat66d(P)
-    for k in range(6):
-        more[k, k] = P[k, k] * wp.float64(INFLATION)
-    return more
-
-
-@device_function
-def factorise(memory: Any, world: int, i: int, a: int):
-    """Set row a of the block Cholesky factor of the regressors' covariance; on its diagonal the inverse."""
-    row = memory.known[world, a].member
-    for b in range(a + 1):
-        X = mat66d(memory.P[world, i, row, memory.known[world, b].member])
-        if a == b:
-            X = inflated(X)
-        for c in range(b):
-            X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
-        if a == b:
-            memory.factor[world, a, a] = algebra.inverse_factor(X)
-        else:
-            memory.factor[world, a, b] = X * wp.transpose(memory.factor[world, b, b])
-
-
-@device_function
-def solve_known(memory: Any, world: int, i: int, count: int):
-    """Set the regression coefficients L."""
-    for a in range(count):
-        factorise(memory, world, i, a)
-        Y = mat66d(memory.known[world, a].covariance)
-        for c in range(a):
-            Y = Y - memory.known[world, c].coefficient * wp.transpose(memory.factor[world, a, c])
-        memory.known[world, a].coefficient = Y * wp.transpose(memory.factor[world, a, a])
-    for back in range(count):
-        a = count - 1 - back
-        Y = mat66d(memory.known[world, a].coefficient)
-        for c in range(a + 1, count):
-            Y = Y - memory.known[world, c].coefficient * memory.factor[world, c, a]
-        memory.known[world, a].coefficient = Y * memory.factor[world, a, a]
 
 
 @device_function
@@ -341,17 +271,35 @@ def dependence_inflation(memory: Any, world: int, i: int, n: int):
         return wp.float64(0.0)
     if not depends_on_own(memory, world, i, n):
         return wp.float64(constants.MIN_INFLATION)
-    count = wp.float64(0.0)
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if depends_on_own(memory, world, i, k):
-            count += wp.float64(1.0)
-    return count
+    return wp.float64(dependents(memory, world, i))
 
 
 @device_function
 def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
-    """Set the regression coefficients L; return the residual covariance."""
-    solve_known(memory, world, i, count)
+    """Set the regression coefficients L; return the residual covariance.
+
+    The block Cholesky factor of the regressors' covariance has its inverse on the diagonal.
+    """
+    for a in range(count):
+        Y = mat66d(memory.known[world, a].covariance)
+        for b in range(a + 1):
+            X = mat66d(memory.P[world, i, memory.known[world, a].member, memory.known[world, b].member])
+            if a == b:
+                X = algebra.inflated(X, wp.float64(constants.RELATIVE_NOISE))
+            for c in range(b):
+                X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
+            if a == b:
+                memory.factor[world, a, a] = algebra.inverse_factor(X)
+            else:
+                memory.factor[world, a, b] = X * wp.transpose(memory.factor[world, b, b])
+                Y = Y - memory.known[world, b].coefficient * wp.transpose(memory.factor[world, a, b])
+        memory.known[world, a].coefficient = Y * wp.transpose(memory.factor[world, a, a])
+    for back in range(count):
+        a = count - 1 - back
+        Y = mat66d(memory.known[world, a].coefficient)
+        for c in range(a + 1, count):
+            Y = Y - memory.known[world, c].coefficient * memory.factor[world, c, a]
+        memory.known[world, a].coefficient = Y * memory.factor[world, a, a]
     left = mat66d(after)
     for a in range(count):
         block = regressed(memory, world, i, count, memory.known[world, a].member)
@@ -363,10 +311,14 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
 def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return the inflation of `after`.
 
-    `after` is the reported covariance; both are 6x6, rad and m. Approximate correlations that contradict the others are
-    not used.
+    `after` is the reported covariance; both are 6x6, rad and m. Known are the covariance with the previous error of n,
+    if its report was `received` before, the broadcast ones, and approximate ones. Approximate ones that contradict the
+    others are not used.
     """
-    count, sure = gather_known(model, memory, world, i, n, after, received)
+    count = wp.where(received, 1, 0)
+    memory.known[world, 0] = Regressor(n, after, mat66d())
+    sure = note_correlations(model, memory, world, i, n, after, received, count, True)
+    count = note_correlations(model, memory, world, i, n, after, received, sure, False)
     more = mat66d()
     growth = wp.float64(0.0)
     if count > 0:

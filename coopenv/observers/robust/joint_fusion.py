@@ -21,6 +21,7 @@ from coopenv.observers.robust.algebra import (
     recentring,
     symmetrise,
     transition,
+    with_noise,
 )
 from coopenv.observers.robust.belief import (
     append_member,
@@ -31,6 +32,7 @@ from coopenv.observers.robust.belief import (
     mark_seen,
     most_others,
     remove_member,
+    set_block,
     subtract_block,
 )
 from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_VARIANCE_GROWTH
@@ -48,7 +50,7 @@ from coopenv.observers.robust.memory import PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import JOINT_MESSAGES
 from coopenv.observers.robust.observer import OPTIONS, in_space, make_estimate, make_start
 from coopenv.observers.robust.propagation import increment_noise
-from coopenv.observers.robust.tracklets import bit_of, information_share, is_due, propagate_member, test_sender
+from coopenv.observers.robust.tracklets import LEAST_TIME, bit_of, information_share, propagate_member, test_sender
 from coopenv.world.camera import VISIBLE
 from coopenv.world.embedded import Embedded
 from coopenv.world.warp_internals import device_function
@@ -57,33 +59,28 @@ from coopenv.world.warp_internals import device_function
 @device_function
 def predict_message(model: Any, memory: Any, world: int, i: int, c: int, count: int):
     """Propagate the contact's last message to the new one by odometry: poses to `step`, covariance to BEFORE."""
+    sender = memory.contact[world, i, c].sender
     for a in range(count):
         last = memory.contact_broadcast[world, i, c, a]
-        step = between(last.odometry, memory.broadcast[world, a].odometry)
+        broadcast = memory.inbox_broadcast[world, i, sender, a]
+        step = between(last.odometry, broadcast.odometry)
         memory.step[world, a] = moved(last.pose, step)
-        F = transition(step)
-        for b in range(count):
-            memory.matrix[world, BEFORE, a, b] = F * memory.contact_P[world, i, c, MAX_BROADCAST * a + b]
-        memory.scratch[world, a].column = F
-    for a in range(count):
-        for b in range(count):
-            Ft = wp.transpose(memory.scratch[world, b].column)
-            memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
-        ticks = wp.max(memory.broadcast[world, a].tick - memory.contact_broadcast[world, i, c, a].tick, 0)
-        dt = wp.float64(ticks) * model.camera_period
-        step = between(memory.contact_broadcast[world, i, c, a].odometry, memory.broadcast[world, a].odometry)
-        noise = increment_noise(model, memory, world, i, step, dt)
-        block = memory.matrix[world, BEFORE, a, a]
-        for k in range(6):
-            block[k, k] += noise[k // 3]
-        memory.matrix[world, BEFORE, a, a] = block
+        memory.scratch[world, a].column = transition(step)
+        for b in range(a + 1):
+            block = memory.scratch[world, a].column * memory.contact_P[world, i, c, MAX_BROADCAST * a + b]
+            block = block * wp.transpose(memory.scratch[world, b].column)
+            if a == b:
+                dt = wp.float64(wp.max(broadcast.tick - last.tick, 0)) * model.camera_period
+                block = with_noise(block, increment_noise(model, memory, world, i, step, dt))
+            memory.matrix[world, BEFORE, a, b] = block
+            memory.matrix[world, BEFORE, b, a] = wp.transpose(block)
 
 
 @device_function
-def propagate_to_message(model: Any, memory: Any, world: int, i: int, count: int):
+def propagate_to_message(model: Any, memory: Any, world: int, i: int, sender: int, count: int):
     """Propagate the members in a message to the times of their poses in it."""
     for a in range(count):
-        broadcast = memory.broadcast[world, a]
+        broadcast = memory.inbox_broadcast[world, i, sender, a]
         n = index_of(memory, world, i, broadcast.vehicle)
         if n > 0:
             last = memory.member[world, i, n].report
@@ -97,7 +94,7 @@ def propagate_to_message(model: Any, memory: Any, world: int, i: int, count: int
 
 
 @device_function
-def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
+def news_of(memory: Any, world: int, i: int, sender: int, count: int, share: Any) -> bool:
     """Turn the covariances BEFORE and AFTER into new information, of which a share counts; return whether there is any.
 
     Its matrix takes the place of BEFORE, its vector that of the corrections in `scratch`.
@@ -106,17 +103,16 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
         if entry(memory, world, AFTER, k, k) > wp.float64(MAX_VARIANCE_GROWTH) * entry(memory, world, BEFORE, k, k):
             return False
     invert(memory, world, AFTER, INVERSE, count)
-    for a in range(count):  # of the errors about `step`, as the rest
-        memory.scratch[world, a].recentring = recentring(
-            left_error(memory.step[world, a], memory.broadcast[world, a].pose)
+    for a in range(count):  # errors about `step`: of the poses in the message, and of the members
+        broadcast = memory.inbox_broadcast[world, i, sender, a]
+        news = left_error(memory.step[world, a], broadcast.pose)
+        member = index_of(memory, world, i, broadcast.vehicle)
+        memory.scratch[world, a].recentring = recentring(news)
+        memory.scratch[world, a].last_correction = news
+        memory.scratch[world, a].full_correction = left_error(
+            memory.step[world, a], memory.member[world, i, member].pose
         )
     recentre(memory, world, INVERSE, count)
-    for a in range(count):
-        vector = vec6d()
-        for b in range(count):
-            news = left_error(memory.step[world, b], memory.broadcast[world, b].pose)
-            vector += memory.matrix[world, INVERSE, a, b] * news
-        memory.scratch[world, a].correction = vector
     invert(memory, world, BEFORE, AFTER, count)
     for a in range(count):
         for b in range(count):
@@ -125,16 +121,14 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     symmetrise(memory, world, BEFORE, count)
     size = wp.float64(0.0)
     for a in range(count):
-        vector = share * memory.scratch[world, a].correction
+        vector = vec6d()
         for b in range(count):
-            n = index_of(memory, world, i, memory.broadcast[world, b].vehicle)
-            offset = left_error(memory.step[world, b], memory.member[world, i, n].pose)
-            vector = vector - memory.matrix[world, BEFORE, a, b] * offset
+            vector += share * (memory.matrix[world, INVERSE, a, b] * memory.scratch[world, b].last_correction)
+            vector = vector - memory.matrix[world, BEFORE, a, b] * memory.scratch[world, b].full_correction
         memory.scratch[world, a].correction = vector
         size += wp.dot(vector, vector)
     for a in range(count):  # of the errors about the members, backwards, to second order
-        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
-        G = recentring(-left_error(memory.step[world, a], memory.member[world, i, n].pose))
+        G = recentring(-memory.scratch[world, a].full_correction)
         memory.scratch[world, a].recentring = G
         memory.scratch[world, a].correction = wp.transpose(G) * memory.scratch[world, a].correction
     recentre(memory, world, BEFORE, count)
@@ -142,18 +136,18 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
 
 
 @device_function
-def fuse_joint_information(memory: Any, world: int, i: int, count: int):
+def fuse_joint_information(memory: Any, world: int, i: int, sender: int, count: int):
     """Fuse information about the errors of all vehicles in a message.
 
     The matrix BEFORE and the corrections in `scratch` hold it.
     """
     members = memory.belief[world, i].members
     for a in range(count):
-        m = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
+        m = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, a].vehicle)
         for k in range(members):
             memory.blocks[world, k, a] = memory.P[world, i, k, m]
     for a in range(count):
-        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
+        n = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, a].vehicle)
         for b in range(count):
             block = mat66d()
             for c in range(count):
@@ -183,25 +177,25 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
 
 
 @device_function
-def is_in_message(memory: Any, world: int, count: int, vehicle: int) -> bool:
-    """Return whether the message that has been read holds a vehicle."""
+def is_in_message(memory: Any, world: int, i: int, sender: int, count: int, vehicle: int) -> bool:
+    """Return whether a received message holds a vehicle."""
     for n in range(count):
-        if memory.broadcast[world, n].vehicle == vehicle:
+        if memory.inbox_broadcast[world, i, sender, n].vehicle == vehicle:
             return True
     return False
 
 
 @device_function
-def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, count: int) -> bool:
+def make_joint_room(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int) -> bool:
     """Remove the members in the message and, if room is needed, those unseen for longest.
 
     Return False, with nothing changed, if that does not make room for all vehicles in the message.
     """
-    own = wp.where(is_in_message(memory, world, count, i), 1, 0)
+    own = wp.where(is_in_message(memory, world, i, sender, count, i), 1, 0)
     staying = int(0)
     unseen = int(0)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if not is_in_message(memory, world, count, memory.member[world, i, n].vehicle):
+        if not is_in_message(memory, world, i, sender, count, memory.member[world, i, n].vehicle):
             staying += 1
             if is_unseen(model, memory, world, i, n, tick):
                 unseen += 1
@@ -209,7 +203,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
     if excess > unseen:
         return False
     for a in range(count):
-        n = index_of(memory, world, i, memory.broadcast[world, a].vehicle)
+        n = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, a].vehicle)
         if n > 0:
             remove_member(memory, world, i, n)
     for _ in range(excess):
@@ -219,12 +213,12 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
 
 @device_function
 def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int):
-    """Add all vehicles in the message that has been read, with its covariance, if there is room."""
-    if not make_joint_room(model, memory, world, i, tick, count):
+    """Add all vehicles in a received message, whose covariance is in AFTER, if there is room."""
+    if not make_joint_room(model, memory, world, i, sender, count, tick):
         return
     depends_on = joint_messages.dependence(memory, world, i, sender)
     for a in range(count):
-        broadcast = memory.broadcast[world, a]
+        broadcast = memory.inbox_broadcast[world, i, sender, a]
         if broadcast.vehicle != i:
             n = memory.belief[world, i].members
             append_member(memory, world, i, broadcast.vehicle, broadcast.pose, memory.matrix[world, AFTER, a, a])
@@ -233,11 +227,9 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
             memory.member[world, i, n].seen_tick = tick
             depends_on = depends_on | bit_of(broadcast.vehicle)
             for b in range(a):
-                m = index_of(memory, world, i, memory.broadcast[world, b].vehicle)
+                m = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, b].vehicle)
                 if m > 0:
-                    block = memory.matrix[world, AFTER, a, b]
-                    memory.P[world, i, n, m] = block
-                    memory.P[world, i, m, n] = wp.transpose(block)
+                    set_block(memory, world, i, n, m, memory.matrix[world, AFTER, a, b])
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
     c = joint_messages.contact_of(memory, world, i, sender)
     if c < 0:
@@ -250,41 +242,33 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
 @device_function
 def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
     """Propagate the vehicles in a message to it, and fuse its information since the contact's last message."""
-    ticks = memory.broadcast[world, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
-    if not is_due(model, memory.contact_broadcast[world, i, c, 0].tick, memory.broadcast[world, 0].tick):
+    broadcast = memory.inbox_broadcast[world, i, sender, 0]
+    dt = wp.float64(broadcast.tick - memory.contact_broadcast[world, i, c, 0].tick) * model.camera_period
+    if dt <= wp.float64(LEAST_TIME):  # too early after the sender's last fused message
         return
     predict_message(model, memory, world, i, c, count)
     joint_messages.store_contact(memory, world, i, c, sender, count)
-    propagate_to_message(model, memory, world, i, count)
+    propagate_to_message(model, memory, world, i, sender, count)
     n = index_of(memory, world, i, sender)
-    broadcast = memory.broadcast[world, 0]
     was_excluded = memory.contact[world, i, c].excluded
     joint_messages.note_contacts(memory, world, i)
     now = PoseEstimate(broadcast.pose, memory.matrix[world, AFTER, 0, 0])
-    test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
+    test_sender(memory, world, i, n, now, dt)
     memory.contact[world, i, c].excluded = memory.member[world, i, n].excluded
     memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
     if was_excluded == 1 or memory.contact[world, i, c].excluded == 1:
         return
     depends_on = memory.contact[world, i, c].depends_on
-    if news_of(memory, world, i, count, information_share(memory, world, i, depends_on)):
-        fuse_joint_information(memory, world, i, count)
+    if news_of(memory, world, i, sender, count, information_share(memory, world, i, depends_on)):
+        fuse_joint_information(memory, world, i, sender, count)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
-
-
-@device_function
-def vehicle_in_message(memory: Any, world: int, i: int, sender: int, n: int) -> int:
-    """Return the n-th vehicle in a received message, the sender first."""
-    if n == 0:
-        return sender
-    return memory.inbox_broadcast[world, i, sender, n - 1].vehicle
 
 
 @device_function
 def includes_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
     """Return whether a received message holds a vehicle in view."""
-    for n in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
-        if state.sight[world, i, model.landmarks + vehicle_in_message(memory, world, i, sender, n)] == VISIBLE:
+    for n in range(joint_messages.vehicles_in(memory, world, i, sender)):
+        if state.sight[world, i, model.landmarks + memory.inbox_broadcast[world, i, sender, n].vehicle] == VISIBLE:
             return True
     return False
 
@@ -292,13 +276,14 @@ def includes_visible(model: Any, state: Any, memory: Any, world: int, i: int, se
 @device_function
 def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Fuse one message, or add its vehicles; skip it if another message supersedes it."""
-    count = joint_messages.read_message(memory, world, i, sender)
+    count = joint_messages.vehicles_in(memory, world, i, sender)
+    joint_messages.read_covariance(memory, world, i, sender, count)
     c = joint_messages.contact_of(memory, world, i, sender)
     if joint_messages.is_superseded(model, memory, world, i, sender, count):
         if c >= 0:
             joint_messages.store_contact(memory, world, i, c, sender, count)
         return
-    if joint_messages.includes_the_same(memory, world, i, c, count):
+    if joint_messages.includes_the_same(memory, world, i, c, sender, count):
         fuse_joint_message(model, memory, world, i, c, sender, count)
     elif c >= 0 or includes_visible(model, state, memory, world, i, sender):
         add_joint_members(model, memory, world, i, sender, count, tick)
@@ -321,15 +306,15 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
                 if includes_visible(model, state, memory, world, i, sender):  # all vehicles in it then count as seen
-                    for k in range(joint_messages.others_in_message(memory, world, i, sender) + 1):
-                        m = index_of(memory, world, i, vehicle_in_message(memory, world, i, sender, k))
+                    for k in range(joint_messages.vehicles_in(memory, world, i, sender)):
+                        m = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, k].vehicle)
                         if m > 0:
                             memory.member[world, i, m].seen_tick = tick
     for fewer in range(MAX_BROADCAST):
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks
             if sender >= 0 and is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if joint_messages.others_in_message(memory, world, i, sender) == MAX_BROADCAST - 1 - fewer:
+                if joint_messages.vehicles_in(memory, world, i, sender) == MAX_BROADCAST - fewer:
                     fuse_one(model, state, memory, world, i, sender, tick)
     joint_messages.forget_contacts(memory, world, i)
     joint_messages.note_contacts(memory, world, i)

@@ -14,6 +14,7 @@ from coopenv.observers.robust.memory import (
     LARGE,
     MOUNTING,
     SIZES,
+    VEHICLE,
     CommonMemory,
     Pose,
     are_joint,
@@ -24,16 +25,9 @@ from coopenv.observers.robust.memory import (
     vec3d,
     where,
 )
-from coopenv.observers.robust.tracklets import (
-    arrived,
-    bit_of,
-    broadcast_report,
-    marker_jacobian,
-    own_report,
-    receive,
-)
+from coopenv.observers.robust.tracklets import bit_of, make_receive, marker_jacobian, own_report
 from coopenv.world.state import FLAG, ROTATION, TICK, Rule, array, extended, whole
-from coopenv.world.v2x import claimed_std, content_tick
+from coopenv.world.v2x import claimed_std
 from coopenv.world.warp_internals import device_function
 
 
@@ -51,7 +45,7 @@ class BroadcastVehicle:
 class JointHeader:
     """The part of a joint message beside the sender's own report."""
 
-    others: wp.int32  # number of other vehicles in it
+    count: wp.int32  # of vehicles in it, the sender included
     complete: wp.int32  # whether these are all members of the sender's belief
 
 
@@ -70,20 +64,19 @@ class Contact:
 JointMemory = extended(
     CommonMemory,
     "JointMemory",
-    """T vehicles in a message, B of them others than its sender.
+    """T vehicles in a message, its sender first.
 
     Their covariances are matrices of E blocks; messages hold the F numbers of the Cholesky factor, row by row.
     """,
     outbox_joint=array("WNS", JointHeader),
-    outbox_broadcast=array("WNSB", BroadcastVehicle),
+    outbox_broadcast=array("WNST", BroadcastVehicle),
     outbox_factor=array("WNSF", wp.float32),
     inbox_joint=array("WNN", JointHeader),
-    inbox_broadcast=array("WNNB", BroadcastVehicle),
+    inbox_broadcast=array("WNNT", BroadcastVehicle),
     inbox_factor=array("WNNF", wp.float32),
     contact=array("WNK", Contact),
-    contact_broadcast=array("WNKT", BroadcastVehicle),  # the sender first
+    contact_broadcast=array("WNKT", BroadcastVehicle),
     contact_P=array("WNKE", mat66d),  # blocks, row by row
-    broadcast=array("WT", BroadcastVehicle),  # scratch: of the message that is read
     step=array("WT", Pose),  # scratch: the last report of each carried on by odometry
     matrix=array("WXTT", mat66d),  # scratch
     blocks=array("WKT", mat66d),  # scratch: columns of the covariance
@@ -94,7 +87,6 @@ JOINT_SIZES = {
     **SIZES,
     "K": MAX_MEMBERS_JOINT + MOUNTING,
     "T": MAX_BROADCAST,
-    "B": MAX_BROADCAST - 1,
     "E": MAX_BROADCAST**2,
     "F": DIMENSION * (DIMENSION + 1) // 2,
     "X": 3,
@@ -106,27 +98,23 @@ def _are_in_message(P: Any, fields: Any, model: Any) -> Any:
     return are_joint(P.reshape(*P.shape[:3], MAX_BROADCAST, MAX_BROADCAST, 6, 6), fields["observer_contact.count"])
 
 
-VEHICLE = Rule("a vehicle", lambda values, fields, model: (values >= 0) & (values < model.vehicles))
-SENDER = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+MEMBER = Rule("a vehicle", lambda values, fields, model: (values >= 0) & (values < model.vehicles))
 
 
 def joint_rules() -> dict[str, Rule]:
     """Return what a saved memory may hold, see `rules_for`."""
     rules = {
         **rules_for(JOINT_SIZES["K"]),
-        "contact.sender": SENDER,
-        "contact.count": whole(0, MAX_BROADCAST),
+        "contact.sender": VEHICLE,
         "contact_P": Rule("a covariance", _are_in_message, axes=3),
-        **dict.fromkeys(("contact.excluded", "contact.fused"), FLAG),
+        **dict.fromkeys(("contact.excluded", "contact.fused", "outbox_joint.complete", "inbox_joint.complete"), FLAG),
         **dict.fromkeys(("matrix", "blocks"), LARGE),
     }
-    counts = {"outbox": "outbox_joint.others", "inbox": "inbox_joint.others", "contact": "contact.count"}
+    counts = {"outbox": "outbox_joint.count", "inbox": "inbox_joint.count", "contact": "contact.count"}
     for box, count in counts.items():
         rules |= where(count, {f"{box}_broadcast.pose.R": ROTATION, f"{box}_broadcast.odometry.R": ROTATION})
-        rules |= {f"{box}_broadcast.vehicle": VEHICLE, f"{box}_broadcast.tick": TICK}
-        if box != "contact":
-            rules |= {f"{box}_joint.others": whole(0, MAX_BROADCAST - 1), f"{box}_joint.complete": FLAG}
-    return rules | {"broadcast.vehicle": VEHICLE, "broadcast.tick": TICK}
+        rules |= {f"{box}_broadcast.vehicle": MEMBER, f"{box}_broadcast.tick": TICK, count: whole(0, MAX_BROADCAST)}
+    return rules
 
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
@@ -146,7 +134,6 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
     fill(memory.inbox_joint[world, i], JointHeader())
     fill_rows(memory.inbox_broadcast[world, i], BroadcastVehicle())
     fill_rows(memory.inbox_factor[world, i], wp.float32(0.0))
-    fill(memory.broadcast[world], BroadcastVehicle())
     fill(memory.step[world], Pose())
     fill_rows(memory.blocks[world], mat66d())
     for x in range(memory.matrix.shape[1]):
@@ -159,71 +146,72 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if tick % model.radio.period != 0:
         return
     slot = tick % model.radio.slots
-    report = broadcast_report(model, state, world, i, own_report(model, memory, world, i, tick))
-    claimed = wp.float64(claimed_std(model, state, world, i, tick))
+    report = own_report(model, state, memory, world, i, tick)
     joint = JointHeader()
-    others = memory.belief[world, i].others
-    members = memory.belief[world, i].members - others + 1  # without the odometry's errors
-    count = wp.min(members, MAX_BROADCAST)
     if report.valid == 1:
-        joint.others = count - 1
-        joint.complete = wp.where(count == members, 1, 0)
-        J = marker_jacobian(vec3d(model.scene.marker[model.landmarks + i]))
-        for a in range(count):
-            for b in range(count):
-                block = memory.P[world, i, wp.where(a > 0, others - 1 + a, 0), wp.where(b > 0, others - 1 + b, 0)]
-                if a == 0:
-                    block = J * block
-                if b == 0:
-                    block = block * wp.transpose(J)
-                if claimed > wp.float64(0.0) and (a == 0 or b == 0):
-                    block = wp.where(a == b, claimed * claimed, wp.float64(0.0)) * wp.identity(6, wp.float64)
-                memory.matrix[world, AFTER, a, b] = block
-        if not factorise(memory, world, AFTER, 6 * count):
+        others = memory.belief[world, i].others
+        members = memory.belief[world, i].members - others + 1  # without the odometry's errors
+        count = wp.min(members, MAX_BROADCAST)
+        write_covariance(model, state, memory, world, i, count, tick)
+        if factorise(memory, world, AFTER, 6 * count):
+            joint = JointHeader(count, wp.where(count == members, 1, 0))
+            for k in range(6 * count):
+                for j in range(k + 1):
+                    number = wp.float32(entry(memory, world, AFTER, k, j))
+                    memory.outbox_factor[world, i, slot, (k * (k + 1)) // 2 + j] = number
+            memory.outbox_broadcast[world, i, slot, 0] = BroadcastVehicle(i, tick, report.pose, report.odometry)
+            for n in range(1, count):
+                other = memory.member[world, i, others + n - 1]
+                broadcast = BroadcastVehicle(other.vehicle, other.report.tick, other.pose, other.report.odometry)
+                memory.outbox_broadcast[world, i, slot, n] = broadcast
+        else:
             report.valid = 0
-            joint = JointHeader()
-    for n in range(joint.others):
-        other = memory.member[world, i, others + n]
-        broadcast = BroadcastVehicle(other.vehicle, other.report.tick, other.pose, other.report.odometry)
-        memory.outbox_broadcast[world, i, slot, n] = broadcast
-    if report.valid == 1:
-        for k in range(6 * count):
-            for j in range(k + 1):
-                number = wp.float32(entry(memory, world, AFTER, k, j))
-                memory.outbox_factor[world, i, slot, (k * (k + 1)) // 2 + j] = number
     memory.outbox[world, i, slot] = report
     memory.outbox_joint[world, i, slot] = joint
 
 
 @device_function
-def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Receive the messages that the radio delivers at this tick."""
-    for n in range(model.target_count[i]):
-        sender = model.targets[i, n] - model.landmarks
-        sent = arrived(state, memory, world, i, sender)
-        if sent >= 0:
-            content = content_tick(model, state, world, sender, sent)
-            slot = content % model.radio.slots
-            later = state.inbox_stamp[world, i, sender] - content
-            joint = memory.outbox_joint[world, sender, slot]
-            memory.inbox_joint[world, i, sender] = joint
-            for k in range(joint.others):
-                memory.inbox_broadcast[world, i, sender, k] = memory.outbox_broadcast[world, sender, slot, k]
-                memory.inbox_broadcast[world, i, sender, k].tick = (
-                    memory.inbox_broadcast[world, i, sender, k].tick + later
-                )
-            size = 6 * (joint.others + 1)
-            for k in range((size * (size + 1)) // 2):
-                memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
-    receive(model, state, memory, world, i)
+def write_covariance(model: Any, state: Any, memory: Any, world: int, i: int, count: int, tick: int):
+    """Write the covariance of the own error at the marker and of the first other members' to AFTER.
+
+    A `lie` fault that claims a standard deviation replaces the own covariance and removes the cross-covariances.
+    """
+    claimed = wp.float64(claimed_std(model, state, world, i, tick))
+    J = marker_jacobian(vec3d(model.scene.marker[model.landmarks + i]))
+    others = memory.belief[world, i].others
+    for a in range(count):
+        for b in range(count):
+            block = memory.P[world, i, wp.where(a > 0, others - 1 + a, 0), wp.where(b > 0, others - 1 + b, 0)]
+            if a == 0:
+                block = J * block
+            if b == 0:
+                block = block * wp.transpose(J)
+            if claimed > wp.float64(0.0) and (a == 0 or b == 0):
+                block = wp.where(a == b, claimed * claimed, wp.float64(0.0)) * wp.identity(6, wp.float64)
+            memory.matrix[world, AFTER, a, b] = block
 
 
 @device_function
-def others_in_message(memory: Any, world: int, i: int, sender: int) -> int:
-    """Return the number of other vehicles in a received message that count: 0 if the sender depends on this vehicle."""
+def copy_joint(memory: Any, world: int, i: int, sender: int, slot: int, later: int):
+    """Copy the joint part of a message, with ticks `later`: ages are broadcast, not ticks."""
+    memory.inbox_joint[world, i, sender] = memory.outbox_joint[world, sender, slot]
+    count = memory.outbox_joint[world, sender, slot].count
+    for n in range(count):
+        memory.inbox_broadcast[world, i, sender, n] = memory.outbox_broadcast[world, sender, slot, n]
+        memory.inbox_broadcast[world, i, sender, n].tick += later
+    for k in range(3 * count * (6 * count + 1)):
+        memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
+
+
+receive_joint = make_receive(copy_joint)
+
+
+@device_function
+def vehicles_in(memory: Any, world: int, i: int, sender: int) -> int:
+    """Return the number of vehicles in a received message that count: 1 if the sender depends on this vehicle."""
     if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
-        return 0
-    return memory.inbox_joint[world, i, sender].others
+        return 1
+    return memory.inbox_joint[world, i, sender].count
 
 
 @device_function
@@ -237,25 +225,19 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
 
 
 @device_function
-def read_message(memory: Any, world: int, i: int, sender: int) -> int:
-    """Write the vehicles in a received message to `broadcast`, their covariance to AFTER; return their number."""
-    report = memory.inbox[world, i, sender]
-    memory.broadcast[world, 0] = BroadcastVehicle(sender, report.tick, report.pose, report.odometry)
-    others = others_in_message(memory, world, i, sender)
-    for n in range(others):
-        memory.broadcast[world, n + 1] = memory.inbox_broadcast[world, i, sender, n]
-    if (report.depends_on & bit_of(i)) != wp.uint64(0):
-        memory.matrix[world, AFTER, 0, 0] = mat66d(report.P)
-    else:
-        for k in range(6 * (others + 1)):
-            for j in range(k + 1):
-                total = wp.float64(0.0)  # the square of the factor
-                for c in range(j + 1):
-                    left = wp.float64(memory.inbox_factor[world, i, sender, (k * (k + 1)) // 2 + c])
-                    total += left * wp.float64(memory.inbox_factor[world, i, sender, (j * (j + 1)) // 2 + c])
-                memory.matrix[world, AFTER, k // 6, j // 6][k % 6, j % 6] = total
-                memory.matrix[world, AFTER, j // 6, k // 6][j % 6, k % 6] = total
-    return others + 1
+def read_covariance(memory: Any, world: int, i: int, sender: int, count: int):
+    """Write the covariance of the vehicles in a received message to AFTER."""
+    if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
+        memory.matrix[world, AFTER, 0, 0] = mat66d(memory.inbox[world, i, sender].P)
+        return
+    for k in range(6 * count):
+        for j in range(k + 1):
+            total = wp.float64(0.0)  # the square of the factor
+            for c in range(j + 1):
+                left = wp.float64(memory.inbox_factor[world, i, sender, (k * (k + 1)) // 2 + c])
+                total += left * wp.float64(memory.inbox_factor[world, i, sender, (j * (j + 1)) // 2 + c])
+            memory.matrix[world, AFTER, k // 6, j // 6][k % 6, j % 6] = total
+            memory.matrix[world, AFTER, j // 6, k // 6][j % 6, k % 6] = total
 
 
 @device_function
@@ -269,37 +251,37 @@ def contact_of(memory: Any, world: int, i: int, sender: int) -> int:
 
 @device_function
 def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: int):
-    """Store the message that has been read as the last one of a contact."""
+    """Store the received message of a sender, whose covariance is in AFTER, as the last one of a contact."""
     memory.contact[world, i, c].sender = sender
     memory.contact[world, i, c].count = count
     memory.contact[world, i, c].depends_on = dependence(memory, world, i, sender)
     for n in range(count):
-        memory.contact_broadcast[world, i, c, n] = memory.broadcast[world, n]
+        memory.contact_broadcast[world, i, c, n] = memory.inbox_broadcast[world, i, sender, n]
     for a in range(count):
         for b in range(count):
             memory.contact_P[world, i, c, MAX_BROADCAST * a + b] = memory.matrix[world, AFTER, a, b]
 
 
 @device_function
-def includes_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bool:
-    """Return whether there is a contact whose last message holds the same vehicles as the one that has been read."""
+def includes_the_same(memory: Any, world: int, i: int, c: int, sender: int, count: int) -> bool:
+    """Return whether there is a contact whose last message holds the same vehicles as the received one."""
     if c < 0:
         return False
     if memory.contact[world, i, c].count != count:
         return False
     for n in range(count):
-        if memory.contact_broadcast[world, i, c, n].vehicle != memory.broadcast[world, n].vehicle:
+        if memory.contact_broadcast[world, i, c, n].vehicle != memory.inbox_broadcast[world, i, sender, n].vehicle:
             return False
     return True
 
 
 @device_function
 def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, count: int) -> bool:
-    """Return whether a message that is fused already holds the sender of the one that has been read."""
+    """Return whether a message that is fused already holds the sender of the received one."""
     for c in range(memory.contact.shape[2]):
         other = memory.contact[world, i, c].sender
         if other >= 0 and other != sender and memory.contact[world, i, c].fused == 1:
-            later = memory.broadcast[world, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
+            later = memory.inbox_broadcast[world, i, sender, 0].tick - memory.contact_broadcast[world, i, c, 0].tick
             recent = wp.float64(later) * model.camera_period <= wp.float64(MAX_AGE)
             more = memory.contact[world, i, c].count > count or other < sender
             if recent and more:

@@ -9,7 +9,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise
+from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import (
     CONSIDERED_LINEARISATION_TIME,
@@ -21,7 +21,7 @@ from coopenv.observers.robust.constants import (
     MEMBER_LINEARISATION_TIME,
     THIRD,
 )
-from coopenv.observers.robust.memory import BearingFrame, mat26d, vec3d
+from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, Derivative, mat22d, mat26d, vec3d
 from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
 from coopenv.observers.robust.sender_monitor import is_excluded
 from coopenv.observers.robust.tracklets import only_returns
@@ -75,18 +75,17 @@ def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender:
 
 
 @device_function
-def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, tick: int, period: Any):
+def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, frame: BearingFrame):
     """Return the variance per axis, m^2, of a sender's reported position, as it counts in the search.
 
     Hypotheses are tracked through many frames, in all of which that error is nearly the same.
     """
-    P = memory.inbox[world, i, sender].P
-    variance = (wp.float64(P[3, 3]) + wp.float64(P[4, 4]) + wp.float64(P[5, 5])) * wp.float64(THIRD)
-    age = wp.float64(tick - memory.inbox[world, i, sender].tick) * model.camera_period
+    variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(THIRD)
+    age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
     gone = wp.float64(MAX_SPEED) * age
     factor = wp.float64(CORRELATION_FACTOR)
     if memory.search[world, i].hypotheses > 0:
-        factor = wp.max(factor, wp.float64(CORRELATION_TIME) / period)
+        factor = wp.max(factor, wp.float64(CORRELATION_TIME) / frame.period)
     return factor * (variance + gone * gone)
 
 
@@ -98,23 +97,13 @@ def frames_in(time: Any, period: Any):
 
 @device_function
 def set_measurement_of_member(
-    model: Any,
-    memory: Any,
-    world: int,
-    i: int,
-    n: int,
-    member: int,
-    received: bool,
-    tick: int,
-    b: Any,
-    period: Any,
-    purpose: int,
+    model: Any, memory: Any, world: int, i: int, frame: BearingFrame, member: int, received: bool, b: Any
 ) -> bool:
-    """Set the n-th bearing as one to a member that has moved since its last fused report; return whether it is usable.
+    """Set the frame's next bearing as one to a member that has moved since its last fused report.
 
     The member is propagated by its broadcast odometry, and from there by its last twist. Before a second report its
-    twist is unknown: its bearing is then used for a resection only, with `MAX_SPEED` as in the search. Errors that are
-    the same in several frames, one every `period`, count once in all of them.
+    twist is unknown: its bearing is then used for a resection only, with `MAX_SPEED` as in the search; the function
+    returns whether it is used. Errors that are the same in several frames count once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
     sender = memory.member[world, i, member].vehicle
@@ -128,78 +117,74 @@ def set_measurement_of_member(
         passed = wp.float64(memory.inbox[world, i, sender].tick - stands) * model.camera_period
         variance = increment_noise(model, memory, world, i, step, passed)[1]
         stands = memory.inbox[world, i, sender].tick
-    age = wp.float64(tick - stands) * model.camera_period
+    age = wp.float64(frame.tick - stands) * model.camera_period
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
-        variance += odometry_noise(model, i, age)[1] * frames_in(age, period) + away * away
+        variance += odometry_noise(model, i, age)[1] * frames_in(age, frame.period) + away * away
         if memory.member[world, i, member].has_twist == 0:
-            if purpose == TRACKING:
+            if frame.purpose == TRACKING:
                 return False
             going = wp.float64(MAX_SPEED) * age
             variance += going * going
         else:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
-            averaged = frames_in(averaging_time(model, i), period)
+            averaged = frames_in(averaging_time(model, i), frame.period)
             variance += memory.member[world, i, member].velocity_variance * age * age * averaged
-    set_bearing_measurement(memory, world, n, member, b, gone, variance)
+    set_bearing_measurement(memory, world, frame.bearings, member, b, gone, variance)
     return True
 
 
 @device_function
 def set_measurement_of_target(
-    model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, period: Any, purpose: int
+    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, target: int
 ) -> bool:
-    """Set the n-th measurement to the bearing to a target in view; return whether it is usable."""
+    """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, target))
     sender = target - model.landmarks
     if sender < 0:
-        set_bearing_measurement(
-            memory, world, n, 0, b, vec3d(marker_position(model, state, world, target)), wp.float64(0.0)
-        )
+        point = vec3d(marker_position(model, state, world, target))
+        set_bearing_measurement(memory, world, frame.bearings, 0, b, point, wp.float64(0.0))
         return True
-    received = is_received(model, state, memory, world, i, sender, tick)
-    if purpose == SEARCH:
-        received = received and not is_excluded(memory, world, i, sender, tick)
+    received = is_received(model, state, memory, world, i, sender, frame.tick)
+    if frame.purpose == SEARCH:
+        received = received and not is_excluded(memory, world, i, sender, frame.tick)
         if received:
-            variance = received_variance(model, memory, world, i, sender, tick, period)
-            set_bearing_measurement(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
+            variance = received_variance(model, memory, world, i, sender, frame)
+            point = memory.inbox[world, i, sender].pose.p
+            set_bearing_measurement(memory, world, frame.bearings, 0, b, point, variance)
         return received
     member = index_of(memory, world, i, sender)
-    if member > 0 and not (purpose == TRACKING and only_returns(memory, world, i, member)):
-        return set_measurement_of_member(model, memory, world, i, n, member, received, tick, b, period, purpose)
+    if member > 0 and not (frame.purpose == TRACKING and only_returns(memory, world, i, member)):
+        return set_measurement_of_member(model, memory, world, i, frame, member, received, b)
     return False
 
 
 @device_function
-def set_bearing_measurements(
-    model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int
-):
+def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, purpose: int):
     """Set the usable bearings to landmarks and vehicles as measurements, and return their frame.
 
-    In a search, vehicles have their reported positions, otherwise their estimated ones. `period` is the time since the
-    last frame, s.
+    In a search, vehicles have their reported positions, otherwise their estimated ones.
     """
-    bearings = int(0)
+    frame = BearingFrame()
+    frame.purpose = purpose
+    frame.tick = now.tick
+    frame.lever = vec3d(model.camera[i].position)
+    frame.variance = bearing_variance(model, i)
+    frame.period = now.period
+    if purpose != SEARCH:  # since the last frame that has corrected the belief, one tick at least
+        since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
+        frame.period = wp.max(since, now.period)
+    if purpose == TRACKING:
+        frame.mounting = mounting_of(memory, world, i)
+    else:
+        frame.variance += mounting_variances(model, i)[0]
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         if state.sight[world, i, target] == VISIBLE:
-            if set_measurement_of_target(model, state, memory, world, i, bearings, target, tick, period, purpose):
-                bearings += 1
-    mounting = int(0)
-    variance = bearing_variance(model, i)
-    if purpose == TRACKING:
-        mounting = mounting_of(memory, world, i)
-    else:
-        variance += mounting_variances(model, i)[0]
-    return BearingFrame(bearings, mounting, vec3d(model.camera[i].position), variance, period)
-
-
-@device_function
-def time_between(model: Any, state: Any, world: int, i: int, now: Any):
-    """Return the time since the last frame that has corrected the belief, s, one tick at least."""
-    since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
-    return wp.max(since, now.period)
+            if set_measurement_of_target(model, state, memory, world, i, frame, target):
+                frame.bearings += 1
+    return frame
 
 
 @device_function
@@ -227,7 +212,7 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
     along = wp.max(along, wp.float64(0.0))
     across = wp.max(total - along, wp.float64(0.0))
     square = distance * distance
-    return wp.max(time / period, wp.float64(1.0)) * along * across / (square * square)
+    return frames_in(time, period) * along * across / (square * square)
 
 
 @device_function
@@ -257,18 +242,19 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     H = mat26d()
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
-    memory.measurement[world, n].jacobian = H
+    memory.derivative[world, n, 0] = Derivative(0, H)
+    memory.derivative[world, n, 1].member = wp.where(member > 0, member, -1)
     if member > 0:
         G = B * turn
         H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
-        memory.measurement[world, n].member_jacobian = H
-    memory.measurement[world, n].mounting = frame.mounting
+        memory.derivative[world, n, 1].jacobian = H
+    memory.derivative[world, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
     if frame.mounting > 0:
         turned = memory.member[world, i, frame.mounting].pose.R
         H[:, :3] = T * turned * skew(memory.measurement[world, n].bearing)
         H[:, 3:] = -(B * turned)
-        memory.measurement[world, n].mounting_jacobian = H
+        memory.derivative[world, n, 2].jacobian = H
     memory.measurement[world, n].residual = T * bearing
     memory.measurement[world, n].distance = distance
     remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
@@ -281,38 +267,37 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
     """Set a measurement's `gain` to H P."""
-    H = memory.measurement[world, n].jacobian
-    member = memory.measurement[world, n].member
-    mounting = memory.measurement[world, n].mounting
     for k in range(memory.belief[world, i].members):
-        rows = by_rows(H, memory.P[world, i, 0, k])
-        if member > 0:
-            rows = rows + by_rows(memory.measurement[world, n].member_jacobian, memory.P[world, i, member, k])
-        if mounting > 0:
-            rows = rows + by_rows(memory.measurement[world, n].mounting_jacobian, memory.P[world, i, mounting, k])
+        rows = mat26d()
+        for part in range(DERIVATIVES):
+            member = memory.derivative[world, n, part].member
+            if member >= 0:
+                rows = rows + by_rows(memory.derivative[world, n, part].jacobian, memory.P[world, i, member, k])
         memory.gain[world, n, k] = rows
 
 
 @device_function
 def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
     """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
-    S = memory.measurement[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
-    member = memory.measurement[world, n].member
-    if member > 0:
-        S = S + memory.measurement[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
-    mounting = memory.measurement[world, n].mounting
-    if mounting > 0:
-        S = S + memory.measurement[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
+    S = mat22d()
+    for part in range(DERIVATIVES):
+        member = memory.derivative[world, n, part].member
+        if member >= 0:
+            S = S + memory.derivative[world, n, part].jacobian * wp.transpose(memory.gain[world, m, member])
     return S
 
 
 @device_function
-def innovation_with(memory: Any, world: int, n: int, more: Any):
-    """Return the normalised innovation squared of a projected bearing with more noise per axis, rad^2."""
+def innovation_weight(memory: Any, world: int, n: int, noise: Any):
+    """Return the inverse of the innovation's covariance of a projected bearing with a noise per axis, rad^2."""
+    return wp.inverse(noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, n, n))
+
+
+@device_function
+def innovation_with(memory: Any, world: int, n: int, noise: Any):
+    """Return the normalised innovation squared of a projected bearing with a noise per axis, rad^2."""
     residual = memory.measurement[world, n].residual
-    noise = memory.measurement[world, n].noise + more
-    S = noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, n, n)
-    return wp.dot(residual, wp.inverse(S) * residual)
+    return wp.dot(residual, innovation_weight(memory, world, n, noise) * residual)
 
 
 @device_function
@@ -324,4 +309,4 @@ def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: 
     if not linearise(frame, memory, world, i, n):
         return wp.float64(wp.inf)
     project(memory, world, i, n)
-    return innovation_with(memory, world, n, wp.float64(0.0))
+    return innovation_with(memory, world, n, memory.measurement[world, n].noise)

@@ -28,6 +28,7 @@ from coopenv.world.warp_internals import device_function
 
 vec2d: Any = wp.vec2d
 vec3d: Any = wp.vec3d
+vec4d: Any = wp.vec4d
 mat22d: Any = wp.mat22d
 mat33d: Any = wp.mat33d
 vec6d: Any = wp.types.vector(6, wp.float64)
@@ -164,6 +165,8 @@ class Hypothesis:
 class BearingFrame:
     """Properties that all bearings of a frame share; small, because functions receive copies of their arguments."""
 
+    purpose: wp.int32  # see measurements.py
+    tick: wp.int32
     bearings: wp.int32  # how many bearings can be used
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
     lever: vec3d  # m, of the camera in the body
@@ -177,19 +180,23 @@ class BearingMeasurement:
 
     member: wp.int32  # its target; 0: a point in the map
     reported_by: wp.int32  # the member whose report states that point, see solution_separation.py
-    mounting: wp.int32  # see `BearingFrame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
     fits: wp.int32
-    jacobian: mat26d  # H of the vehicle's own error
-    member_jacobian: mat26d  # H of the member's error
-    mounting_jacobian: mat26d  # H of that of the mounting
     noise: wp.float64  # rad^2 per axis
     common_noise: wp.float64  # rad^2, the largest for any hypothesis
     distance: wp.float64  # m
     residual: vec2d  # rad
     weight: mat22d  # 1/rad^2, inverse of the innovation's covariance
+
+
+@wp.struct
+class Derivative:
+    """The derivative of a bearing by the error of a member."""
+
+    member: wp.int32  # -1: none
+    jacobian: mat26d
 
 
 @wp.struct
@@ -209,7 +216,8 @@ class Scratch:
 class CommonMemory:
     """The memory that `robust` and `robust_joint` share.
 
-    K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`.
+    K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on; other axes as in
+    `coopenv.world.state`.
     """
 
     belief: array("WN", JointBelief)
@@ -222,13 +230,16 @@ class CommonMemory:
     outbox: array("WNS", SenderReport)
     inbox: array("WNN", SenderReport)  # per receiver and sender
     measurement: array("WA", BearingMeasurement)
+    derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WK", Scratch)
     gain: array("WAK", mat26d)  # scratch: of a bearing in a member, transposed and not yet weighted, see correction.py
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
-SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
+DERIVATIVES = 3  # the most errors that a bearing depends on
+SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1, "J": DERIVATIVES}
+"""Besides the hypotheses of one frame there is the prior."""
 
 
 @wp.func
@@ -260,6 +271,7 @@ def clear(memory: Any, world: int, i: int):
     fill(memory.inbox[world, i], never)
     fill(memory.scratch[world], Scratch())
     fill(memory.measurement[world], BearingMeasurement())
+    fill_rows(memory.derivative[world], Derivative())
     fill_rows(memory.gain[world], mat26d())
 
 
@@ -319,7 +331,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
         **dict.fromkeys(("measurement.member", "measurement.reported_by"), whole(0, members - 1)),
-        "measurement.mounting": whole(0, MOUNTING),
+        "derivative.member": whole(-1, members - 1),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),

@@ -122,9 +122,9 @@ def write_joint(observer: Any) -> Message:
     if message.position is None:
         return message
     m = observer.memory
-    others = int(m.outbox_joint[0]["others"])
-    broadcast = m.outbox_broadcast[0, :others]
-    n = 6 * (others + 1)
+    count = int(m.outbox_joint[0]["count"])
+    broadcast = m.outbox_broadcast[0, 1:count]
+    n = 6 * count
     joint: dict[str, Any] = {
         "vehicles": broadcast["vehicle"].astype(np.uint16),
         "ages": (int(m.outbox[0]["tick"]) - broadcast["tick"]) * observer.unit,
@@ -165,12 +165,14 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
         raise CoopenvError("message: factor")
     if not (factor[np.cumsum(np.arange(1, n + 1)) - 1] ** 2 >= MIN_VARIANCE).all():
         raise CoopenvError("message: factor is singular")
-    broadcast = m.inbox_broadcast[sender, :others]
+    report = m.inbox[sender]
+    m.inbox_broadcast[sender, 0] = sender, sent, report["pose"], report["odometry"]
+    broadcast = m.inbox_broadcast[sender, 1 : 1 + others]
     broadcast["vehicle"], broadcast["tick"] = vehicles, [sent - observer.units(age) for age in ages.tolist()]
     for one, pose, odometry in zip(broadcast, poses, odometries, strict=True):
         one["pose"], one["odometry"] = from_six(pose), from_six(odometry)
     m.inbox_factor[sender, : len(factor)] = factor
-    m.inbox_joint[sender] = others, complete[0] != 0
+    m.inbox_joint[sender] = 1 + others, complete[0] != 0
     m.inbox[sender]["valid"] = 1
 
 

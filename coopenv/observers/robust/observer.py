@@ -24,6 +24,7 @@ from coopenv.observers.robust.algebra import (
     between,
     carried,
     distance_squared,
+    inflated,
     inverse6,
     inverse_factor,
     is_known,
@@ -31,7 +32,7 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     with_noise,
 )
-from coopenv.observers.robust.belief import apply_error, begin_belief, own_estimate, set_anchor
+from coopenv.observers.robust.belief import apply_error, begin_belief, own_estimate, set_anchor, set_block
 from coopenv.observers.robust.constants import SAME_PRIOR, SURE
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
@@ -41,7 +42,6 @@ from coopenv.observers.robust.measurements import (
     TRACKING,
     innovation_squared,
     set_bearing_measurements,
-    time_between,
 )
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
@@ -107,10 +107,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
 @wp.func
 def is_valid(estimate: PoseEstimate):
     """Return whether an estimate is finite and its covariance positive definite, but for rounding."""
-    P = estimate.P
-    for k in range(6):
-        P[k, k] = P[k, k] * (wp.float64(1.0) + wp.float64(constants.ROUNDING))
-    factor = inverse_factor(P)
+    factor = inverse_factor(inflated(estimate.P, wp.float64(constants.ROUNDING)))
     return wp.isfinite(wp.trace(factor) + wp.length(estimate.pose.p) + wp.trace(estimate.pose.R))
 
 
@@ -158,7 +155,7 @@ def weight_of(memory: Any, world: int, i: int, n: int):
     N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
     member = memory.measurement[world, n].member
     if member > 0:
-        G = memory.measurement[world, n].member_jacobian
+        G = memory.derivative[world, n, 1].jacobian
         N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
     return wp.inverse(N)
 
@@ -171,20 +168,18 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
     for k in range(members):
         memory.scratch[world, k].column = mat66d()
     for n in range(bearings):
-        line = memory.measurement[world, n]
-        if line.fits == 1:
-            HtW = wp.transpose(line.jacobian) * weight_of(memory, world, i, n)
-            own += (HtW * wp.transpose(HtW)) * line.noise
-            if line.member > 0:
-                memory.scratch[world, line.member].column += HtW * line.member_jacobian
+        if memory.measurement[world, n].fits == 1:
+            HtW = wp.transpose(memory.derivative[world, n, 0].jacobian) * weight_of(memory, world, i, n)
+            own += (HtW * wp.transpose(HtW)) * memory.measurement[world, n].noise
+            member = memory.measurement[world, n].member
+            if member > 0:
+                memory.scratch[world, member].column += HtW * memory.derivative[world, n, 1].jacobian
     for k in range(1, members):
         cross = mat66d()
         for j in range(1, members):
             cross += memory.scratch[world, j].column * memory.P[world, i, j, k]
         own += cross * wp.transpose(memory.scratch[world, k].column)
-        block = -(inverse * cross)
-        memory.P[world, i, 0, k] = block
-        memory.P[world, i, k, 0] = wp.transpose(block)
+        set_block(memory, world, i, 0, k, -(inverse * cross))
     memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
 
 
@@ -199,7 +194,7 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
         b = vec6d()
         for n in range(bearings):
             if memory.measurement[world, n].fits == 1:
-                H = memory.measurement[world, n].jacobian
+                H = memory.derivative[world, n, 0].jacobian
                 HtW = wp.transpose(H) * weight_of(memory, world, i, n)
                 M += HtW * H
                 b += HtW * memory.measurement[world, n].residual
@@ -298,9 +293,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
     purpose = wp.where(standing == ESTIMATING, TRACKING, RESECTION)
-    frame = set_bearing_measurements(
-        model, state, memory, world, i, now.tick, time_between(model, state, world, i, now), purpose
-    )
+    frame = set_bearing_measurements(model, state, memory, world, i, now, purpose)
     if standing == ESTIMATING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)

@@ -7,7 +7,7 @@ import warp as wp
 from coopenv.estimation.linalg import exp_so3, orthonormalise, skew, symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import moved, odometry_noise, with_noise
-from coopenv.observers.robust.belief import propagate
+from coopenv.observers.robust.belief import propagate, set_block
 from coopenv.observers.robust.constants import (
     ERRORS_TIME,
     JUMP_GATE,
@@ -17,7 +17,18 @@ from coopenv.observers.robust.constants import (
     SAME_TIME,
     VELOCITY_TIME,
 )
-from coopenv.observers.robust.memory import ERRORS, MOUNTING, Member, Pose, mat33d, mat66d, vec2d, vec3d
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    MOUNTING,
+    Member,
+    Pose,
+    mat33d,
+    mat66d,
+    vec2d,
+    vec3d,
+    vec4d,
+    vec6d,
+)
 from coopenv.world.warp_internals import device_function
 
 
@@ -30,27 +41,15 @@ def mounting_variances(model: Any, i: int):
 
 
 @device_function
-def has_mounting_errors(model: Any, i: int) -> bool:
-    """Return whether an error of the mounting is declared."""
-    return wp.max(mounting_variances(model, i)) > wp.float64(0.0)
-
-
-@device_function
-def begin_mounting(model: Any, memory: Any, world: int, i: int):
-    """Begin the calibration state of the mounting, member 2, with its declared covariance."""
-    if has_mounting_errors(model, i):
-        memory.belief[world, i].others = MOUNTING + 1
-        mounting = Member()
-        mounting.vehicle = i
-        mounting.pose.R = wp.identity(3, wp.float64)
-        memory.member[world, i, MOUNTING] = mounting
-        declared = mounting_variances(model, i)
-        least = wp.float64(constants.MIN_MOUNTING_STD * constants.MIN_MOUNTING_STD)
-        P = wp.identity(6, wp.float64)
-        for k in range(3):
-            P[k, k] = wp.max(declared[0], least)
-            P[k + 3, k + 3] = wp.max(declared[1], least)
-        memory.P[world, i, MOUNTING, MOUNTING] = P
+def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
+    """Begin calibration state n with declared variances (6,)."""
+    memory.belief[world, i].others = n + 1
+    calibration = Member()
+    calibration.vehicle = i
+    calibration.pose.R = wp.identity(3, wp.float64)
+    memory.member[world, i, n] = calibration
+    least = vec6d(wp.float64(MIN_ERROR_STD * MIN_ERROR_STD))
+    memory.P[world, i, n, n] = wp.diag(wp.max(variances, least))
 
 
 @device_function
@@ -73,56 +72,42 @@ TWELFTH = 1.0 / 12.0
 
 @device_function
 def lasting_variances(model: Any, i: int):
-    """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale."""
-    noise = model.noise[i]
-    bias = vec3d(noise.gyro_bias)
-    return wp.cw_mul(bias, bias), wp.float64(noise.odometry_scale) * wp.float64(noise.odometry_scale)
+    """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale (4,)."""
+    bias = vec3d(model.noise[i].gyro_bias)
+    errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale))
+    return wp.cw_mul(errors, errors)
 
 
 @device_function
 def walk_variances(model: Any, i: int):
     """Return the growth of these variances per second."""
-    noise = model.noise[i]
-    bias = vec3d(noise.gyro_bias_walk)
-    scale = wp.float64(noise.odometry_scale_walk)
-    return wp.cw_mul(bias, bias), scale * scale
-
-
-@device_function
-def has_lasting_errors(model: Any, i: int) -> bool:
-    """Return whether a scale error or a bias of the gyro is declared."""
-    bias, scale = lasting_variances(model, i)
-    bias_walk, scale_walk = walk_variances(model, i)
-    return wp.max(bias + bias_walk) + scale + scale_walk > wp.float64(0.0)
+    bias = vec3d(model.noise[i].gyro_bias_walk)
+    errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
+    return wp.cw_mul(errors, errors)
 
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
-    """Begin the calibration states of odometry, member 1, and of the mounting, with their declared covariances."""
-    if has_lasting_errors(model, i) or has_mounting_errors(model, i):
-        memory.belief[world, i].others = ERRORS + 1
-        errors = Member()
-        errors.vehicle = i
-        errors.pose.R = wp.identity(3, wp.float64)
-        memory.member[world, i, ERRORS] = errors
-        bias, scale = lasting_variances(model, i)
-        least = wp.float64(MIN_ERROR_STD) * wp.float64(MIN_ERROR_STD)
-        P = wp.identity(6, wp.float64)  # entries without a state are arbitrary
-        for k in range(3):
-            P[k, k] = wp.max(bias[k], least)
-        P[3, 3] = wp.max(scale, least)
-        memory.P[world, i, ERRORS, ERRORS] = P
-    begin_mounting(model, memory, world, i)
+    """Begin the calibration states of odometry, member 1, and of the mounting, member 2, where errors are declared."""
+    lasting = lasting_variances(model, i)
+    mounting = mounting_variances(model, i)
+    has_mounting = wp.max(mounting) > wp.float64(0.0)
+    if wp.max(lasting + walk_variances(model, i)) > wp.float64(0.0) or has_mounting:
+        one = wp.float64(1.0)  # entries without a state are arbitrary
+        variances = vec6d(lasting[0], lasting[1], lasting[2], lasting[3], one, one)
+        begin_calibration(memory, world, i, ERRORS, variances)
+    if has_mounting:
+        variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
+        begin_calibration(memory, world, i, MOUNTING, variances)
 
 
 @device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariance of the odometry's errors by their walk over dt."""
     if memory.belief[world, i].others > ERRORS:
-        bias, scale = walk_variances(model, i)
-        for k in range(3):
-            memory.P[world, i, ERRORS, ERRORS][k, k] += bias[k] * dt
-        memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * dt
+        walk = walk_variances(model, i)
+        for k in range(4):
+            memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
 
 
 @device_function
@@ -166,9 +151,7 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
         for k in range(memory.belief[world, i].members):
             coupled = G * memory.P[world, i, ERRORS, k]
             if k > 0:
-                block = memory.P[world, i, 0, k] + coupled
-                memory.P[world, i, 0, k] = block
-                memory.P[world, i, k, 0] = wp.transpose(block)
+                set_block(memory, world, i, 0, k, memory.P[world, i, 0, k] + coupled)
             else:
                 both = coupled + wp.transpose(coupled) + G * memory.P[world, i, ERRORS, ERRORS] * wp.transpose(G)
                 memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)

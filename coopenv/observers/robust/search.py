@@ -57,27 +57,20 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
     return best, best_size, best_number
 
 
-@wp.func
-def angles_within(P: Any, most: Any) -> bool:
-    """Return whether all variances of angles are positive and no larger than `most`."""
-    for k in range(3):
-        if not (P[k, k] > wp.float64(0.0) and P[k, k] <= most):
-            return False
-    return True
-
-
 @device_function
 def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool):
     """Return whether three bearings determine the present pose well enough, and its covariance."""
     M = mat66d()
     for n in range(3):
         linearise(frame, memory, world, i, triple[n])
-        H = memory.measurement[world, triple[n]].jacobian
+        H = memory.derivative[world, triple[n], 0].jacobian
         M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, triple[n]].noise)) * H
     P = symmetric_part(inverse6(M))
     if patient:
         return is_known(P), P
-    return angles_within(P, wp.float64(1.0)) and is_regular(M, P, wp.float64(constants.MAX_CONDITION)), P
+    angles = wp.vec3d(P[0, 0], P[1, 1], P[2, 2])
+    determined = wp.min(angles) > wp.float64(0.0) and wp.max(angles) <= wp.float64(1.0)
+    return determined and is_regular(M, P, wp.float64(constants.MAX_CONDITION)), P
 
 
 @device_function
@@ -265,8 +258,7 @@ def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: in
                 fits = 1
             cost = nis
             if wp.isfinite(nis):
-                more = memory.measurement[world, n].common_noise - memory.measurement[world, n].noise
-                cost = innovation_with(memory, world, n, more)
+                cost = innovation_with(memory, world, n, memory.measurement[world, n].common_noise)
             memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
@@ -365,7 +357,7 @@ def postpone_acceptance(memory: Any, world: int, i: int):
 @device_function
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Update the hypotheses by a frame; return whether a single one is left after some frames."""
-    frame = set_bearing_measurements(model, state, memory, world, i, now.tick, now.period, SEARCH)
+    frame = set_bearing_measurements(model, state, memory, world, i, now, SEARCH)
     beginning = memory.search[world, i].hypotheses == 0
     triple = wp.vec3i(-1, -1, -1)
     solved = int(0)

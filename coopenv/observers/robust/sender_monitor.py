@@ -30,6 +30,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
+from coopenv.observers.robust.belief import set_block
 from coopenv.observers.robust.memory import (
     BearingFrame,
     Drift,
@@ -53,16 +54,6 @@ def is_excluded(memory: Any, world: int, i: int, sender: int, tick: int) -> bool
     return tick < memory.monitor[world, i, sender].excluded_until
 
 
-@wp.func
-def only_position(M: Any):
-    """Return a 6x6 matrix without its first three columns."""
-    result = mat66d(M)
-    for a in range(6):
-        for b in range(3):
-            result[a, b] = wp.float64(0.0)
-    return result
-
-
 @device_function
 def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
     """Add a variance (m^2 per axis) to member n's position, and to all errors that depend on it."""
@@ -71,11 +62,11 @@ def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
     for k in range(members):
         memory.scratch[world, k].column = memory.P[world, i, k, n] * inverse
     for k in range(members):
-        A = only_position(memory.scratch[world, k].column)
+        A = memory.scratch[world, k].column
         for j in range(k + 1):
-            block = memory.P[world, i, k, j] + variance * (A * wp.transpose(memory.scratch[world, j].column))
-            memory.P[world, i, k, j] = block
-            memory.P[world, i, j, k] = wp.transpose(block)
+            B = memory.scratch[world, j].column
+            block = memory.P[world, i, k, j] + variance * (A[:, 3:] * wp.transpose(B[:, 3:]))
+            set_block(memory, world, i, k, j, block)
 
 
 @device_function

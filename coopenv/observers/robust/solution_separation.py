@@ -25,7 +25,7 @@ import warp as wp
 
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, distance_squared, position_variance, with_noise
-from coopenv.observers.robust.belief import index_of, own_estimate, put_own, set_anchor
+from coopenv.observers.robust.belief import index_of, own_estimate, put_own, set_anchor, set_block
 from coopenv.observers.robust.correction import correct_by_bearings, iterated_update, store_poses
 from coopenv.observers.robust.correlated_fusion import by_clocks, set_to_report
 from coopenv.observers.robust.correlations import clear_broadcasts
@@ -37,7 +37,6 @@ from coopenv.observers.robust.measurements import (
     linearise,
     set_bearing_measurement,
     set_bearing_measurements,
-    time_between,
 )
 from coopenv.observers.robust.memory import (
     BearingFrame,
@@ -96,7 +95,7 @@ def is_rejected(memory: Any, world: int, i: int, n: int) -> bool:
 @device_function
 def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Set the bearings to members in view, at their last reported positions, as measurements; return their frame."""
-    bearings = int(0)
+    frame = BearingFrame()
     mounting = mounting_variances(model, i)
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
@@ -110,12 +109,13 @@ def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: 
                     P = mat66d(report.P) + by_clocks(model, memory, world, i, member)
                     variance = wp.float64(constants.THIRD) * position_variance(P) + gone * gone + mounting[1]
                     b = vec3d(body_bearing(model, state, world, i, target))
-                    set_bearing_measurement(memory, world, bearings, 0, b, report.pose.p, variance)
-                    memory.measurement[world, bearings].reported_by = member
-                    bearings += 1
-    variance = bearing_variance(model, i) + mounting[0]
-    once = wp.float64(constants.LINEARISATION_TIME)  # s, a period for which the linearisation error counts once
-    return BearingFrame(bearings, 0, vec3d(model.camera[i].position), variance, once)
+                    set_bearing_measurement(memory, world, frame.bearings, 0, b, report.pose.p, variance)
+                    memory.measurement[world, frame.bearings].reported_by = member
+                    frame.bearings += 1
+    frame.lever = vec3d(model.camera[i].position)
+    frame.variance = bearing_variance(model, i) + mounting[0]
+    frame.period = wp.float64(constants.LINEARISATION_TIME)  # for which the linearisation error counts once
+    return frame
 
 
 @device_function
@@ -236,7 +236,11 @@ def correct_landmark_only(model: Any, frame: BearingFrame, memory: Any, world: i
     frames = wp.max(wp.float64(constants.CONSIDERED_LINEARISATION_TIME) / elapsed, wp.float64(1.0))
     mounting = wp.float64(constants.LANDMARK_ONLY_NOISE) * frames * mounting_variances(model, i)
     variance = wp.float64(constants.LANDMARK_ONLY_NOISE) * frame.variance + mounting[0]
-    inflated = BearingFrame(frame.bearings, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
+    inflated = BearingFrame()
+    inflated.bearings = frame.bearings
+    inflated.lever = frame.lever
+    inflated.variance = variance
+    inflated.period = wp.float64(LASTING_FRAME) * elapsed
     fitting = int(0)
     landmarks = int(0)
     for n in range(inflated.bearings):
@@ -264,8 +268,7 @@ def exchange_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
         memory.scratch[world, k].row = memory.P[world, i, 0, k]
-        memory.P[world, i, 0, k] = mat66d()
-        memory.P[world, i, k, 0] = mat66d()
+        set_block(memory, world, i, 0, k, mat66d())
 
 
 @device_function
@@ -273,8 +276,7 @@ def restore_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restore the own pose and its cross-covariances."""
     put_own(memory, world, i, estimate)
     for k in range(1, memory.belief[world, i].members):
-        memory.P[world, i, 0, k] = memory.scratch[world, k].row
-        memory.P[world, i, k, 0] = wp.transpose(memory.scratch[world, k].row)
+        set_block(memory, world, i, 0, k, memory.scratch[world, k].row)
 
 
 @device_function
@@ -353,8 +355,7 @@ def revert_to_landmark_only(model: Any, frame: BearingFrame, memory: Any, world:
     for k in range(1, members):
         for j in range(1, k):
             if j < others:
-                memory.P[world, i, k, j] = mat66d()
-                memory.P[world, i, j, k] = mat66d()
+                set_block(memory, world, i, k, j, mat66d())
     begin_errors(model, memory, world, i)
     reset_monitors(memory, world, i)
     for k in range(others, members):
@@ -419,8 +420,7 @@ def retest_exclusion(model: Any, state: Any, memory: Any, world: int, i: int, no
         k = memory.measurement[world, n].reported_by
         if k != faulty and memory.member[world, i, k].excluded == 1:
             readmit(model, memory, world, i, k)
-    period = time_between(model, state, world, i, now)
-    frame = set_bearing_measurements(model, state, memory, world, i, now.tick, period, TRACKING)
+    frame = set_bearing_measurements(model, state, memory, world, i, now, TRACKING)
     revert_to_landmark_only(model, frame, memory, world, i, now.tick, faulty)
     if memory.member[world, i, faulty].excluded == 0:
         exclude(model, memory, world, i, faulty, now.tick, wp.float64(0.0), False)
@@ -451,8 +451,7 @@ def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         since = wp.float64(now.tick - memory.landmark_only[world, i].tick) * model.camera_period
         looking = since > wp.float64(constants.LANDMARK_ONLY_PERIOD - constants.SAME_TIME)
         if looking or memory.belief[world, i].suspect > 0:
-            period = time_between(model, state, world, i, now)
-            frame = set_bearing_measurements(model, state, memory, world, i, now.tick, period, TRACKING)
+            frame = set_bearing_measurements(model, state, memory, world, i, now, TRACKING)
             if memory.belief[world, i].suspect > 0:
                 test_suspect(model, frame, memory, world, i, now.tick)
             else:

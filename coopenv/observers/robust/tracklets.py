@@ -36,8 +36,11 @@ def marker_jacobian(marker: Any):
 
 
 @device_function
-def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Return pose, covariance and odometry at the marker, or an empty report while the pose is not known."""
+def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Return the report that a vehicle broadcasts: empty while its pose is not known.
+
+    It holds pose, covariance and odometry at the marker, with the changes of a `lie` fault, see `[faults]`.
+    """
     report = SenderReport()
     report.tick = tick
     P = memory.P[world, i, 0, 0]
@@ -45,54 +48,44 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):
             P = sheared(P, -skew(marker))
+        claimed = wp.float64(claimed_std(model, state, world, i, tick))
+        if claimed > wp.float64(0.0):
+            P = claimed * claimed * wp.identity(6, wp.float64)
         pose = memory.member[world, i, 0].pose
+        R, p = as_broadcast(model, state, world, i, pose.R, pose.p + pose.R * marker)
         odometry = memory.belief[world, i].odometry
         report.valid = 1
-        report.pose = Pose(pose.R, pose.p + pose.R * marker)
+        report.pose = Pose(R, p)
         report.P = mat66f(P)
         report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
         report.depends_on = memory.belief[world, i].depends_on
     return report
 
 
-@device_function
-def broadcast_report(model: Any, state: Any, world: int, i: int, report: SenderReport):
-    """Return a report as a vehicle broadcasts it, its `lie` faults included, see `[faults]`."""
-    R, p = as_broadcast(model, state, world, i, report.pose.R, report.pose.p)
-    report.pose = Pose(R, p)
-    std = wp.float32(claimed_std(model, state, world, i, report.tick))
-    if std > wp.float32(0.0):
-        report.P = std * std * wp.identity(6, wp.float32)
-    return report
+def make_receive(copy: Any) -> Any:
+    """Return the Warp function that receives the messages that the radio delivers at a tick.
 
+    Args:
+        copy: (memory, world, receiver, sender, slot, later): copies the part of a message beside the report. Its time
+            stamp is later than its content by so many ticks.
+    """
 
-@device_function
-def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Send a report if one is due."""
-    if tick % model.radio.period == 0:
-        report = broadcast_report(model, state, world, i, own_report(model, memory, world, i, tick))
-        memory.outbox[world, i, tick % model.radio.slots] = report
+    @device_function
+    def receive(model: Any, state: Any, memory: Any, world: int, i: int):
+        """Receive the messages that the radio delivers at this tick."""
+        for n in range(model.target_count[i]):
+            sender = model.targets[i, n] - model.landmarks
+            if sender >= 0:
+                sent = state.inbox_tick[world, i, sender]
+                stamp = state.inbox_stamp[world, i, sender]
+                if sent >= 0 and stamp != memory.inbox[world, i, sender].tick:
+                    content = content_tick(model, state, world, sender, sent)
+                    slot = content % model.radio.slots
+                    copy(memory, world, i, sender, slot, stamp - content)
+                    memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
+                    memory.inbox[world, i, sender].tick = stamp
 
-
-@device_function
-def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
-    """Return the tick at which the message was sent that the radio has delivered now; -1 where there is none."""
-    if sender < 0:  # a landmark
-        return -1
-    sent = state.inbox_tick[world, i, sender]
-    return wp.where(state.inbox_stamp[world, i, sender] != memory.inbox[world, i, sender].tick, sent, -1)
-
-
-@device_function
-def receive(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Receive the reports that the radio delivers at this tick."""
-    for n in range(model.target_count[i]):
-        sender = model.targets[i, n] - model.landmarks
-        sent = arrived(state, memory, world, i, sender)
-        if sent >= 0:
-            slot = content_tick(model, state, world, sender, sent) % model.radio.slots
-            memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
-            memory.inbox[world, i, sender].tick = state.inbox_stamp[world, i, sender]
+    return receive
 
 
 @device_function
@@ -138,6 +131,16 @@ def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
 
 
 @device_function
+def dependents(memory: Any, world: int, i: int) -> int:
+    """Return how many members' reports may contain this vehicle's own information."""
+    count = int(0)
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if depends_on_own(memory, world, i, n):
+            count += 1
+    return count
+
+
+@device_function
 def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n may return this vehicle's own information, and has no much smaller variance.
 
@@ -161,17 +164,6 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     """
     if depends_on == wp.uint64(0):
         return wp.float64(1.0)
-    own = bit_of(i)
-    if (depends_on & own) == wp.uint64(0):
+    if (depends_on & bit_of(i)) == wp.uint64(0):
         return wp.float64(constants.DEPENDENT_SHARE)
-    count = int(1)
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if depends_on_own(memory, world, i, n):
-            count += 1
-    return wp.float64(1.0) / wp.float64(count)
-
-
-@device_function
-def is_due(model: Any, before: int, sent: int) -> bool:
-    """Return whether a message is late enough after the sender's last fused one to be fused."""
-    return wp.float64(sent - before) * model.camera_period > wp.float64(LEAST_TIME)
+    return wp.float64(1.0) / wp.float64(1 + dependents(memory, world, i))
