@@ -7,35 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import warp as wp
-from numpy.testing import assert_allclose
-from scipy.stats import chi2
 
 from coopenv.estimation.poses import Coordinates
 from coopenv.observers import run
 from coopenv.observers.robust.constants import SEPARATION_GATE
-from coopenv.observers.robust.solution_separation import consistent_cost
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.world.launch import start_warp
 from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_observers import OpenRobust
 from tests.observers.robust.test_lies import scene
-
-start_warp()
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def costs_kernel(costs: wp.array(dtype=wp.float64)):
-    n = wp.tid()
-    costs[n] = consistent_cost(n)
-
-
-def test_what_consistent_bearings_cost_is_a_quantile_of_chi_square() -> None:
-    costs = wp.zeros(7, dtype=wp.float64, device="cpu")
-    wp.launch(costs_kernel, 7, [costs], device="cpu")
-    assert costs.numpy()[0] == 0.0
-    assert_allclose(costs.numpy()[1:], chi2.ppf(0.999, 2 * np.arange(1, 7)), rtol=0.03)
 
 
 @pytest.mark.parametrize("seed", [515, 522])
