@@ -16,20 +16,13 @@ from coopenv.estimation.linalg import (
     symmetric_part,
     turn_by,
 )
-from coopenv.observers.robust.constants import (
-    KNOWN_ANGLE,
-    KNOWN_POSITION,
-    MAX_ACCELERATION,
-    MIN_ANGULAR_VELOCITY_STD,
-    MIN_VELOCITY_STD,
-    THIRD,
-)
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec2d, vec6d
 from coopenv.world.warp_internals import device_function
 
-KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
-KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
-QUARTER = 0.25 / MAX_ACCELERATION**2
+KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
+KNOWN_POSITION_VARIANCE = constants.KNOWN_POSITION**2
+QUARTER = 0.25 / constants.MAX_ACCELERATION**2
 BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
 
 
@@ -187,8 +180,8 @@ def propagated(P: Any, step: Pose):
 def odometry_noise(model: Any, i: int, dt: Any):
     """Return the variances (rotation, translation) per axis of an increment of vehicle i's odometry over dt."""
     scale = model.odometry_period * dt
-    angular = wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
-    linear = wp.max(wp.float64(model.noise[i].velocity), wp.float64(MIN_VELOCITY_STD))
+    angular = wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(constants.MIN_ANGULAR_VELOCITY_STD))
+    linear = wp.max(wp.float64(model.noise[i].velocity), wp.float64(constants.MIN_VELOCITY_STD))
     return vec2d(angular * angular * scale, linear * linear * scale)
 
 
@@ -198,7 +191,7 @@ def averaging_time(model: Any, i: int):
 
     Over a time t noise of density q has the variance q / (2 t), and the lag is a t: their sum is least at this one.
     """
-    return wp.pow(odometry_noise(model, i, wp.float64(1.0))[1] * wp.float64(QUARTER), wp.float64(THIRD))
+    return wp.pow(odometry_noise(model, i, wp.float64(1.0))[1] * wp.float64(QUARTER), wp.float64(constants.THIRD))
 
 
 @wp.func

@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
     diagonal_by_rows,
     displaced,
@@ -20,12 +21,11 @@ from coopenv.observers.robust.algebra import (
     recentring,
     with_noise,
 )
-from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Pose, PoseEstimate, mat66d
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
 
-MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
+MAX_UNSEEN_TIME = constants.FORGET_TIME + constants.SAME_TIME
 
 
 @device_function

@@ -4,9 +4,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
-from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function
@@ -55,20 +55,12 @@ def set_gain(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def hold_considered(memory: Any, world: int, i: int):
-    """Set the corrections of considered members to zero."""
-    for k in range(memory.belief[world, i].members):
-        if not is_free(memory, world, i, k):
-            memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
-            memory.scratch[world, k].correction = vec6d()
-
-
-@device_function
 def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool):
     """Find the correction by all bearings that fit, without a change of the covariance; return the sum of their NIS.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. With `gating`, the
     bearings are those that the gate has linearised and projected; bearings to members are gated again sequentially.
+    Considered members are not corrected.
     """
     total = wp.float64(0.0)
     members = memory.belief[world, i].members
@@ -88,14 +80,17 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                     residual = residual + memory.derivative[world, n, part].jacobian * left
             weighted = memory.measurement[world, n].weight * residual
             nis = wp.dot(weighted, residual)
-            if gating and member > 0 and nis > wp.float64(BEARING_GATE):
+            if gating and member > 0 and nis > wp.float64(constants.BEARING_GATE):
                 memory.measurement[world, n].fits = 0
             else:
                 total += nis
                 for k in range(members):
                     correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
                     memory.scratch[world, k].correction = correction
-    hold_considered(memory, world, i)
+    for k in range(members):
+        if not is_free(memory, world, i, k):
+            memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
+            memory.scratch[world, k].correction = vec6d()
     return total
 
 
@@ -123,11 +118,17 @@ def nearest(memory: Any, world: int, bearings: int):
     return distance
 
 
-@wp.func
-def turn_of_sight(error: Any, distance: Any):
-    """Return the angle by which an error turns a line of sight to a distance, rad."""
-    size = wp.abs(error)
-    return wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance)
+@device_function
+def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, last: Any):
+    """Return the largest turn (rad) of a line of sight by a share of the correction less one of the last correction."""
+    distance = nearest(memory, world, bearings)
+    turn = wp.float64(0.0)
+    for k in range(memory.belief[world, i].members):
+        if is_free(memory, world, i, k):
+            further = share * memory.scratch[world, k].correction - last * memory.scratch[world, k].last_correction
+            size = wp.abs(further)
+            turn = wp.max(turn, wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance))
+    return turn
 
 
 @device_function
@@ -136,21 +137,12 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
 
     The share is 1 if the correction turns a line of sight far, else 0.5.
     """
-    distance = nearest(memory, world, bearings)
-    turn = wp.float64(0.0)
-    for k in range(memory.belief[world, i].members):
-        if is_free(memory, world, i, k):
-            turn = wp.max(turn, turn_of_sight(memory.scratch[world, k].correction, distance))
-    share = wp.float64(1.0)
-    if turn < wp.float64(RELINEARISATION_ANGLE):
-        share = wp.float64(0.5)
-    turn = wp.float64(0.0)
-    for k in range(memory.belief[world, i].members):
-        if is_free(memory, world, i, k):
-            further = share * memory.scratch[world, k].correction - memory.scratch[world, k].last_correction
-            turn = wp.max(turn, turn_of_sight(further, distance))
-    if turn < wp.float64(RELINEARISATION_ANGLE) and not first:
-        share = wp.float64(0.0)
+    one = wp.float64(1.0)
+    far = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0)) >= wp.float64(constants.RELINEARISATION_ANGLE)
+    share = wp.where(far, one, wp.float64(0.5))
+    if not first:
+        if turn_of_sight(memory, world, i, bearings, share, one) < wp.float64(constants.RELINEARISATION_ANGLE):
+            share = wp.float64(0.0)
     return share
 
 
@@ -170,7 +162,7 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     correct_by_bearings(memory, world, i, bearings, True)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)
-    while share > wp.float64(0.0) and step < MAX_LINEARISATIONS:
+    while share > wp.float64(0.0) and step < constants.MAX_LINEARISATIONS:
         linearise_again(frame, memory, world, i, share)
         correct_by_bearings(memory, world, i, bearings, False)
         share = next_share(memory, world, i, bearings, False)

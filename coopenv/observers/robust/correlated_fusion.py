@@ -17,7 +17,6 @@ import warp as wp
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
-from coopenv.observers.robust.constants import LEAST_CHANGE, SHARE_OF_CHANGE
 from coopenv.observers.robust.correlations import correlation_index, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import mat66d, vec6d
@@ -55,7 +54,8 @@ def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
         return False
     v = memory.member[world, i, n].v
     dated = memory.member[world, i, n].dated_v
-    if wp.length(v - dated) <= wp.float64(SHARE_OF_CHANGE) * wp.length(dated) + wp.float64(LEAST_CHANGE):
+    most = wp.float64(constants.SHARE_OF_CHANGE) * wp.length(dated) + wp.float64(constants.LEAST_CHANGE)
+    if wp.length(v - dated) <= most:
         return False
     memory.member[world, i, n].dated_v = v
     P = memory.P[world, i, n, n] + by_clocks(model, memory, world, i, n)
@@ -150,11 +150,9 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
 @device_function
 def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
     """Propagate a member to its new report, test the report, and fuse it."""
-    sent = memory.inbox[world, i, sender].tick
-    before = memory.member[world, i, n].report.tick
     last = memory.member[world, i, n].report
     report = memory.inbox[world, i, sender]
-    dt = wp.float64(sent - before) * model.camera_period
+    dt = wp.float64(report.tick - last.tick) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
     lasting = lasting_noise(memory, world, i, step, dt, wp.float64(constants.ERRORS_TIME))
@@ -163,7 +161,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
     propagate_member(model, memory, world, i, n, step, dt, noise)
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
-    learnt = note_step(memory, world, i, sender, last, report, noise, lasting, dt)
+    learnt = note_step(memory, world, i, n, last, noise, lasting, dt)
     if memory.member[world, i, n].excluded == 0:  # an excluded sender has no sums, and its reports may jump
         propagate_information(memory, world, i, sender, learnt, noise[1])
     drift = drift_of(memory, world, i, n)
@@ -242,12 +240,11 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         sender = target - model.landmarks
-        if sender >= 0 and state.sight[world, i, target] == VISIBLE:
-            if is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if index_of(memory, world, i, sender) == 0 and not is_excluded(memory, world, i, sender, tick):
-                    at = rank(model, sender, memory.inbox[world, i, sender])
-                    if at > last and (best < 0 or at < best):
-                        best = at
+        if state.sight[world, i, target] == VISIBLE and is_received(model, state, memory, world, i, sender, tick):
+            if index_of(memory, world, i, sender) == 0 and not is_excluded(memory, world, i, sender, tick):
+                at = rank(model, sender, memory.inbox[world, i, sender])
+                if at > last and (best < 0 or at < best):
+                    best = at
     return best
 
 
@@ -260,9 +257,9 @@ def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick:
         if n == 0:
             break
         fuse_report(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
-    at = next_met(model, state, memory, world, i, -1, tick)
+    at = int(-1)
     for _ in range(model.target_count[i]):
+        at = next_met(model, state, memory, world, i, at, tick)
         if at < 0:
             break
         add_member(model, memory, world, i, at % model.vehicles, tick)
-        at = next_met(model, state, memory, world, i, at, tick)

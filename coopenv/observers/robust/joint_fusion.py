@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.estimation.poses import Coordinates
 from coopenv.observers.contract import Observer, Setup
-from coopenv.observers.robust import joint_messages
+from coopenv.observers.robust import constants, joint_messages
 from coopenv.observers.robust.algebra import (
     AFTER,
     BEFORE,
@@ -35,7 +35,6 @@ from coopenv.observers.robust.belief import (
     set_block,
     subtract_block,
 )
-from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_VARIANCE_GROWTH
 from coopenv.observers.robust.joint_messages import (
     JOINT_SIZES,
     Contact,
@@ -58,16 +57,16 @@ from coopenv.world.warp_internals import device_function
 
 @device_function
 def predict_message(model: Any, memory: Any, world: int, i: int, c: int, count: int):
-    """Propagate the contact's last message to the new one by odometry: poses to `step`, covariance to BEFORE."""
+    """Propagate the contact's last message to the new one by odometry: poses to `scratch`, covariance to BEFORE."""
     sender = memory.contact[world, i, c].sender
     for a in range(count):
         last = memory.contact_broadcast[world, i, c, a]
         broadcast = memory.inbox_broadcast[world, i, sender, a]
         step = between(last.odometry, broadcast.odometry)
-        memory.step[world, a] = moved(last.pose, step)
+        memory.scratch[world, a].pose = moved(last.pose, step)
         memory.scratch[world, a].column = transition(step)
         for b in range(a + 1):
-            block = memory.scratch[world, a].column * memory.contact_P[world, i, c, MAX_BROADCAST * a + b]
+            block = memory.scratch[world, a].column * memory.contact_P[world, i, c, constants.MAX_BROADCAST * a + b]
             block = block * wp.transpose(memory.scratch[world, b].column)
             if a == b:
                 dt = wp.float64(wp.max(broadcast.tick - last.tick, 0)) * model.camera_period
@@ -99,19 +98,19 @@ def news_of(memory: Any, world: int, i: int, sender: int, count: int, share: Any
 
     Its matrix takes the place of BEFORE, its vector that of the corrections in `scratch`.
     """
+    growth = wp.float64(constants.MAX_VARIANCE_GROWTH)
     for k in range(6 * count):
-        if entry(memory, world, AFTER, k, k) > wp.float64(MAX_VARIANCE_GROWTH) * entry(memory, world, BEFORE, k, k):
+        if entry(memory, world, AFTER, k, k) > growth * entry(memory, world, BEFORE, k, k):
             return False
     invert(memory, world, AFTER, INVERSE, count)
-    for a in range(count):  # errors about `step`: of the poses in the message, and of the members
+    for a in range(count):  # errors about the propagated poses: of those in the message, and of the members
         broadcast = memory.inbox_broadcast[world, i, sender, a]
-        news = left_error(memory.step[world, a], broadcast.pose)
+        pose = memory.scratch[world, a].pose
+        news = left_error(pose, broadcast.pose)
         member = index_of(memory, world, i, broadcast.vehicle)
         memory.scratch[world, a].recentring = recentring(news)
         memory.scratch[world, a].last_correction = news
-        memory.scratch[world, a].full_correction = left_error(
-            memory.step[world, a], memory.member[world, i, member].pose
-        )
+        memory.scratch[world, a].full_correction = left_error(pose, memory.member[world, i, member].pose)
     recentre(memory, world, INVERSE, count)
     invert(memory, world, BEFORE, AFTER, count)
     for a in range(count):
@@ -301,7 +300,7 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
         memory.contact[world, i, c].fused = 1
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
-        if sender >= 0 and is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
+        if is_received(model, state, memory, world, i, sender, tick):
             c = joint_messages.contact_of(memory, world, i, sender)
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
@@ -310,11 +309,11 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
                         m = index_of(memory, world, i, memory.inbox_broadcast[world, i, sender, k].vehicle)
                         if m > 0:
                             memory.member[world, i, m].seen_tick = tick
-    for fewer in range(MAX_BROADCAST):
+    for fewer in range(constants.MAX_BROADCAST):
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks
-            if sender >= 0 and is_received(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if joint_messages.vehicles_in(memory, world, i, sender) == MAX_BROADCAST - fewer:
+            if is_received(model, state, memory, world, i, sender, tick):
+                if joint_messages.vehicles_in(memory, world, i, sender) == constants.MAX_BROADCAST - fewer:
                     fuse_one(model, state, memory, world, i, sender, tick)
     joint_messages.forget_contacts(memory, world, i)
     joint_messages.note_contacts(memory, world, i)

@@ -7,9 +7,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import AFTER, entry, factorise
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_MEMBERS_JOINT, SAME_TIME, SUPERSEDING_TIME
 from coopenv.observers.robust.memory import (
     LARGE,
     MOUNTING,
@@ -77,17 +77,16 @@ JointMemory = extended(
     contact=array("WNK", Contact),
     contact_broadcast=array("WNKT", BroadcastVehicle),
     contact_P=array("WNKE", mat66d),  # blocks, row by row
-    step=array("WT", Pose),  # scratch: the last report of each carried on by odometry
     matrix=array("WXTT", mat66d),  # scratch
     blocks=array("WKT", mat66d),  # scratch: columns of the covariance
 )
 
-DIMENSION = 6 * MAX_BROADCAST
+DIMENSION = 6 * constants.MAX_BROADCAST
 JOINT_SIZES = {
     **SIZES,
-    "K": MAX_MEMBERS_JOINT + MOUNTING,
-    "T": MAX_BROADCAST,
-    "E": MAX_BROADCAST**2,
+    "K": constants.MAX_MEMBERS_JOINT + MOUNTING,
+    "T": constants.MAX_BROADCAST,
+    "E": constants.MAX_BROADCAST**2,
     "F": DIMENSION * (DIMENSION + 1) // 2,
     "X": 3,
 }
@@ -95,7 +94,8 @@ JOINT_SIZES = {
 
 def _are_in_message(P: Any, fields: Any, model: Any) -> Any:
     """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles of a contact."""
-    return are_joint(P.reshape(*P.shape[:3], MAX_BROADCAST, MAX_BROADCAST, 6, 6), fields["observer_contact.count"])
+    T = constants.MAX_BROADCAST
+    return are_joint(P.reshape(*P.shape[:3], T, T, 6, 6), fields["observer_contact.count"])
 
 
 MEMBER = Rule("a vehicle", lambda values, fields, model: (values >= 0) & (values < model.vehicles))
@@ -113,11 +113,15 @@ def joint_rules() -> dict[str, Rule]:
     counts = {"outbox": "outbox_joint.count", "inbox": "inbox_joint.count", "contact": "contact.count"}
     for box, count in counts.items():
         rules |= where(count, {f"{box}_broadcast.pose.R": ROTATION, f"{box}_broadcast.odometry.R": ROTATION})
-        rules |= {f"{box}_broadcast.vehicle": MEMBER, f"{box}_broadcast.tick": TICK, count: whole(0, MAX_BROADCAST)}
+        rules |= {
+            f"{box}_broadcast.vehicle": MEMBER,
+            f"{box}_broadcast.tick": TICK,
+            count: whole(0, constants.MAX_BROADCAST),
+        }
     return rules
 
 
-MAX_AGE = SUPERSEDING_TIME + SAME_TIME
+MAX_AGE = constants.SUPERSEDING_TIME + constants.SAME_TIME
 
 
 @device_function
@@ -134,7 +138,6 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
     fill(memory.inbox_joint[world, i], JointHeader())
     fill_rows(memory.inbox_broadcast[world, i], BroadcastVehicle())
     fill_rows(memory.inbox_factor[world, i], wp.float32(0.0))
-    fill(memory.step[world], Pose())
     fill_rows(memory.blocks[world], mat66d())
     for x in range(memory.matrix.shape[1]):
         fill_rows(memory.matrix[world, x], mat66d())
@@ -151,7 +154,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if report.valid == 1:
         others = memory.belief[world, i].others
         members = memory.belief[world, i].members - others + 1  # without the odometry's errors
-        count = wp.min(members, MAX_BROADCAST)
+        count = wp.min(members, constants.MAX_BROADCAST)
         write_covariance(model, state, memory, world, i, count, tick)
         if factorise(memory, world, AFTER, 6 * count):
             joint = JointHeader(count, wp.where(count == members, 1, 0))
@@ -259,15 +262,13 @@ def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: i
         memory.contact_broadcast[world, i, c, n] = memory.inbox_broadcast[world, i, sender, n]
     for a in range(count):
         for b in range(count):
-            memory.contact_P[world, i, c, MAX_BROADCAST * a + b] = memory.matrix[world, AFTER, a, b]
+            memory.contact_P[world, i, c, constants.MAX_BROADCAST * a + b] = memory.matrix[world, AFTER, a, b]
 
 
 @device_function
 def includes_the_same(memory: Any, world: int, i: int, c: int, sender: int, count: int) -> bool:
     """Return whether there is a contact whose last message holds the same vehicles as the received one."""
-    if c < 0:
-        return False
-    if memory.contact[world, i, c].count != count:
+    if c < 0 or memory.contact[world, i, wp.max(c, 0)].count != count:
         return False
     for n in range(count):
         if memory.contact_broadcast[world, i, c, n].vehicle != memory.inbox_broadcast[world, i, sender, n].vehicle:

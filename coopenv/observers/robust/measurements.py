@@ -9,18 +9,9 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.constants import (
-    CONSIDERED_LINEARISATION_TIME,
-    CORRELATION_FACTOR,
-    CORRELATION_TIME,
-    LINEARISATION_TIME,
-    MAX_ACCELERATION,
-    MAX_SPEED,
-    MEMBER_LINEARISATION_TIME,
-    THIRD,
-)
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, Derivative, mat22d, mat26d, vec3d
 from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
 from coopenv.observers.robust.sender_monitor import is_excluded
@@ -29,8 +20,8 @@ from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
-HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
-UNIFORM_VARIANCE = THIRD
+HALF_ACCELERATION = 0.5 * constants.MAX_ACCELERATION
+UNIFORM_VARIANCE = constants.THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
@@ -70,7 +61,9 @@ def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any
 
 @device_function
 def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether a fresh report of a sender is received and valid."""
+    """Return whether a fresh report of a sender is received and valid; False for a landmark, which is below 0."""
+    if sender < 0:
+        return False
     return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
 
 
@@ -80,12 +73,12 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
 
     Hypotheses are tracked through many frames, in all of which that error is nearly the same.
     """
-    variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(THIRD)
+    variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(constants.THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
-    gone = wp.float64(MAX_SPEED) * age
-    factor = wp.float64(CORRELATION_FACTOR)
+    gone = wp.float64(constants.MAX_SPEED) * age
+    factor = wp.float64(constants.CORRELATION_FACTOR)
     if memory.search[world, i].hypotheses > 0:
-        factor = wp.max(factor, wp.float64(CORRELATION_TIME) / frame.period)
+        factor = wp.max(factor, wp.float64(constants.CORRELATION_TIME) / frame.period)
     return factor * (variance + gone * gone)
 
 
@@ -124,7 +117,7 @@ def set_measurement_of_member(
         if memory.member[world, i, member].has_twist == 0:
             if frame.purpose == TRACKING:
                 return False
-            going = wp.float64(MAX_SPEED) * age
+            going = wp.float64(constants.MAX_SPEED) * age
             variance += going * going
         else:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
@@ -198,11 +191,11 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     along = wp.dot(u, V * u)
     total = wp.trace(V)
-    time = wp.float64(LINEARISATION_TIME)
+    time = wp.float64(constants.LINEARISATION_TIME)
     if member > 0:
-        time = wp.float64(MEMBER_LINEARISATION_TIME)
+        time = wp.float64(constants.MEMBER_LINEARISATION_TIME)
         if memory.member[world, i, member].considered == 1:
-            time = wp.float64(CONSIDERED_LINEARISATION_TIME)
+            time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)
         C = block3(memory.P[world, i, 0, member], 3, 3)

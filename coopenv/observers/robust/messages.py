@@ -39,13 +39,19 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
     if message.position is None and not message.extra:  # the sender is searching for its pose
         return
     check_pose(message)
-    odometry, depends_on = np.asarray(message.extra["odometry"], np.float64), np.asarray(message.extra["depends_on"])
-    if odometry.shape != (6,) or not (np.abs(odometry) <= LARGEST).all():
-        raise CoopenvError("message: odometry")
+    odometry, depends_on = _numbers(message, "odometry", (6,)), np.asarray(message.extra["depends_on"])
     if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
         raise CoopenvError("message: depends_on")
     report["pose"], report["P"] = (message.rotation, message.position), message.covariance
     report["odometry"], report["depends_on"], report["valid"] = from_six(odometry), depends_on[0], 1
+
+
+def _numbers(message: Message, name: str, shape: tuple[int, ...]) -> Array:
+    """Return an entry of a message; a CoopenvError means another shape, or a number that is too large or none."""
+    values = np.asarray(message.extra[name], np.float64)
+    if values.shape != shape or not (np.abs(values) <= LARGEST).all():
+        raise CoopenvError(f"message: {name}")
+    return values
 
 
 def check_pose(message: Message) -> None:
@@ -110,9 +116,6 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
 ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast)
 
 
-JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")  # the entries of a joint message
-
-
 def write_joint(observer: Any) -> Message:
     """Return a message with other vehicles, too: poses, odometry, and the factor of the joint covariance.
 
@@ -143,7 +146,7 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
     if not m.inbox[sender]["valid"]:
         return
     m.inbox[sender]["valid"] = 0
-    vehicles, ages, poses, odometries, factor, complete = (np.asarray(extra[name]) for name in JOINT)
+    vehicles, complete = np.asarray(extra["vehicles"]), np.asarray(extra["complete"])
     others = len(vehicles)
     n = 6 * (others + 1)
     names = {sender, *vehicles.tolist()}
@@ -154,15 +157,11 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
         or not _are_vehicles(observer, names)
     ):
         raise CoopenvError("message: vehicles")
-    for name, value, shape in (
-        ("ages", ages, (others,)),
-        ("poses", poses, (others, 6)),
-        ("odometries", odometries, (others, 6)),
-    ):
-        if value.shape != shape or not (np.abs(value) <= LARGEST).all():
-            raise CoopenvError(f"message: {name}")
-    if factor.shape != (n * (n + 1) // 2,) or not (np.abs(factor) <= LARGEST).all() or complete.shape != (1,):
-        raise CoopenvError("message: factor")
+    ages = _numbers(message, "ages", (others,))
+    poses, odometries = _numbers(message, "poses", (others, 6)), _numbers(message, "odometries", (others, 6))
+    factor = _numbers(message, "factor", (n * (n + 1) // 2,))
+    if complete.shape != (1,):
+        raise CoopenvError("message: complete")
     if not (factor[np.cumsum(np.arange(1, n + 1)) - 1] ** 2 >= MIN_VARIANCE).all():
         raise CoopenvError("message: factor is singular")
     report = m.inbox[sender]

@@ -33,7 +33,6 @@ from coopenv.observers.robust.algebra import (
     with_noise,
 )
 from coopenv.observers.robust.belief import apply_error, begin_belief, own_estimate, set_anchor, set_block
-from coopenv.observers.robust.constants import SAME_PRIOR, SURE
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import receive_broadcast, send_broadcast
@@ -282,7 +281,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
         return SEARCHING
     prior = memory.search[world, i].prior
     found = memory.hypothesis[world, i, 0].estimate
-    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(SAME_PRIOR)
+    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.SAME_PRIOR)
     if confirmed:
         found = prior
     restart_belief(model, memory, world, i, found)
@@ -297,7 +296,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
     if standing == ESTIMATING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
-    elif resect(frame, memory, world, i) and is_known(wp.float64(SURE) * memory.P[world, i, 0, 0]):
+    elif resect(frame, memory, world, i) and is_known(wp.float64(constants.SURE) * memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
     else:
         postpone_acceptance(memory, world, i)

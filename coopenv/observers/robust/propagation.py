@@ -8,15 +8,6 @@ from coopenv.estimation.linalg import exp_so3, orthonormalise, skew, symmetric_p
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import moved, odometry_noise, with_noise
 from coopenv.observers.robust.belief import propagate, set_block
-from coopenv.observers.robust.constants import (
-    ERRORS_TIME,
-    JUMP_GATE,
-    MAX_SMOOTH_ACCELERATION,
-    MAX_SMOOTH_ANGULAR_ACCELERATION,
-    MIN_ERROR_STD,
-    SAME_TIME,
-    VELOCITY_TIME,
-)
 from coopenv.observers.robust.memory import (
     ERRORS,
     MOUNTING,
@@ -48,7 +39,7 @@ def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
     calibration.vehicle = i
     calibration.pose.R = wp.identity(3, wp.float64)
     memory.member[world, i, n] = calibration
-    least = vec6d(wp.float64(MIN_ERROR_STD * MIN_ERROR_STD))
+    least = vec6d(wp.float64(constants.MIN_ERROR_STD * constants.MIN_ERROR_STD))
     memory.P[world, i, n, n] = wp.diag(wp.max(variances, least))
 
 
@@ -169,7 +160,7 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
         P = memory.P[world, i, ERRORS, ERRORS]
         time = wp.max(correlated, dt)
         noise[0] = wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) * dt * time
-        noise[1] = P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(SAME_TIME))
+        noise[1] = P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(constants.SAME_TIME))
     return noise
 
 
@@ -177,7 +168,7 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return the variances (rotation, translation) of an increment over dt, lasting errors included."""
     noise = odometry_noise(model, i, dt)
-    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(ERRORS_TIME))
+    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(constants.ERRORS_TIME))
 
 
 @wp.func
@@ -188,7 +179,7 @@ def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
     period.
     """
     square = wp.dot(change, change)
-    gate = wp.max(wp.float64(JUMP_GATE) * std * std, smooth * smooth * period * period)
+    gate = wp.max(wp.float64(constants.JUMP_GATE) * std * std, smooth * smooth * period * period)
     return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
 
 
@@ -212,10 +203,11 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         p = p + R * (half * change_v)
         R = R * exp_so3(half * change_w)
         period = model.odometry_period
-        linear, angular = wp.float64(MAX_SMOOTH_ACCELERATION), wp.float64(MAX_SMOOTH_ANGULAR_ACCELERATION)
+        angular = wp.float64(constants.MAX_SMOOTH_ANGULAR_ACCELERATION)
+        linear = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
         noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
-        share = dt / (dt + wp.float64(VELOCITY_TIME))
+        share = dt / (dt + wp.float64(constants.VELOCITY_TIME))
         memory.belief[world, i].mean_v = memory.belief[world, i].mean_v + share * (v - memory.belief[world, i].mean_v)
     else:
         memory.belief[world, i].mean_v = v

@@ -325,22 +325,14 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 
 
 @device_function
-def note_step(
-    memory: Any,
-    world: int,
-    i: int,
-    sender: int,
-    last: SenderReport,
-    report: SenderReport,
-    noise: Any,
-    lasting: Any,
-    dt: Any,
-):
-    """Add to a sender's sums the step from its propagated last report to its new one; return the step (3,), m, map.
+def note_step(memory: Any, world: int, i: int, n: int, last: SenderReport, noise: Any, lasting: Any, dt: Any):
+    """Add to member n's sums the step from its propagated last report to its new one; return the step (3,), m, map.
 
     The sums restart after a long silence or a large growth of the covariance. `noise` and `lasting` are variances
     (rotation, translation) of the odometry, rad^2 and m^2; lasting errors are the same in all steps of a sum.
     """
+    sender = memory.member[world, i, n].vehicle
+    report = memory.member[world, i, n].report
     step = algebra.between(last.odometry, report.odometry)
     carried = algebra.carried(PoseEstimate(last.pose, mat66d(last.P)), step, noise)
     x = report.pose.p - carried.pose.p
