@@ -50,10 +50,8 @@ DRIFT_GATE, DRIFT_CLEAR = 28.0, 9.0
 """Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 4e-6; and that of an excluded
 sender, 0.97."""
 DRIFT_STD = 6.0  # least drift for an exclusion, in reported standard deviations. Chosen
-DRIFT_TIME, SLOW_DRIFT_TIME = (
-    3.0,
-    30.0,
-)  # s: time constants of the sums that compare a sender's position with its odometry. Chosen
+DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0
+"""s: time constants of the sums that compare a sender's position with its odometry. Chosen."""
 SLACK = 0.1  # share of the odometry noise that a reported covariance may lack. Tuned
 JUMP_STD = 4.0  # standard deviations beyond braking that count as a jump of its odometry
 INNOVATION_SUM_GATE = 60.0

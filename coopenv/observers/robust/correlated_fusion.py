@@ -29,7 +29,7 @@ from coopenv.observers.robust.sender_monitor import (
     propagate_information,
     test_report,
 )
-from coopenv.observers.robust.tracklets import bit_of, depends_on_own, propagate_member
+from coopenv.observers.robust.tracklets import bit_of, depends_on_own, includes, propagate_member
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
 
@@ -90,8 +90,8 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         append_member(memory, world, i, sender, report.pose, mat66d(report.P))
         memory.member[world, i, n].report = report
         memory.member[world, i, n].seen_tick = tick
-        known = memory.belief[world, i].depends_on & bit_of(sender)
-        memory.member[world, i, n].correlation_unknown = wp.where(known != wp.uint64(0), 1, 0)
+        known = includes(memory.belief[world, i].depends_on, sender)
+        memory.member[world, i, n].correlation_unknown = wp.where(known, 1, 0)
         set_to_report(model, memory, world, i, n)
         depends_on = report.depends_on | bit_of(sender)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on

@@ -16,7 +16,6 @@ from coopenv.observers.robust.algebra import (
     invert,
     left_error,
     moved,
-    multiply,
     recentre,
     recentring,
     symmetrise,
@@ -159,8 +158,11 @@ def fuse_joint_information(memory: Any, world: int, i: int, sender: int, count: 
         along = vec6d()
         for b in range(count):
             along += wp.transpose(memory.matrix[world, INVERSE, b, a]) * memory.scratch[world, b].correction
+            product = mat66d()
+            for c in range(count):
+                product += memory.matrix[world, BEFORE, a, c] * memory.matrix[world, INVERSE, c, b]
+            memory.matrix[world, AFTER, a, b] = product
         memory.scratch[world, a].last_correction = along
-    multiply(memory, world, BEFORE, INVERSE, AFTER, count)
     symmetrise(memory, world, AFTER, count)
     for k in range(members):
         error = vec6d()

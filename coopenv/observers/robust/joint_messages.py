@@ -25,7 +25,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
     where,
 )
-from coopenv.observers.robust.tracklets import bit_of, make_receive, marker_jacobian, own_report
+from coopenv.observers.robust.tracklets import includes, make_receive, marker_jacobian, own_report
 from coopenv.world.state import FLAG, ROTATION, TICK, Rule, array, extended, whole
 from coopenv.world.v2x import claimed_std
 from coopenv.world.warp_internals import device_function
@@ -212,7 +212,7 @@ receive_joint = make_receive(copy_joint)
 @device_function
 def vehicles_in(memory: Any, world: int, i: int, sender: int) -> int:
     """Return the number of vehicles in a received message that count: 1 if the sender depends on this vehicle."""
-    if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
+    if includes(memory.inbox[world, i, sender].depends_on, i):
         return 1
     return memory.inbox_joint[world, i, sender].count
 
@@ -221,8 +221,7 @@ def vehicles_in(memory: Any, world: int, i: int, sender: int) -> int:
 def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
     """Return the vehicles on which a received message depends: none if it holds the whole belief of its sender."""
     depends_on = memory.inbox[world, i, sender].depends_on
-    own = depends_on & bit_of(i)
-    if own == wp.uint64(0) and memory.inbox_joint[world, i, sender].complete == 1:
+    if memory.inbox_joint[world, i, sender].complete == 1 and not includes(depends_on, i):
         return wp.uint64(0)
     return depends_on
 
@@ -230,7 +229,7 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
 @device_function
 def read_covariance(memory: Any, world: int, i: int, sender: int, count: int):
     """Write the covariance of the vehicles in a received message to AFTER."""
-    if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
+    if includes(memory.inbox[world, i, sender].depends_on, i):
         memory.matrix[world, AFTER, 0, 0] = mat66d(memory.inbox[world, i, sender].P)
         return
     for k in range(6 * count):

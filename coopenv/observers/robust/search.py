@@ -94,12 +94,10 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
 
 
 @device_function
-def solve(
-    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool
-):
-    """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
+def solve(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool):
+    """Make hypotheses of the solutions of one problem of bearings b and points z, rows.
 
-    With `tracking` they become hypotheses.
+    Return whether `patient` finds all solutions determined.
     """
     count, distances = solve_triangle(b, z)
     for n in range(count):
@@ -110,7 +108,7 @@ def solve(
             determined, P = covariance_of(frame, memory, world, i, triple, patient)
             if patient and not determined:
                 return False
-            if tracking and determined:
+            if determined:
                 add_hypothesis(memory, world, i, PoseEstimate(pose, P))
     return True
 
@@ -145,19 +143,16 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
 
 
 @device_function
-def solve_triple(
-    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool
-) -> bool:
-    """Make hypotheses of the poses that agree with three bearings, in their order, if `tracking`.
+def solve_triple(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool) -> bool:
+    """Make hypotheses of the poses that agree with three bearings, in their order.
 
-    Return False, without hypotheses, if `patient` and a solution is not well determined.
+    Return False if `patient` and a solution is not well determined.
     """
     memory.search[world, i].hypotheses = 0
     for number in range(constants.PROBLEMS):
         exists, b, z = problem(frame, memory, world, triple, number)
         if exists:
-            if not solve(frame, memory, world, i, triple, b, z, patient, tracking):
-                memory.search[world, i].hypotheses = 0
+            if not solve(frame, memory, world, i, triple, b, z, patient):
                 return False
     return True
 
@@ -293,25 +288,15 @@ def chosen_triple(frame: BearingFrame, memory: Any, world: int, i: int):
 
 
 @device_function
-def may_solve(memory: Any, world: int, i: int, period: Any) -> bool:
-    """Add the time of a frame; return whether to use it: not soon after an undetermined one."""
-    memory.search[world, i].waited_time += period
-    memory.search[world, i].clear_time += period
-    patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
-    return not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME)
-
-
-@device_function
-def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, period: Any) -> bool:
+def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, period: Any, patient: bool) -> bool:
     """Solve a triple; return whether its solutions are hypotheses now: if all were well determined for some time.
 
     Near a double solution the error has no ellipsoidal region, and noise makes the solutions appear and vanish. With
     time the estimates of a follower's leaders improve, which separates the solutions.
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
-    patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
     tracking = not patient or clear >= wp.float64(constants.CLEAR_TIME)
-    if not solve_triple(frame, memory, world, i, triple, patient, tracking):
+    if not solve_triple(frame, memory, world, i, triple, patient):
         clear = wp.float64(-constants.DOUBT_TIME)
         tracking = False
     if tracking:
@@ -323,6 +308,8 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
         clear = wp.float64(0.0)
         least = wp.where(patient, wp.float64(constants.MIN_SEARCH_TIME), wp.float64(constants.MIN_DOUBTFUL_TIME))
         memory.search[world, i].least_time = least
+    else:
+        memory.search[world, i].hypotheses = 0
     memory.search[world, i].clear_time = clear
     return tracking
 
@@ -337,9 +324,13 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
     solved = int(0)
     tracking = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
     if not tracking:
-        if may_solve(memory, world, i, period):
+        memory.search[world, i].waited_time += period
+        memory.search[world, i].clear_time += period
+        patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
+        # not soon after a frame that did not determine the pose
+        if not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME):
             triple = chosen_triple(frame, memory, world, i)
-            tracking = solve_chosen(frame, memory, world, i, triple, period)
+            tracking = solve_chosen(frame, memory, world, i, triple, period, patient)
             solved = memory.search[world, i].hypotheses
     if tracking:
         add_prior(memory, world, i)

@@ -24,7 +24,15 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import between, carried, distance_squared, position_variance, with_noise
+from coopenv.observers.robust.algebra import (
+    KNOWN_ANGLE_VARIANCE,
+    KNOWN_POSITION_VARIANCE,
+    between,
+    carried,
+    distance_squared,
+    position_variance,
+    with_noise,
+)
 from coopenv.observers.robust.belief import index_of, own_estimate, put_own, set_anchor, set_block
 from coopenv.observers.robust.correction import correct_by_bearings, iterated_update, store_poses
 from coopenv.observers.robust.correlated_fusion import by_clocks, set_to_report
@@ -194,10 +202,8 @@ LASTING_FRAME = constants.LINEARISATION_TIME / constants.CONSIDERED_LINEARISATIO
 @device_function
 def begin_landmark_only(memory: Any, world: int, i: int, estimate: PoseEstimate, tick: int):
     """Begin the landmark-only solution with an estimate at a tick."""
-    memory.landmark_only[world, i].begun = 1
-    memory.landmark_only[world, i].tick = tick
-    memory.landmark_only[world, i].odometry = memory.belief[world, i].odometry
-    memory.landmark_only[world, i].estimate = estimate
+    exposed = memory.landmark_only[world, i].exposed
+    memory.landmark_only[world, i] = LandmarkOnlySolution(1, exposed, tick, memory.belief[world, i].odometry, estimate)
 
 
 @device_function
@@ -312,9 +318,7 @@ def find_fault_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, 
     count = int(0)
     for n in range(frame.bearings):
         if not innovation_squared(frame, memory, world, i, n) < wp.float64(wp.inf):
-            memory.measurement[world, n].residual = vec2d(
-                wp.float64(constants.NOT_AHEAD), wp.float64(constants.NOT_AHEAD)
-            )
+            memory.measurement[world, n].residual = vec2d(wp.float64(constants.NOT_AHEAD))
     store_poses(memory, world, i)
     for n in range(frame.bearings):
         if is_fused_sender(memory, world, i, n):
@@ -353,9 +357,8 @@ def revert_to_landmark_only(model: Any, frame: BearingFrame, memory: Any, world:
     members = memory.belief[world, i].members
     others = memory.belief[world, i].others
     for k in range(1, members):
-        for j in range(1, k):
-            if j < others:
-                set_block(memory, world, i, k, j, mat66d())
+        for j in range(1, wp.min(k, others)):
+            set_block(memory, world, i, k, j, mat66d())
     begin_errors(model, memory, world, i)
     reset_monitors(memory, world, i)
     for k in range(others, members):
@@ -441,10 +444,7 @@ def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         memory.landmark_only[world, i].begun = 0
     elif now.due:
         if memory.landmark_only[world, i].begun == 0:
-            variances = vec2d(
-                wp.float64(constants.KNOWN_ANGLE * constants.KNOWN_ANGLE),
-                wp.float64(constants.KNOWN_POSITION * constants.KNOWN_POSITION),
-            )
+            variances = vec2d(wp.float64(KNOWN_ANGLE_VARIANCE), wp.float64(KNOWN_POSITION_VARIANCE))
             pose = memory.member[world, i, 0].pose
             begin_landmark_only(memory, world, i, PoseEstimate(pose, with_noise(mat66d(), variances)), now.tick)
         note_exposure(memory, world, i)

@@ -29,6 +29,12 @@ def bit_of(vehicle: int) -> wp.uint64:
 
 
 @wp.func
+def includes(mask: wp.uint64, vehicle: int) -> bool:
+    """Return whether a mask has a vehicle's bit."""
+    return (mask & bit_of(vehicle)) != wp.uint64(0)
+
+
+@wp.func
 def marker_jacobian(marker: Any):
     """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
     one = wp.identity(3, wp.float64)
@@ -127,7 +133,7 @@ def test_sender(memory: Any, world: int, i: int, n: int, reported: PoseEstimate,
 @device_function
 def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n's report may contain this vehicle's own information."""
-    return (memory.member[world, i, n].report.depends_on & bit_of(i)) != wp.uint64(0)
+    return includes(memory.member[world, i, n].report.depends_on, i)
 
 
 @device_function
@@ -164,6 +170,6 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     """
     if depends_on == wp.uint64(0):
         return wp.float64(1.0)
-    if (depends_on & bit_of(i)) == wp.uint64(0):
+    if not includes(depends_on, i):
         return wp.float64(constants.DEPENDENT_SHARE)
     return wp.float64(1.0) / wp.float64(1 + dependents(memory, world, i))

@@ -8,15 +8,21 @@ import numpy as np
 import pytest
 
 from coopenv.scenario.files import load_scenario
+from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_worlds import nees_of, steps_of
 
 ROBUST = {"observer.name": "robust"}
 
 
-def test_it_depends_on_those_that_it_has_heard() -> None:
-    world = simulate(load_scenario("lane:5,seen=2", ROBUST | {"horizon": 3.0}), 2)
+def lane(name: str, **overrides: float) -> World:
+    world = simulate(load_scenario(name, ROBUST | {"horizon": 3.0} | overrides), 2)
     reset(world)
+    return world
+
+
+def test_it_depends_on_those_that_it_has_heard() -> None:
+    world = lane("lane:5,seen=2")
     memory: Any = world.memory
     world.advance(0)
     assert (memory.belief.numpy()["depends_on"] <= [0, 0b1, 0b11, 0b110, 0b1100]).all()  # at most on first messages
@@ -25,16 +31,14 @@ def test_it_depends_on_those_that_it_has_heard() -> None:
 
 
 def test_nobody_depends_on_who_is_not_heard() -> None:
-    world = simulate(load_scenario("lane:5,seen=2", ROBUST | {"horizon": 3.0, "v2x.loss": 0.999999}), 2)
-    reset(world)
+    world = lane("lane:5,seen=2", **{"v2x.loss": 0.999999})
     world.advance(60)
     memory: Any = world.memory
     assert (memory.belief.numpy()["depends_on"] == 0).all()
 
 
 def test_nobody_in_a_lane_is_met_again() -> None:
-    world = simulate(load_scenario("lane:6,seen=3", ROBUST | {"horizon": 3.0}), 2)
-    reset(world)
+    world = lane("lane:6,seen=3")
     memory: Any = world.memory
     for _ in range(20):
         world.advance(6)

@@ -40,31 +40,28 @@ def by_window(
     return np.array(means), np.array([np.sqrt((part**2).mean(axis=(0, 1))) for part in np.split(errors, windows)])
 
 
-@pytest.mark.parametrize("name", ["lane:8", "random:12,seed=4", "tree:9"])
-def test_everybody_is_as_sure_as_it_may_be(name: str) -> None:
-    """Starts of up to 10 degrees and 1 m; the mean over worlds of each vehicle."""
-    anees = by_window(name, {}, range(12), (2, 5, 10, 15))[0].mean(axis=1)
-    assert (anees > 0.3).all() and (anees < 2.0).all(), anees
-
-
 @pytest.mark.parametrize(
-    ("name", "overrides"),
+    ("name", "overrides", "most"),
     [
-        ("ring:5", {}),
-        ("lane:10", {"noise.velocity": 0.02, "noise.odometry_scale": 0.1}),
-        ("roots:12", {"noise.velocity": 0.01, "noise.odometry_scale": 0.1}),
-        ("lane:12,seen=5", {"noise.odometry_scale": 0.05}),
-        ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}),
+        ("lane:8", {}, 2.0),
+        ("random:12,seed=4", {}, 2.0),
+        ("tree:9", {}, 2.0),
+        ("ring:5", {}, 1.6),
+        ("lane:10", {"noise.velocity": 0.02, "noise.odometry_scale": 0.1}, 1.6),
+        ("roots:12", {"noise.velocity": 0.01, "noise.odometry_scale": 0.1}, 1.6),
+        ("lane:12,seen=5", {"noise.odometry_scale": 0.05}, 1.6),
+        ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}, 1.6),
     ],
     ids=str,
 )
-def test_it_is_no_surer_than_it_may_be_where_more_is_wrong(name: str, overrides: dict[str, float]) -> None:
-    """In circles, with wheels that are off by a tenth, with many to hear, and with late messages.
+def test_everybody_is_as_sure_as_it_may_be(name: str, overrides: dict[str, float], most: float) -> None:
+    """Starts of up to 10 degrees and 1 m; the mean over worlds of each vehicle.
 
-    Up to 12 was seen where errors of odometry that last were taken for what senders had learnt.
+    Also in circles, with wheels that are off by a tenth, with many to hear, and with late messages: up to 12 was seen
+    where errors of odometry that last were taken for what senders had learnt.
     """
     anees = by_window(name, overrides, range(12), (2, 5, 10, 15))[0].mean(axis=1)
-    assert (anees > 0.3).all() and (anees < 1.6).all(), anees
+    assert (anees > 0.3).all() and (anees < most).all(), anees
 
 
 def test_a_vehicle_at_the_end_of_a_lane_finds_its_place() -> None:

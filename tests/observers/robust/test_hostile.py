@@ -32,9 +32,9 @@ class Alters:
     def broadcast(self, observer: Any, message: Message) -> Message:
         if message.position is None:
             return message
-        names = ["position", "covariance", *message.extra]
-        name = names[self.rng.integers(len(names))]
-        old = np.asarray(getattr(message, name) if name in ("position", "covariance") else message.extra[name])
+        fields = {"position": message.position, "covariance": message.covariance, **message.extra}
+        name = list(fields)[self.rng.integers(len(fields))]
+        old = np.asarray(fields[name])
         value = np.array(old, dtype=float)
         if not value.size:
             return message
@@ -52,10 +52,8 @@ class Alters:
             value = (value + value.T) / 2.0
         info = np.iinfo(old.dtype) if old.dtype.kind in "iu" else None
         value = value if info is None else np.clip(np.rint(value), 0, min(info.max, 2**53))
-        field = value.astype(old.dtype)
-        if name in ("position", "covariance"):
-            return replace(message, **{name: field})
-        return replace(message, extra={**message.extra, name: field})
+        fields[name] = value.astype(old.dtype)
+        return replace(message, position=fields.pop("position"), covariance=fields.pop("covariance"), extra=fields)
 
 
 @pytest.mark.parametrize("observer", ["robust", "robust_joint"])
