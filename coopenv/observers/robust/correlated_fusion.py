@@ -17,7 +17,7 @@ import warp as wp
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
-from coopenv.observers.robust.correlations import correlation_index, is_positive, rank, regress
+from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.propagation import lasting_noise
@@ -201,14 +201,10 @@ def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int,
         if k != n:
             if is_pending(model, state, memory, world, i, k, tick):
                 other = memory.member[world, i, k].vehicle
-                c = correlation_index(memory, world, i, sender, other)
-                if c >= 0:
-                    if memory.correlation[world, i, sender, c].tick > memory.member[world, i, k].report.tick:
-                        return True
-                c = correlation_index(memory, world, i, other, sender)
-                if c >= 0:
-                    if memory.correlation[world, i, other, c].tick == before:
-                        return True
+                if correlated_tick(memory, world, i, sender, other) > memory.member[world, i, k].report.tick:
+                    return True
+                if correlated_tick(memory, world, i, other, sender) == before:
+                    return True
     return False
 
 

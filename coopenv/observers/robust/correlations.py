@@ -161,6 +161,15 @@ def correlation_index(memory: Any, world: int, i: int, sender: int, vehicle: int
 
 
 @device_function
+def correlated_tick(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
+    """Return the tick of the report of a vehicle that a sender's correlation with it refers to, -1 without one."""
+    c = correlation_index(memory, world, i, sender, vehicle)
+    if c < 0:
+        return -1
+    return memory.correlation[world, i, sender, c].tick
+
+
+@device_function
 def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
     """Return a stored correlation."""
     return mat66d(memory.correlation[world, i, sender, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))

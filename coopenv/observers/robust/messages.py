@@ -54,6 +54,21 @@ def _numbers(message: Message, name: str, shape: tuple[int, ...]) -> Array:
     return values
 
 
+def _others(observer: Any, sender: int, message: Message, name: str, most: int) -> Array:
+    """Return an entry of a message that lists vehicles; a CoopenvError means that it cannot.
+
+    These are at most so many vehicles, different from each other and from the sender.
+    """
+    others = np.asarray(message.extra[name])
+    count = len(observer.setup.target_names) - observer.setup.landmarks
+    if others.ndim != 1 or others.dtype.kind not in "iu" or len(others) > most:
+        raise CoopenvError(f"message: {name}")
+    vehicles = {sender, *others.tolist()}
+    if len(vehicles) <= len(others) or not vehicles <= set(range(count)):
+        raise CoopenvError(f"message: {name}")
+    return others
+
+
 def check_pose(message: Message) -> None:
     """Refuse a message without a valid pose and a covariance that can be inverted."""
     if message.position is None or message.rotation is None or message.covariance is None:
@@ -91,17 +106,8 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
     if not m.inbox[sender]["valid"] or "told" not in message.extra:
         return
     m.inbox[sender]["valid"] = 0
-    broadcast, ages, matrices = (np.asarray(message.extra[name]) for name in ("told", "ages", "correlations"))
-    count = len(observer.setup.target_names) - observer.setup.landmarks
-    if (
-        broadcast.ndim != 1
-        or len(broadcast) > MAX_CORRELATIONS
-        or broadcast.dtype.kind != "u"
-        or not (broadcast < count).all()
-    ):
-        raise CoopenvError("message: told")
-    if len(np.unique(broadcast)) < len(broadcast) or sender in broadcast:
-        raise CoopenvError("message: told twice")
+    broadcast = _others(observer, sender, message, "told", MAX_CORRELATIONS)
+    ages, matrices = np.asarray(message.extra["ages"]), np.asarray(message.extra["correlations"])
     if matrices.shape != (len(broadcast), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
         raise CoopenvError("message: correlations")
     if ages.shape != broadcast.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():
@@ -146,17 +152,12 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
     if not m.inbox[sender]["valid"]:
         return
     m.inbox[sender]["valid"] = 0
-    vehicles, complete = np.asarray(extra["vehicles"]), np.asarray(extra["complete"])
+    vehicles, complete = (
+        _others(observer, sender, message, "vehicles", MAX_BROADCAST - 1),
+        np.asarray(extra["complete"]),
+    )
     others = len(vehicles)
     n = 6 * (others + 1)
-    names = {sender, *vehicles.tolist()}
-    if (
-        vehicles.dtype.kind not in "iu"
-        or others >= MAX_BROADCAST
-        or len(names) <= others
-        or not _are_vehicles(observer, names)
-    ):
-        raise CoopenvError("message: vehicles")
     ages = _numbers(message, "ages", (others,))
     poses, odometries = _numbers(message, "poses", (others, 6)), _numbers(message, "odometries", (others, 6))
     factor = _numbers(message, "factor", (n * (n + 1) // 2,))
@@ -194,11 +195,6 @@ def tampered(message: Message) -> Message:
 def _six(poses: Any) -> Any:
     """Return poses as rotation vectors and positions (m, 6)."""
     return np.array([six_of(pose) for pose in poses]).reshape(-1, 6)
-
-
-def _are_vehicles(observer: Any, numbers: set[int]) -> bool:
-    """Return whether all numbers are those of vehicles."""
-    return min(numbers) >= 0 and max(numbers) < len(observer.setup.target_names) - observer.setup.landmarks
 
 
 JOINT_MESSAGES = Messages(write_joint, read_joint, tampered)

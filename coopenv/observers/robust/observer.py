@@ -149,17 +149,6 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
 
 
 @device_function
-def weight_of(memory: Any, world: int, i: int, n: int):
-    """Return the weight of a bearing, whose variance includes the error of its target."""
-    N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
-    member = memory.measurement[world, n].member
-    if member > 0:
-        G = memory.derivative[world, n, 1].jacobian
-        N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
-    return wp.inverse(N)
-
-
-@device_function
 def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, inverse: Any):
     """Set the own covariance to that of the resection, members' errors included."""
     members = memory.belief[world, i].members
@@ -168,7 +157,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
         memory.scratch[world, k].column = mat66d()
     for n in range(bearings):
         if memory.measurement[world, n].fits == 1:
-            HtW = wp.transpose(memory.derivative[world, n, 0].jacobian) * weight_of(memory, world, i, n)
+            HtW = wp.transpose(memory.derivative[world, n, 0].jacobian) * memory.measurement[world, n].weight
             own += (HtW * wp.transpose(HtW)) * memory.measurement[world, n].noise
             member = memory.measurement[world, n].member
             if member > 0:
@@ -193,8 +182,14 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
         b = vec6d()
         for n in range(bearings):
             if memory.measurement[world, n].fits == 1:
+                N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
+                member = memory.measurement[world, n].member
+                if member > 0:  # the variance includes the error of the target
+                    G = memory.derivative[world, n, 1].jacobian
+                    N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
+                memory.measurement[world, n].weight = wp.inverse(N)
                 H = memory.derivative[world, n, 0].jacobian
-                HtW = wp.transpose(H) * weight_of(memory, world, i, n)
+                HtW = wp.transpose(H) * memory.measurement[world, n].weight
                 M += HtW * H
                 b += HtW * memory.measurement[world, n].residual
         if fitting < 3:

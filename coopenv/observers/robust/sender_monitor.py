@@ -152,11 +152,9 @@ def test_report(
     if sender_reset_detected(memory, world, i, n, dt):
         return True
     test_sender(memory, world, i, n, PoseEstimate(report.pose, mat66d(report.P)), dt)
-    if jumped or memory.member[world, i, n].excluded == 1:
-        exclude(model, memory, world, i, n, tick, wp.float64(0.0), False)
-        memory.monitor[world, i, sender].self_inconsistent = 1
-    elif drift > wp.float64(0.0):
-        exclude(model, memory, world, i, n, tick, drift, True)
+    if memory.member[world, i, n].excluded == 1 or jumped or drift > wp.float64(0.0):
+        drifts = memory.member[world, i, n].excluded == 0 and not jumped
+        exclude(model, memory, world, i, n, tick, wp.where(drifts, drift, wp.float64(0.0)), drifts)
         memory.monitor[world, i, sender].self_inconsistent = 1
     return False
 

@@ -108,9 +108,9 @@ def set_report_measurements(model: Any, state: Any, memory: Any, world: int, i: 
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         sender = target - model.landmarks
-        if sender >= 0 and state.sight[world, i, target] == VISIBLE:
+        if state.sight[world, i, target] == VISIBLE and is_received(model, state, memory, world, i, sender, tick):
             member = index_of(memory, world, i, sender)
-            if member > 0 and is_received(model, state, memory, world, i, sender, tick):
+            if member > 0:
                 if memory.member[world, i, member].excluded == 0 or is_disputed(memory, world, i, member):
                     report = memory.inbox[world, i, sender]
                     gone = wp.float64(constants.MAX_SPEED) * wp.float64(tick - report.tick) * model.camera_period
