@@ -94,10 +94,12 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
 
 
 @device_function
-def solve(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool):
-    """Make hypotheses of the solutions of one problem of bearings b and points z, rows.
+def solve(
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool
+):
+    """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
 
-    Return whether `patient` finds all solutions determined.
+    With `tracking` they become hypotheses.
     """
     count, distances = solve_triangle(b, z)
     for n in range(count):
@@ -108,7 +110,7 @@ def solve(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: 
             determined, P = covariance_of(frame, memory, world, i, triple, patient)
             if patient and not determined:
                 return False
-            if determined:
+            if tracking and determined:
                 add_hypothesis(memory, world, i, PoseEstimate(pose, P))
     return True
 
@@ -143,8 +145,10 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
 
 
 @device_function
-def solve_triple(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool) -> bool:
-    """Make hypotheses of the poses that agree with three bearings, in their order.
+def solve_triple(
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool
+) -> bool:
+    """Make hypotheses of the poses that agree with three bearings, in their order, if `tracking`.
 
     Return False if `patient` and a solution is not well determined.
     """
@@ -152,7 +156,7 @@ def solve_triple(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
     for number in range(constants.PROBLEMS):
         exists, b, z = problem(frame, memory, world, triple, number)
         if exists:
-            if not solve(frame, memory, world, i, triple, b, z, patient):
+            if not solve(frame, memory, world, i, triple, b, z, patient, tracking):
                 return False
     return True
 
@@ -296,7 +300,7 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
     tracking = not patient or clear >= wp.float64(constants.CLEAR_TIME)
-    if not solve_triple(frame, memory, world, i, triple, patient):
+    if not solve_triple(frame, memory, world, i, triple, patient, tracking):
         clear = wp.float64(-constants.DOUBT_TIME)
         tracking = False
     if tracking:
