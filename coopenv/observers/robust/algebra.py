@@ -89,6 +89,21 @@ def by_rows(H: Any, M: Any):
 
 
 @wp.func
+def transposed_by_rows(K: Any, H: Any):
+    """Return K^T H for two 2x6 matrices, likewise."""
+    a = H[0]
+    b = H[1]
+    return wp.matrix_from_rows(
+        K[0, 0] * a + K[1, 0] * b,
+        K[0, 1] * a + K[1, 1] * b,
+        K[0, 2] * a + K[1, 2] * b,
+        K[0, 3] * a + K[1, 3] * b,
+        K[0, 4] * a + K[1, 4] * b,
+        K[0, 5] * a + K[1, 5] * b,
+    )
+
+
+@wp.func
 def diagonal_by_rows(G: Any, M: Any):
     """Return G M for 6x6 matrices of which G is zero but for its blocks of 3x3 on the diagonal, likewise."""
     return wp.matrix_from_rows(

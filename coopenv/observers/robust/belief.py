@@ -12,6 +12,7 @@ import warp as wp
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
+    diagonal_by_rows,
     displaced,
     forward,
     moved,
@@ -103,7 +104,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
     if k == ERRORS and memory.belief[world, i].others > ERRORS:
         memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
         memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
-    elif is_free(memory, world, i, k):
+    else:
         apply_error(memory, world, i, k, correction)
         G = recentring(correction)
     memory.scratch[world, k].recentring = G
@@ -113,14 +114,22 @@ def correct_member(memory: Any, world: int, i: int, k: int):
 def apply_corrections(memory: Any, world: int, i: int):
     """Apply the corrections of all free members, and recentre the covariance about the new poses."""
     for k in range(memory.belief[world, i].members):
-        correct_member(memory, world, i, k)
+        free = is_free(memory, world, i, k)
+        if free:
+            correct_member(memory, world, i, k)
         for j in range(k + 1):
-            if is_free(memory, world, i, k) or is_free(memory, world, i, j):
-                block = memory.P[world, i, k, j]
+            block = memory.P[world, i, k, j]
+            if free and is_free(memory, world, i, j):
                 block = recentred(memory.scratch[world, k].recentring, block, memory.scratch[world, j].recentring)
                 if k == j:
                     block = symmetric_part(block)
-                set_block(memory, world, i, k, j, block)
+            elif free:
+                block = diagonal_by_rows(memory.scratch[world, k].recentring, block)
+            elif is_free(memory, world, i, j):
+                block = wp.transpose(diagonal_by_rows(memory.scratch[world, j].recentring, wp.transpose(block)))
+            else:
+                continue
+            set_block(memory, world, i, k, j, block)
 
 
 @device_function

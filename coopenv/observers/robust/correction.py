@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import by_rows, displaced, recentring
+from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
@@ -104,8 +104,7 @@ def condense(memory: Any, world: int, i: int, bearings: int):
                 for n in range(bearings):
                     if memory.measurement[world, n].fits == 1:
                         K = memory.measurement[world, n].weight * memory.gain[world, n, k]
-                        H = memory.gain[world, n, j]
-                        block = block + (wp.outer(K[0], H[0]) + wp.outer(K[1], H[1]))  # K^T H, by rows
+                        block = block + transposed_by_rows(K, memory.gain[world, n, j])
                 subtract_block(memory, world, i, k, j, block)
 
 

@@ -12,7 +12,7 @@ from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, Derivative, mat22d, mat26d, vec3d
+from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, vec3d
 from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
 from coopenv.observers.robust.sender_monitor import is_excluded
 from coopenv.observers.robust.tracklets import only_returns
@@ -259,24 +259,29 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
-    """Set a measurement's `gain` to H P."""
+    """Set a measurement's `gain` to H P; without a loop over the derivatives, which compilers make slower code of."""
+    H = memory.derivative[world, n, 0].jacobian
+    member = memory.derivative[world, n, 1].member
+    mounting = memory.derivative[world, n, 2].member
     for k in range(memory.belief[world, i].members):
-        rows = mat26d()
-        for part in range(DERIVATIVES):
-            member = memory.derivative[world, n, part].member
-            if member >= 0:
-                rows = rows + by_rows(memory.derivative[world, n, part].jacobian, memory.P[world, i, member, k])
+        rows = by_rows(H, memory.P[world, i, 0, k])
+        if member > 0:
+            rows = rows + by_rows(memory.derivative[world, n, 1].jacobian, memory.P[world, i, member, k])
+        if mounting > 0:
+            rows = rows + by_rows(memory.derivative[world, n, 2].jacobian, memory.P[world, i, mounting, k])
         memory.gain[world, n, k] = rows
 
 
 @device_function
 def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
     """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
-    S = mat22d()
-    for part in range(DERIVATIVES):
-        member = memory.derivative[world, n, part].member
-        if member >= 0:
-            S = S + memory.derivative[world, n, part].jacobian * wp.transpose(memory.gain[world, m, member])
+    S = memory.derivative[world, n, 0].jacobian * wp.transpose(memory.gain[world, m, 0])
+    member = memory.derivative[world, n, 1].member
+    if member > 0:
+        S = S + memory.derivative[world, n, 1].jacobian * wp.transpose(memory.gain[world, m, member])
+    mounting = memory.derivative[world, n, 2].member
+    if mounting > 0:
+        S = S + memory.derivative[world, n, 2].jacobian * wp.transpose(memory.gain[world, m, mounting])
     return S
 
 
