@@ -100,7 +100,7 @@ def null_vector(M: Any):
 
 @wp.func
 def plane_slopes(M: Any, null: Any):
-    """Return two directions, rows, that each span with the null vector a plane of a singular symmetric matrix."""
+    """Return the two directions that span, each with the null vector, the planes of a singular symmetric matrix."""
     axis = vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
     if wp.abs(null[0]) > wp.float64(0.7):
         axis = vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
@@ -116,7 +116,7 @@ def plane_slopes(M: Any, null: Any):
     high = wp.cos(angle) * u + wp.sin(angle) * w
     low = wp.cross(null, high)
     slope = wp.sqrt((radius - middle) / (radius + middle))
-    return wp.matrix_from_rows(wp.normalize(low + slope * high), wp.normalize(low - slope * high))
+    return wp.normalize(low + slope * high), wp.normalize(low - slope * high)
 
 
 @wp.func
@@ -144,10 +144,11 @@ EIGHTH_TURN = 0.7853981633974483
 @wp.func
 def misfit(d: Any, gaps: Any, a: Any):
     """Return the squared sides that distances make, less those of the triangle: pairs (0, 1), (0, 2), (1, 2)."""
-    first = vec3d(d[0], d[0], d[1])
-    second = vec3d(d[1], d[2], d[2])
-    apart = first - second
-    return wp.cw_mul(apart, apart) + wp.cw_mul(wp.cw_mul(first, second), gaps) - a
+    return vec3d(
+        (d[0] - d[1]) * (d[0] - d[1]) + d[0] * d[1] * gaps[0] - a[0],
+        (d[0] - d[2]) * (d[0] - d[2]) + d[0] * d[2] * gaps[1] - a[1],
+        (d[1] - d[2]) * (d[1] - d[2]) + d[1] * d[2] * gaps[2] - a[2],
+    )
 
 
 @wp.func
@@ -157,7 +158,7 @@ def polished(distances: Any, gaps: Any, a: Any):
     d = distances
     f = misfit(d, gaps, a)
     for _ in range(NEWTON_STEPS):
-        p = two * (d[0] - d[1]) + d[1] * gaps[0]  # derivatives of the sides
+        p = two * (d[0] - d[1]) + d[1] * gaps[0]
         q = two * (d[1] - d[0]) + d[0] * gaps[0]
         r = two * (d[0] - d[2]) + d[2] * gaps[1]
         s = two * (d[2] - d[0]) + d[0] * gaps[1]
@@ -177,13 +178,13 @@ def polished(distances: Any, gaps: Any, a: Any):
 
 
 @wp.func
-def scaled(direction: Any, plane: Any, null: Any, gaps: Any, a: Any):
+def scaled(direction: Any, plane: Any, null: Any, gaps: Any, perimeter: Any):
     """Return the distances along a direction that make the triangle as large as it is."""
     d = direction[0] * null + direction[1] * plane
     if d[0] + d[1] + d[2] < wp.float64(0.0):
         d = -d
     f = misfit(d, gaps, vec3d())
-    return d * wp.sqrt((a[0] + a[1] + a[2]) / (f[0] + f[1] + f[2]))
+    return d * wp.sqrt(perimeter / (f[0] + f[1] + f[2]))
 
 
 @wp.func
@@ -217,11 +218,14 @@ def distances_of(a: Any, gaps: Any):
         member = unit_matrix(T + gamma * S)
         cone = unit_matrix(S - gamma * T)
         null = null_vector(member)
-        planes = plane_slopes(member, null)
-        for n in range(2):
-            first, second = directions_in(planes[n], null, cone)
-            result[2 * n] = scaled(first, planes[n], null, gaps, a)
-            result[2 * n + 1] = scaled(second, planes[n], null, gaps, a)
+        first, second = plane_slopes(member, null)
+        perimeter = a[0] + a[1] + a[2]
+        d0, d1 = directions_in(first, null, cone)
+        d2, d3 = directions_in(second, null, cone)
+        result[0] = scaled(d0, first, null, gaps, perimeter)
+        result[1] = scaled(d1, first, null, gaps, perimeter)
+        result[2] = scaled(d2, second, null, gaps, perimeter)
+        result[3] = scaled(d3, second, null, gaps, perimeter)
     return result
 
 
