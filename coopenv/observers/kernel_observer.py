@@ -105,8 +105,6 @@ class KernelObserver:
         """The vehicle's part of the state by name: arrays without the axes W and N."""
         self.memory = views_of(self._records[1], fields(self._kernels.memory))
         """The same of the memory."""
-        if self._messages.tampered is not None:
-            self.tampered = self._messages.tampered
         self._now = [wp.zeros(1, dtype=kind, device="cpu") for kind in (wp.int32, wp.float64, wp.int32)]
         self._now_views = [array.numpy() for array in self._now]
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]

@@ -62,9 +62,6 @@ class Messages:
     read: Callable[[Any, int, Any, int], None]
     """(KernelObserver, sender, Message, sent): put a message into the observer's inbox; `sent` is
     when, in the kernels' time. Raises ValueError or a CoopenvError where the message is malformed."""
-    tampered: Callable[[Any], Any] | None = None
-    """(Message): return a message whose further contents agree with what its position and covariance claim, for studies
-    of liars."""
 
 
 @dataclass(frozen=True)

@@ -43,14 +43,6 @@ def array(axes: str, dtype: Any, rule: Rule | None = None) -> Any:
     return annotation
 
 
-def extended(record: Any, name: str, doc: str, **more: Any) -> Any:
-    """Return a struct with the fields of another one and more, declared with `array`."""
-    annotations = {**{field: var.type for field, var in record.vars.items()}, **more}
-    return wp.struct(
-        type(name, (), {"__doc__": doc, "__module__": record.cls.__module__, "__annotations__": annotations})
-    )
-
-
 def fields(record: Any) -> dict[str, Any]:
     """Return the arrays that a record's struct declares with `array`, by name: annotations with `axes` and `dtype`."""
     return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}

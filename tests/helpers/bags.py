@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from coopenv.cars import codec
-from coopenv.cars.transport.authors import to_ros1
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import log_so3
 from coopenv.observers import Recording
@@ -158,7 +157,7 @@ def write(path: Path, given: Iterable[Message], form: str) -> Path:
 
         path = path.with_suffix(".bag")
         with Writer1(path) as bag:
-            _fill(bag, ordered, codec.ros1(), lambda message: codec.encode_ros1(to_ros1(message)))
+            _fill(bag, ordered, codec.ros1(), lambda message: codec.ros1_of(codec.encode(message), message.__msgtype__))
         return path
     from rosbags.rosbag2 import StoragePlugin, Writer
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -61,21 +60,18 @@ def noise_free(horizon: float, name: str = "busy_intersection") -> Recording:
 
 
 @cache
-def crowd(horizon: float, leaders: int, gone: int, telling: bool = False) -> Recording:
+def crowd(horizon: float, leaders: int, gone: int) -> Recording:
     """One vehicle that hears more leaders than it can keep; the first of them are out of its view from a third on.
 
     Args:
         horizon: s.
         leaders: how many.
         gone: how many go out of view.
-        telling: whether each leader hears the one before, so that its joint messages tell of others.
     """
     scenario = load_scenario("busy_intersection_tracking", {"horizon": horizon})
     template, names = scenario.vehicles[0], [f"vehicle_{n + 1}" for n in range(leaders)]
     landmarks = tuple(landmark.name for landmark in scenario.landmarks)
     lead = dict.fromkeys(names, landmarks)
-    if telling:
-        lead |= {name: (*landmarks, before) for before, name in pairwise(names)}
     places = [(-2.0 - 1.5 * n, -10.0 + 2.0 * n, 2.0) for n in range(leaders)] + [(-12.0, -16.0, 2.5)]
     vehicles = tuple(
         template.model_copy(

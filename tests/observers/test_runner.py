@@ -130,9 +130,7 @@ def test_odometry_without_noise_is_the_true_motion() -> None:
 NAMES = sorted({*registry.ZOO} & {*registry.available_names(planar=False)})
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "robust_joint")) for name in NAMES]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_truth_does_not_leak(name: str) -> None:
     made = recording(horizon=0.2)
     lie = replace(made.truth, rotation=made.truth.rotation[:, ::-1], position=made.truth.position + 100.0)

@@ -2,5 +2,4 @@
 
 Per tick: propagation.py, correlated_fusion.py (messages), correction.py (bearings), solution_separation.py (integrity).
 search.py finds a lost pose. The functions run embedded in the world's kernels, and for one vehicle on the host.
-`robust_joint` shares all but its messages (joint_messages.py) and their fusion (joint_fusion.py).
 """

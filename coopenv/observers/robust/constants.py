@@ -4,8 +4,7 @@ THIRD = 1.0 / 3.0
 
 # Belief
 
-MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
-"""Vehicles in a belief, the vehicle itself included, calibration states excluded: of `robust` and of `robust_joint`."""
+MAX_MEMBERS = 5  # vehicles in a belief, the vehicle itself included, calibration states excluded
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; rad: largest turn of a line of sight without another linearisation. Tuned."""
 LINEARISATION_TIME, MEMBER_LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 1.0, 12.0
@@ -86,9 +85,6 @@ CONSISTENT_QUANTILE = 3.09  # of a normal distribution, 0.999: bound on the cost
 
 NEWS_TIME = 0.2
 """s between the reports of a sender that are fused; of those in between only the odometry is used. Chosen."""
-DEPENDENT_SHARE = 0.7
-"""Share that counts of the information of a sender that depends on other vehicles: part of it may be fused already.
-Tuned."""
 STEPS = 127  # of a correlation in a message, from 0 to 1
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
 CORRELATION_VALIDITY = 1.037
@@ -112,11 +108,7 @@ MIN_INFLATION = 0.005
 correlations, so that covariances are slightly too small, more so with every receiver in a chain. Tuned."""
 LEAST_LEFT = 0.003
 """Least share of a sender's variance, in all directions, that known correlations do not explain. Tuned."""
-MAX_VARIANCE_GROWTH = 1.01
-"""Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message is not fused."""
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
-MAX_BROADCAST = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
-SUPERSEDING_TIME = 1.0  # s, for which a joint message replaces the messages of the vehicles in it. Chosen
 
 ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a message is malformed: 0.1 um

@@ -30,7 +30,8 @@ from coopenv.observers.robust.memory import (
     mat66f,
     vec3d,
 )
-from coopenv.observers.robust.tracklets import dependents, depends_on_own, make_receive, marker_jacobian, own_report
+from coopenv.observers.robust.tracklets import dependents, depends_on_own, marker_jacobian, own_report
+from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
 
 
@@ -148,7 +149,20 @@ def copy_correlations(memory: Any, world: int, i: int, sender: int, slot: int, l
             memory.correlation[world, i, sender, c].tick += later
 
 
-receive_broadcast = make_receive(copy_correlations)
+@device_function
+def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
+    """Receive the messages that the radio delivers at this tick."""
+    for n in range(model.target_count[i]):
+        sender = model.targets[i, n] - model.landmarks
+        if sender >= 0:
+            sent = state.inbox_tick[world, i, sender]
+            stamp = state.inbox_stamp[world, i, sender]
+            if sent >= 0 and stamp != memory.inbox[world, i, sender].tick:
+                content = content_tick(model, state, world, sender, sent)
+                slot = content % model.radio.slots
+                copy_correlations(memory, world, i, sender, slot, stamp - content)
+                memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
+                memory.inbox[world, i, sender].tick = stamp
 
 
 @device_function

@@ -20,7 +20,6 @@ from coopenv.world.state import (
     TICK,
     Rule,
     array,
-    extended,
     numbers,
     whole,
 )
@@ -213,11 +212,40 @@ class Scratch:
 
 
 @wp.struct
-class CommonMemory:
-    """The memory that `robust` and `robust_joint` share.
+class Correlation:
+    """The correlation of a sender's error with the error of a vehicle that it receives, see correlations.py."""
 
-    K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on; other axes as in
-    `coopenv.world.state`.
+    vehicle: wp.int32  # -1: none
+    tick: wp.int32  # at which that vehicle sent the report on which the correlation is based
+    matrix: mat66f  # whole numbers, in steps
+
+
+@wp.struct
+class Regressor:
+    """The covariance of a sender's new error with that of a member; scratch, see correlations.py."""
+
+    member: wp.int32
+    covariance: mat66d
+    coefficient: mat66d
+
+
+@wp.struct
+class LandmarkOnlySolution:
+    """The pose from landmarks and odometry alone, see solution_separation.py."""
+
+    begun: wp.int32  # 0 during a search, and after it was found wrong: it begins anew
+    exposed: wp.int32  # whether the belief has fused a sender since it was last set to this solution
+    tick: wp.int32  # of the last propagation
+    odometry: Pose  # of the belief, then
+    estimate: PoseEstimate
+
+
+@wp.struct
+class RobustMemory:
+    """The memory of a world's observers.
+
+    K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on, C correlations
+    of a message; other axes as in `coopenv.world.state`.
     """
 
     belief: array("WN", JointBelief)
@@ -233,12 +261,17 @@ class CommonMemory:
     derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WK", Scratch)
     gain: array("WAK", mat26d)  # scratch: of a bearing in a member, transposed and not yet weighted, see correction.py
+    landmark_only: array("WN", LandmarkOnlySolution)
+    outbox_correlation: array("WNSC", Correlation)
+    correlation: array("WNNC", Correlation)  # per receiver and sender
+    known: array("WK", Regressor)  # scratch
+    factor: array("WKK", mat66d)  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
 DERIVATIVES = 3  # the most errors that a bearing depends on
-SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1, "J": DERIVATIVES}
+ROBUST_SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1, "J": DERIVATIVES, "C": MAX_CORRELATIONS}
 """Besides the hypotheses of one frame there is the prior."""
 
 
@@ -304,14 +337,19 @@ def _others(rule: Rule) -> Rule:
     return rule._replace(holds=holds)
 
 
-def rules_for(members: int) -> dict[str, Rule]:
-    """Return the rules of a saved memory with so many members, by field, see `coopenv.world.state`."""
+VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
+
+
+def robust_rules() -> dict[str, Rule]:
+    """Return the rules of a saved memory by field, see `coopenv.world.state`."""
+    members = ROBUST_SIZES["K"]
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.excluded member.considered "
         "member.correlation_unknown outbox.news inbox.news member.report.news member.report.valid measurement.fits "
-        "belief.suspect_fused monitor.self_inconsistent"
+        "belief.suspect_fused monitor.self_inconsistent landmark_only.begun landmark_only.exposed"
     )
-    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
+    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick landmark_only.tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
         "measurement.common_noise measurement.weight scratch.column gain monitor.information_matrix"
@@ -332,6 +370,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
         **dict.fromkeys(("measurement.member", "measurement.reported_by"), whole(0, members - 1)),
         "derivative.member": whole(-1, members - 1),
+        "known.member": whole(0, members - 1),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
@@ -339,60 +378,8 @@ def rules_for(members: int) -> dict[str, Rule]:
     reports = {"pose.R": ROTATION, "P": COVARIANCE, "odometry.R": ROTATION}
     for box in ("outbox", "inbox"):
         rules |= where(f"{box}.valid", {f"{box}.{name}": rule for name, rule in reports.items()})
-    return rules | where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})
-
-
-@wp.struct
-class Correlation:
-    """The correlation of a sender's error with the error of a vehicle that it receives, see correlations.py."""
-
-    vehicle: wp.int32  # -1: none
-    tick: wp.int32  # at which that vehicle sent the report on which the correlation is based
-    matrix: mat66f  # whole numbers, in steps
-
-
-@wp.struct
-class Regressor:
-    """The covariance of a sender's new error with that of a member; scratch, see correlations.py."""
-
-    member: wp.int32
-    covariance: mat66d
-    coefficient: mat66d
-
-
-@wp.struct
-class LandmarkOnlySolution:
-    """The pose from landmarks and odometry alone, see solution_separation.py."""
-
-    begun: wp.int32  # 0 during a search, and after it was found wrong: it begins anew
-    exposed: wp.int32  # whether the belief has fused a sender since it was last set to this solution
-    tick: wp.int32  # of the last propagation
-    odometry: Pose  # of the belief, then
-    estimate: PoseEstimate
-
-
-RobustMemory = extended(
-    CommonMemory,
-    "RobustMemory",
-    """C correlations in a message.""",
-    landmark_only=array("WN", LandmarkOnlySolution),
-    outbox_correlation=array("WNSC", Correlation),
-    correlation=array("WNNC", Correlation),  # per receiver and sender
-    known=array("WK", Regressor),  # scratch
-    factor=array("WKK", mat66d),  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
-)
-ROBUST_SIZES = {**SIZES, "C": MAX_CORRELATIONS}
-
-VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
-WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
-
-
-def robust_rules() -> dict[str, Rule]:
-    """Return the rules of a saved memory by field, see `rules_for`."""
-    rules: dict[str, Any] = rules_for(ROBUST_SIZES["K"])
+    rules |= where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
-    rules |= {"landmark_only.begun": FLAG, "landmark_only.exposed": FLAG, "landmark_only.tick": TICK}
     solution = {"estimate.pose.R": ROTATION, "estimate.P": COVARIANCE, "odometry.R": ROTATION}
-    rules |= where("landmark_only.begun", {f"landmark_only.{name}": rule for name, rule in solution.items()})
-    return rules | {"known.member": whole(0, ROBUST_SIZES["K"] - 1)}
+    return rules | where("landmark_only.begun", {f"landmark_only.{name}": rule for name, rule in solution.items()})

@@ -1,4 +1,4 @@
-"""Messages of `robust` (196 bytes) and `robust_joint` between the kernels and other programs."""
+"""Messages of `robust` between the kernels and other programs: 172 bytes, with correlations 256."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,7 +9,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import Array, exp_so3, log_so3
 from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
-from coopenv.observers.robust.constants import MAX_BROADCAST, MAX_CORRELATIONS, MIN_VARIANCE, STEPS
+from coopenv.observers.robust.constants import MAX_CORRELATIONS, MIN_VARIANCE, STEPS
 from coopenv.world.embedded import Messages
 
 
@@ -120,81 +120,3 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
 
 
 ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast)
-
-
-def write_joint(observer: Any) -> Message:
-    """Return a message with other vehicles, too: poses, odometry, and the factor of the joint covariance.
-
-    The factor in single precision keeps digits that a covariance would lose.
-    """
-    message = write(observer)
-    if message.position is None:
-        return message
-    m = observer.memory
-    count = int(m.outbox_joint[0]["count"])
-    broadcast = m.outbox_broadcast[0, 1:count]
-    n = 6 * count
-    joint: dict[str, Any] = {
-        "vehicles": broadcast["vehicle"].astype(np.uint16),
-        "ages": (int(m.outbox[0]["tick"]) - broadcast["tick"]) * observer.unit,
-        "poses": _six(broadcast["pose"]),
-        "odometries": _six(broadcast["odometry"]),
-        "factor": m.outbox_factor[0, : n * (n + 1) // 2].copy(),
-        "complete": m.outbox_joint[0]["complete"].astype(np.uint8).reshape(1),
-    }
-    return replace(message, extra={**message.extra, **joint})
-
-
-def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message with other vehicles into the inbox; errors are those of `read`."""
-    m, extra = observer.memory, message.extra
-    read(observer, sender, message, sent)
-    if not m.inbox[sender]["valid"]:
-        return
-    m.inbox[sender]["valid"] = 0
-    vehicles, complete = (
-        _others(observer, sender, message, "vehicles", MAX_BROADCAST - 1),
-        np.asarray(extra["complete"]),
-    )
-    others = len(vehicles)
-    n = 6 * (others + 1)
-    ages = _numbers(message, "ages", (others,))
-    poses, odometries = _numbers(message, "poses", (others, 6)), _numbers(message, "odometries", (others, 6))
-    factor = _numbers(message, "factor", (n * (n + 1) // 2,))
-    if complete.shape != (1,):
-        raise CoopenvError("message: complete")
-    if not (factor[np.cumsum(np.arange(1, n + 1)) - 1] ** 2 >= MIN_VARIANCE).all():
-        raise CoopenvError("message: factor is singular")
-    report = m.inbox[sender]
-    m.inbox_broadcast[sender, 0] = sender, sent, report["pose"], report["odometry"]
-    broadcast = m.inbox_broadcast[sender, 1 : 1 + others]
-    broadcast["vehicle"], broadcast["tick"] = vehicles, [sent - observer.units(age) for age in ages.tolist()]
-    for one, pose, odometry in zip(broadcast, poses, odometries, strict=True):
-        one["pose"], one["odometry"] = from_six(pose), from_six(odometry)
-    m.inbox_factor[sender, : len(factor)] = factor
-    m.inbox_joint[sender] = 1 + others, complete[0] != 0
-    m.inbox[sender]["valid"] = 1
-
-
-def tampered(message: Message) -> Message:
-    """Return a message whose joint covariance agrees with its changed pose covariance, for studies of faults."""
-    if message.covariance is None or "factor" not in message.extra:
-        return message
-    n = 6 * (1 + len(message.extra["vehicles"]))
-    L = np.zeros((n, n))
-    L[np.tril_indices(n)] = message.extra["factor"]
-    P = L @ L.T
-    if np.allclose(P[:6, :6], message.covariance, rtol=1e-3, atol=1e-3 * np.diag(message.covariance).min()):
-        return message  # its covariance is unchanged
-    P[:6, 6:], P[6:, :6], P[:6, :6] = 0.0, 0.0, message.covariance
-    factor = np.linalg.cholesky(P)[np.tril_indices(n)].astype(np.float32)
-    more: dict[str, Any] = {**message.extra, "factor": factor}
-    return replace(message, extra=more)
-
-
-def _six(poses: Any) -> Any:
-    """Return poses as rotation vectors and positions (m, 6)."""
-    return np.array([six_of(pose) for pose in poses]).reshape(-1, 6)
-
-
-JOINT_MESSAGES = Messages(write_joint, read_joint, tampered)

@@ -236,37 +236,27 @@ def write(state: Any, memory: Any, world: int, i: int):
     state.covariance[world, i] = type(state.covariance[world, i])(P)
 
 
-def make_start(begin_messages: Any, receive: Any) -> Any:
-    """Return the Warp function that starts an observer.
+@device_function
+def start(model: Any, state: Any, memory: Any, world: int, i: int):
+    """Start at the initial estimate, and receive the leaders' messages.
 
-    Args:
-        begin_messages: clears all messages; called after the belief has begun.
-        receive: receives the messages that the radio delivers.
+    An estimate that is too uncertain to linearise about is only a prior for the search.
     """
-
-    @device_function
-    def start(model: Any, state: Any, memory: Any, world: int, i: int):
-        """Start at the initial estimate, and receive the leaders' messages.
-
-        An estimate that is too uncertain to linearise about is only a prior for the search.
-        """
-        clear(memory, world, i)
-        memory.belief[world, i].others = 1
-        begin_errors(model, memory, world, i)
-        R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
-        initial = PoseEstimate(
-            Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i)
-        )
-        restart_belief(model, memory, world, i, initial)
-        memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
-        set_anchor(memory, world, i, initial.P, 0)
-        if not is_known(initial.P):
-            begin_search(memory, world, i, initial)
-        begin_messages(model, memory, world, i)
-        write(state, memory, world, i)
-        receive(model, state, memory, world, i)
-
-    return start
+    clear(memory, world, i)
+    memory.belief[world, i].others = 1
+    begin_errors(model, memory, world, i)
+    R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
+    initial = PoseEstimate(
+        Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i)
+    )
+    restart_belief(model, memory, world, i, initial)
+    memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
+    set_anchor(memory, world, i, initial.P, 0)
+    if not is_known(initial.P):
+        begin_search(memory, world, i, initial)
+    begin_broadcasts(model, memory, world, i)
+    write(state, memory, world, i)
+    receive_broadcast(model, state, memory, world, i)
 
 
 @device_function
@@ -297,46 +287,35 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
         postpone_acceptance(memory, world, i)
 
 
-def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
-    """Return the Warp function of one tick.
-
-    Args:
-        receive: receives the messages that the radio delivers.
-        fuse_messages: fuses them.
-        separate: tests the belief against the solution from landmarks alone.
-    """
-
-    @device_function
-    def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-        """Take one camera tick of one vehicle, whose messages have been delivered."""
-        state.nis[world, i] = wp.float64(0.0)
-        state.nis_dof[world, i] = 0
-        receive(model, state, memory, world, i)
-        step, jump = take_odometry(model, state, memory, world, i, now.period)
-        walk_errors(model, memory, world, i, now.period)
-        walk_mounting(model, memory, world, i, now.period)
-        standing = int(ESTIMATING)
-        if memory.search[world, i].active == 1:
-            noise = increment_noise(model, memory, world, i, step, now.period) + jump
-            propagate_search(memory, world, i, step, noise)
-            standing = SEARCHING
-            if now.due:
-                standing = search(model, state, memory, world, i, now)
-        else:
-            noise = odometry_noise(model, i, now.period) + jump
-            propagate_own(memory, world, i, step, noise, now.period)
-        if standing != SEARCHING:
-            fuse_messages(model, state, memory, world, i, now.tick)
-            if now.due:
-                correct(model, state, memory, world, i, now, standing)
-            if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
-                declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
-        separate(model, state, memory, world, i, now)
-        write(state, memory, world, i)
+@device_function
+def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Take one camera tick of one vehicle, whose messages have been delivered."""
+    state.nis[world, i] = wp.float64(0.0)
+    state.nis_dof[world, i] = 0
+    receive_broadcast(model, state, memory, world, i)
+    step, jump = take_odometry(model, state, memory, world, i, now.period)
+    walk_errors(model, memory, world, i, now.period)
+    walk_mounting(model, memory, world, i, now.period)
+    standing = int(ESTIMATING)
+    if memory.search[world, i].active == 1:
+        noise = increment_noise(model, memory, world, i, step, now.period) + jump
+        propagate_search(memory, world, i, step, noise)
+        standing = SEARCHING
         if now.due:
-            state.corrected_tick[world, i] = now.tick
-
-    return estimate
+            standing = search(model, state, memory, world, i, now)
+    else:
+        noise = odometry_noise(model, i, now.period) + jump
+        propagate_own(memory, world, i, step, noise, now.period)
+    if standing != SEARCHING:
+        fuse_messages(model, state, memory, world, i, now.tick)
+        if now.due:
+            correct(model, state, memory, world, i, now, standing)
+        if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
+            declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
+    separate(model, state, memory, world, i, now)
+    write(state, memory, world, i)
+    if now.due:
+        state.corrected_tick[world, i] = now.tick
 
 
 OPTIONS = {"max_unroll": 1}
@@ -345,8 +324,8 @@ with the last one, which is Warp's on a GPU, steps take a twentieth less than wi
 
 ROBUST = Embedded(
     "robust",
-    make_estimate(receive_broadcast, fuse_messages, separate),
-    make_start(begin_broadcasts, receive_broadcast),
+    estimate,
+    start,
     send_broadcast,
     RobustMemory,
     ROBUST_SIZES,
@@ -363,14 +342,9 @@ def robust(setup: Setup) -> Observer:
     Raises:
         CoopenvError: the vehicle moves on a plane and its odometry is its commands.
     """
-    return in_space("robust", ROBUST, setup)
-
-
-def in_space(name: str, observer: Embedded, setup: Setup) -> Observer:
-    """Return an observer for a vehicle in space; a CoopenvError names the one for robots on a plane."""
     if setup.planar:
         raise CoopenvError(
-            f"observer '{name}' is for vehicles in space; '{setup.name}' is a recorded robot on a plane whose odometry "
+            f"observer 'robust' is for vehicles in space; '{setup.name}' is a recorded robot on a plane whose odometry "
             "is its commands: use 'planar_robust'"
         )
-    return KernelObserver(observer, setup)
+    return KernelObserver(ROBUST, setup)

@@ -16,10 +16,8 @@ from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Pose, PoseEstimate, SenderReport, mat66f, vec3d
-from coopenv.world.v2x import as_broadcast, claimed_std, content_tick
+from coopenv.world.v2x import as_broadcast, claimed_std
 from coopenv.world.warp_internals import device_function
-
-LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
 
 
 @wp.func
@@ -66,32 +64,6 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
         report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
         report.depends_on = memory.belief[world, i].depends_on
     return report
-
-
-def make_receive(copy: Any) -> Any:
-    """Return the Warp function that receives the messages that the radio delivers at a tick.
-
-    Args:
-        copy: (memory, world, receiver, sender, slot, later): copies the part of a message beside the report. Its time
-            stamp is later than its content by so many ticks.
-    """
-
-    @device_function
-    def receive(model: Any, state: Any, memory: Any, world: int, i: int):
-        """Receive the messages that the radio delivers at this tick."""
-        for n in range(model.target_count[i]):
-            sender = model.targets[i, n] - model.landmarks
-            if sender >= 0:
-                sent = state.inbox_tick[world, i, sender]
-                stamp = state.inbox_stamp[world, i, sender]
-                if sent >= 0 and stamp != memory.inbox[world, i, sender].tick:
-                    content = content_tick(model, state, world, sender, sent)
-                    slot = content % model.radio.slots
-                    copy(memory, world, i, sender, slot, stamp - content)
-                    memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
-                    memory.inbox[world, i, sender].tick = stamp
-
-    return receive
 
 
 @device_function
@@ -159,17 +131,3 @@ def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
         return False
     own = algebra.position_variance(memory.P[world, i, 0, 0])
     return algebra.position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own
-
-
-@device_function
-def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
-    """Return the share of new information that counts of a sender that depends on these vehicles.
-
-    It is 1 without dependence and `DEPENDENT_SHARE` for dependence on other vehicles. If n senders depend on this
-    vehicle, each counts 1 / (n + 1): information that returns round a loop then fades in any graph.
-    """
-    if depends_on == wp.uint64(0):
-        return wp.float64(1.0)
-    if not includes(depends_on, i):
-        return wp.float64(constants.DEPENDENT_SHARE)
-    return wp.float64(1.0) / wp.float64(1 + dependents(memory, world, i))

@@ -47,8 +47,8 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
         return ObserverOptions(source=source, observers=observers).plan().observers
 
     space, plane = names("overtaking"), names("mrclam_6")
-    assert not {"planar_ekf", "planar_robust"} & {*space} and {"p3p", "robust", "robust_joint"} <= {*space}
-    assert not {"p3p", "robust", "robust_joint"} & {*plane} and {"planar_ekf", "planar_robust", "riccati"} <= {*plane}
+    assert not {"planar_ekf", "planar_robust"} & {*space} and {"p3p", "robust"} <= {*space}
+    assert not {"p3p", "robust"} & {*plane} and {"planar_ekf", "planar_robust", "riccati"} <= {*plane}
     assert names("overtaking", "planar_ekf,mekf,mekf") == ("planar_ekf", "mekf")
 
 

@@ -68,9 +68,8 @@ def test_threads_change_nothing() -> None:
     assert_same(*(played(world) for world in worlds))
 
 
-@pytest.mark.parametrize("observer", ["robust", pytest.param("robust_joint", marks=pytest.mark.slow)])
-def test_a_reset_leaves_nothing_of_the_last_episode(observer: str) -> None:
-    world = start(noisy(observer=observer), [3, 4])
+def test_a_reset_leaves_nothing_of_the_last_episode() -> None:
+    world = start(noisy(), [3, 4])
     fresh = world.get_state()
     assert not (fresh["observer_search.active"][:, 0]).any() and fresh["observer_search.active"][:, 1:].all()
     played(world)
@@ -89,16 +88,9 @@ def test_a_reset_by_mask_touches_the_masked_only() -> None:
     assert_same(played(world, 60), played(straight, 60), ~mask, ~mask)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "observer", "errors"),
-    [
-        *((dtype, "robust", {}) for dtype in DTYPES),
-        ("float64", "robust", LASTING),
-        pytest.param("float64", "robust_joint", {}, marks=pytest.mark.slow),
-    ],
-)
-def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, observer: str, errors: dict[str, float]) -> None:
-    description = noisy(5.0, observer, **errors)
+@pytest.mark.parametrize(("dtype", "errors"), [*((dtype, {}) for dtype in DTYPES), ("float64", LASTING)])
+def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, errors: dict[str, float]) -> None:
+    description = noisy(5.0, **errors)
     world = start(description, [1, 2], dtype)
     played(world, 24)  # the second vehicle is still searching
     saved = world.get_state()
