@@ -19,10 +19,11 @@ Counted are the odometry's scale, the gyro's bias, how the camera is mounted, an
 focal length are left out: with them the bound would be higher.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from coopenv.estimation.poses import Array, skew
@@ -33,59 +34,22 @@ ERRORS = 11
 (3, m) of the camera in body axes, offset of the clock (s)."""
 
 
-@dataclass(frozen=True)
-class ErrorStates:
-    """Which errors the vehicles of a record have, beside those of their poses."""
-
-    kept: list[int]  # (e,) of `ERRORS`, those that any vehicle has
-    variance: Array  # (N, e) at the start
-    walk: Array  # (N, e) by which it grows, 1/s
-
-    @property
-    def count(self) -> int:
-        """How many a vehicle has."""
-        return len(self.kept)
-
-    def over_step(self, turned: Array, step: Array, dt: float) -> Array:
-        """Return (..., 6, e) what the pose's left error gets over a tick from the errors, to first order.
-
-        Args:
-            turned: (..., 3, 3) body at the start to body at the end.
-            step: (..., 3) displacement, body at the start, m.
-            dt: s.
-        """
-        made = np.zeros((*step.shape[:-1], 6, ERRORS))
-        made[..., 3:, :1] = -turned @ step[..., None]
-        made[..., :3, 1:4] = -dt * np.eye(3)
-        return made[..., self.kept]
-
-    def in_bearings(self, u: Array, across: Array) -> Array:
-        """Return (K, 3, e) what a bearing gets from its own vehicle's errors, its clock apart.
-
-        Args:
-            u: (K, 3) unit bearings, body frame.
-            across: (K, 3, 3) the derivative of a bearing by the line to the target.
-        """
-        made = np.zeros((len(u), 3, ERRORS))
-        made[..., 4:7], made[..., 7:10] = skew(u), -across
-        return made[..., self.kept]
-
-    def of_clock(self, motion: Array) -> Array:
-        """Return (K, 3, e) what a bearing gets from a clock that is off, given its derivative by time (K, 3)."""
-        made = np.zeros((len(motion), 3, ERRORS))
-        made[..., 10] = motion
-        return made[..., self.kept]
+POSE = list(range(6))
+"""Left error of a pose, the first of a vehicle's states; `ERRORS` follow."""
 
 
-def error_states(recording: Recording) -> ErrorStates:
-    """Return the declared errors of the vehicles of a record."""
+def error_states(recording: Recording) -> tuple[list[int], Array, Array]:
+    """Return the states (w,) of the vehicles of a record: those of the pose, and the errors that any vehicle has.
+
+    The others are the variances (N, w - 6) of these errors at the start, and (N, w - 6) by which they grow, 1/s.
+    """
     std, walk = np.zeros((2, len(recording.setups), ERRORS))
     for i, noise in enumerate(setup.noise for setup in recording.setups):
         camera = [noise.camera_orientation] * 3 + [noise.camera_position] * 3
         std[i] = [noise.odometry_scale, *noise.gyro_bias, *camera, noise.clock_offset]
         walk[i, :4] = [noise.odometry_scale_walk, *noise.gyro_bias_walk]
-    kept = np.flatnonzero((std + walk).any(axis=0)).tolist()
-    return ErrorStates(kept, std[:, kept] ** 2, walk[:, kept] ** 2)
+    kept = np.flatnonzero((std + walk).any(axis=0))
+    return [*POSE, *(6 + kept).tolist()], std[:, kept] ** 2, walk[:, kept] ** 2
 
 
 BLOCK = 10_000_000
@@ -153,15 +117,13 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
 
     A group counts what its own vehicles measure; `joint`: their neighbours' poses are unknown.
     """
-    errors = error_states(recording)
-    w = 6 + errors.count
-    part = (w * np.asarray(groups)[..., None] + np.arange(w)).reshape(len(groups), -1)
-    members, used = np.asarray(groups), sorted({i for group in groups for i in group})
-    pairs = zip(recording.start_covariance, errors.variance, strict=True)
-    start = [block_diag(P, np.diag(variance)) for P, variance in pairs]
+    states, variances, walks = error_states(recording)
+    w, dt, members = len(states), recording.dt, np.asarray(groups)
+    part = (w * members[..., None] + np.arange(w)).reshape(len(groups), -1)
+    start = [block_diag(P, np.diag(of)) for P, of in zip(recording.start_covariance, variances, strict=True)]
     P = np.array([block_diag(*(start[i] for i in group)) for group in groups])
-    dt, walks = recording.dt, zip(recording.setups, errors.walk, strict=True)
-    Q = np.array([np.diag(np.concatenate([setup.noise.odometry(dt), dt * walk])) for setup, walk in walks])
+    noises = [setup.noise.odometry(dt) for setup in recording.setups]
+    Q = np.array([np.diag([*noise, *(dt * walk)]) for noise, walk in zip(noises, walks, strict=True)])
     own = np.arange(part.shape[1]).reshape(-1, w)
     rows, columns = own[:, :, None], own[:, None, :]
     blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
@@ -169,7 +131,7 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
     identity = np.eye(part.shape[1])
     at_once = 1 if len(own) <= EXACT else max(1, round(COARSE / recording.dt))
     for ticks in _stretches(recording, at_once, w):
-        E, M = steps(recording, ticks, errors), information(recording, joint, used, ticks, errors)
+        E, M = steps(recording, ticks, states), information(recording, joint, members, ticks, states)
         M[~recording.due[ticks.start : ticks.stop]] = 0.0
         for first in range(0, len(ticks), at_once):
             last = min(first + at_once, len(ticks))
@@ -227,79 +189,70 @@ def _bound(recording: Recording, blocks: Array) -> Bound:
     return Bound(recording.t, np.sqrt(trace), np.degrees(np.sqrt(angle)), blocks)
 
 
-def steps(recording: Recording, ticks: range, errors: ErrorStates | None = None) -> Array:
-    """Return (k, N, w, w) how each vehicle's errors go on over its true motion into some ticks.
+def steps(recording: Recording, ticks: range, states: list[int] = POSE) -> Array:
+    """Return (k, N, w, w) how each vehicle's states go on over its true motion into some ticks, to first order.
 
-    They are the left error of its pose (w = 6), and after it further `errors`. Of tick 0 it is the identity.
+    Of tick 0 it is the identity.
     """
     R, p = recording.truth.rotation, recording.truth.position
     into = np.array(ticks)
     before = np.maximum(into - 1, 0)
-    back = np.swapaxes(R[before], -1, -2)
     E = np.swapaxes(R[into], -1, -2) @ R[before]
-    way = (back @ (p[into] - p[before])[..., None])[..., 0]
-    more = 0 if errors is None else errors.count
-    made = np.zeros((*E.shape[:2], 6 + more, 6 + more))
+    way = (np.swapaxes(R[before], -1, -2) @ (p[into] - p[before])[..., None])[..., 0]
+    made = np.broadcast_to(np.eye(6 + ERRORS), (*E.shape[:2], 6 + ERRORS, 6 + ERRORS)).copy()
     made[..., :3, :3] = made[..., 3:6, 3:6] = E
     made[..., 3:6, :3] = -E @ skew(way)
-    if errors is not None:
-        made[..., 6:, 6:] = np.eye(more)
-        made[..., :6, 6:] = errors.over_step(E, way, recording.dt) * (into > 0)[:, None, None, None]
-    return made
+    made[..., 3:6, 6:7] = -E @ way[..., None]
+    made[..., :3, 7:10] = -recording.dt * np.eye(3) * (into > 0)[:, None, None, None]
+    return made[(..., *np.ix_(states, states))]
 
 
 def information(
     recording: Recording,
     joint: bool = True,
-    observers: Collection[int] | None = None,
+    observers: ArrayLike | None = None,
     ticks: range | None = None,
-    errors: ErrorStates | None = None,
+    states: list[int] = POSE,
 ) -> Array:
     """Return sum of H^T N^-1 H (k, wN, wN) over the visible edges at each tick, linearised at the truth.
 
     `joint`: a neighbour's pose is unknown, too; `observers`: the vehicles that measure, None: all; `ticks`: at
-    which ones, None: at all; `errors`: what is unknown beside the poses, for which w = 6.
+    which ones, None: at all; `states`: what is unknown of each vehicle.
     """
-    ticks = range(recording.ticks) if ticks is None else ticks
-    wanted, w = slice(ticks.start, ticks.stop), 6 + (0 if errors is None else errors.count)
-    R, p, landmarks = recording.truth.rotation[wanted], recording.truth.position[wanted], recording.landmarks[wanted]
-    visible = recording.visible[wanted]
-    K, N = R.shape[:2]
-    L = recording.landmarks.shape[1]
-    M = np.zeros((K, w * N, w * N))
-    minus = np.broadcast_to(-np.eye(3), (K, 3, 3))
-    for i, setup in enumerate(recording.setups):
-        if observers is not None and i not in observers:
-            continue
+    truth, N, L, w = recording.truth, len(recording.setups), recording.landmarks.shape[1], len(states)
+    at = np.arange(recording.ticks) if ticks is None else np.array(ticks)
+    R, visible, before = truth.rotation[at], recording.visible[at], np.maximum(at - 1, 0)
+    M = np.zeros((len(at), w * N, w * N))
+    for i in range(N) if observers is None else np.unique(observers):
+        setup = recording.setups[i]
         own = slice(w * i, w * i + w)
         Rt = np.swapaxes(R[:, i], -1, -2)
         for target in setup.targets:
             j = int(target) - L
             marker = recording.setups[j].marker if j >= 0 else np.zeros(3)
-            z = landmarks[:, target] if j < 0 else p[:, j] + R[:, j] @ marker
-            a = (Rt @ (z - p[:, i])[..., None])[..., 0]
+            path = recording.landmarks[:, target] if j < 0 else truth.position[:, j] + truth.rotation[:, j] @ marker
+            a = (Rt @ (path[at] - truth.position[at, i])[..., None])[..., 0]
             d = a - setup.lever_arm
             distance = np.maximum(np.linalg.norm(d, axis=-1), 1e-9)
             u = d / distance[:, None]
             across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
             weight = visible[:, i, target, None, None] * setup.noise.bearing_information(u)
-            Hi = across @ np.concatenate([skew(a), minus], axis=-1)
-            known, moved = j < 0 or not joint, np.zeros((K, 3, 0))
-            if errors is not None:
-                Hi = np.concatenate([Hi, errors.in_bearings(u, across)], axis=-1)
-            if errors is not None and not known:  # a report is dated by the sender's clock
-                there = recording.truth.position[:, j] + recording.truth.rotation[:, j] @ marker
-                at = np.maximum(ticks, 1)
-                v = (there[at] - there[at - 1]) / recording.dt  # m/s
-                moved = errors.of_clock((across @ Rt @ v[..., None])[..., 0])
-                Hi[..., 6:] -= moved
+            known = j < 0 or not joint
+            clock = (across @ Rt @ (path[at] - path[before])[..., None])[..., 0] / recording.dt
+            H = np.zeros((len(at), 3, 6 + ERRORS))
+            H[..., :3], H[..., 3:6] = across @ skew(a), -across
+            H[..., 10:13], H[..., 13:16] = skew(u), -across
+            H[..., 16] = 0.0 if known else -clock  # a report is dated by the sender's clock
+            Hi = H[..., states]
             Hi_t = np.swapaxes(Hi, -1, -2) @ weight
             M[:, own, own] += Hi_t @ Hi
             if known:
                 continue
             other = slice(w * j, w * j + w)
-            Hj = across @ Rt @ R[:, j] @ np.hstack([-skew(marker), np.eye(3)])
-            Hj = np.concatenate([Hj, moved], axis=-1)
+            H = np.zeros_like(H)
+            H[..., :6] = across @ Rt @ R[:, j] @ np.hstack([-skew(marker), np.eye(3)])
+            H[..., 16] = clock
+            Hj = H[..., states]
             Hj_t = np.swapaxes(Hj, -1, -2) @ weight
             M[:, other, other] += Hj_t @ Hj
             M[:, own, other] += Hi_t @ Hj

@@ -102,7 +102,7 @@ def test_errors_that_last_count_as_unknown(names: tuple[str, ...]) -> None:
 
 def test_who_is_told_of_nothing_has_the_bound_of_poses() -> None:
     made = small_record(TICKS)
-    assert error_states(made).count == 0
+    assert len(error_states(made)[0]) == 6
     plain, more = cramer_rao(made), cramer_rao(told_of(made, "scale", "bias", "mounting", "clock"))
     assert (more.position[1:] > plain.position[1:]).all()
 

@@ -24,11 +24,8 @@ def received_position(received: Received) -> PlanarPose | None:
 
     The heading of a neighbour is not needed: it is 0 with a variance of 0.
     """
-    position, reported = received.message.position, received.message.covariance
-    if position is None or reported is None or not 0.0 <= received.age <= OLDEST_S:
-        return None
-    p, P = np.asarray(position, dtype=float), np.asarray(reported, dtype=float)
-    if p.shape != (3,) or P.ndim != 2 or min(P.shape) < 2 or not _plausible(p[:2], P[:2, :2]):
+    p, P = received.message.position, received.message.covariance
+    if p is None or P is None or not 0.0 <= received.age <= OLDEST_S or not _plausible(p[:2], P[:2, :2]):
         return None
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = (P[:2, :2] + P[:2, :2].T) / 2

@@ -19,13 +19,6 @@ class PlanarPose(NamedTuple):
     covariance: Array
 
 
-def picked(state: Array, covariance: Array) -> PlanarPose:
-    """Return x, y and the heading from which bearings count (the camera's bias taken off), with their covariance."""
-    pick = np.eye(3, STATES)
-    pick[HEADING, BIAS] = -1.0
-    return PlanarPose(pick @ state, pick @ covariance @ pick.T)
-
-
 NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
@@ -177,7 +170,6 @@ class Tuning:
     (split covariance intersection with the weight that leaves the least variance)."""
     dependent: float = 1.0  # the share of both covariances that `intersection` takes as possibly shared errors
     arm_m: float = 0.0  # m, how far a rad of heading counts in that variance
-    mutual: bool = False  # whether a robot that is seen corrects itself with the sighting, too
 
 
 TEXTBOOK = Tuning()
@@ -210,7 +202,6 @@ CALIBRATING = Tuning(
     fusion="intersection",
     dependent=0.25,
     arm_m=1.0,
-    mutual=True,
 )
 
 

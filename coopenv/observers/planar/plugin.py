@@ -14,11 +14,12 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.filter import Mixture, PlanarFilter
-from coopenv.observers.planar.fusion import LOWER, RobotMonitors, Sightings, received_position, sightings_of
+from coopenv.observers.planar.fusion import LOWER, RobotMonitors, received_position, sightings_of
 from coopenv.observers.planar.model import (
     BIAS,
     CALIBRATING,
     HEADING,
+    STATES,
     TEXTBOOK,
     TURN_SCALE,
     OdometryStep,
@@ -26,7 +27,6 @@ from coopenv.observers.planar.model import (
     Tuning,
     X,
     Y,
-    picked,
 )
 from coopenv.observers.planar.search import LossTest, PoseInformation, Sighting, SightingHistory, find_pose
 
@@ -43,24 +43,19 @@ class PlanarEkf:
     """
 
     tuning: ClassVar[Tuning] = TEXTBOOK
+    estimator: ClassVar[type[PlanarFilter] | type[Mixture]] = PlanarFilter
 
     def __init__(self, setup: Setup) -> None:
         if not setup.planar:
             raise CoopenvError(f"{type(self).__name__} is for robots on a plane; '{setup.name}' moves in space")
-        self._me = setup.landmarks + setup.vehicle
-        self._sightings: list[tuple[int, float]] = []
-        self._before = PlanarPose(np.zeros(3), np.zeros((3, 3)))
-        self._received: dict[int, float] = {}
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose with a covariance (6, 6) in LEFT coordinates."""
         R, p = initial_pose
         heading = math.atan2(R[1, 0], R[0, 0])
         turn = _from_body(heading)
-        covariance = turn @ initial_covariance[PLANE] @ turn.T
-        self._begin(np.array([p[0], p[1], heading]), covariance)
-        self._sightings.clear()
-        self._received.clear()
+        pose, covariance = np.array([p[0], p[1], heading]), turn @ initial_covariance[PLANE] @ turn.T
+        self.filter: Any = self.estimator(self.tuning, pose, covariance)
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
@@ -68,72 +63,35 @@ class PlanarEkf:
         chord = math.copysign(math.hypot(tick.translation[0], tick.translation[1]), tick.translation[0])
         arc_over_chord = 1.0 if turn == 0.0 else turn / 2 / math.sin(turn / 2)
         self._advance(tick.dt, turn, chord * arc_over_chord)
-        if self.tuning.mutual:
-            self._take_sightings(tick)
-        if tick.valid.any():
-            self._look(tick)
+        self._look(tick)
         return self._estimate()
 
     def message(self) -> Message:
-        """Return position and covariance, and the bearings to other robots since the last message.
-
-        The pose sent with these bearings is the one before they corrected it. The receiver's own estimate therefore
-        does not return to it.
-        """
+        """Return position and covariance."""
         state, covariance = self.filter.state, np.zeros((3, 3))
         covariance[:2, :2], covariance[2, 2] = self.filter.covariance[:2, :2], OUT_OF_PLANE_STD**2
-        extra: dict[str, Any] = {}
-        if self.tuning.mutual and self._sightings:
-            targets, bearings = zip(*self._sightings, strict=True)
-            pose = [*self._before.pose, *self._before.covariance[LOWER]]
-            extra = {
-                "seen": np.array(targets, np.uint8),
-                "bearing": np.array(bearings, np.float32),
-                "from": np.array(pose, np.float32),
-            }
-        self._sightings.clear()
-        return Message(position=np.array([state[X], state[Y], 0.0]), covariance=covariance, extra=extra)
+        return Message(position=np.array([state[X], state[Y], 0.0]), covariance=covariance)
 
-    def _begin(self, pose: Array, covariance: Array) -> None:
-        self.filter: PlanarFilter | Mixture = PlanarFilter(self.tuning, pose, covariance)
-
-    def _advance(self, dt: float, turn: float, path: float) -> OdometryStep:
-        return self.filter.advance(dt, turn, path)
+    def _advance(self, dt: float, turn: float, path: float) -> None:
+        self.filter.advance(dt, turn, path)
 
     def _look(self, tick: Tick) -> None:
         """Correct by the bearings of a frame, landmarks first."""
+        if not tick.valid.any():
+            return
         for target, b, position, message in sorted(tick.usable(), key=lambda entry: entry[3] is not None):
             bearing = math.atan2(b[1], b[0])
             if message is None:
                 self._see_landmark(tick, target, bearing, float(position[0]), float(position[1]))
             elif (reported := received_position(tick.messages[target])) is not None:
-                if not self._sightings:
-                    self._before = picked(self.filter.state, self.filter.covariance)
-                self._sightings.append((target, bearing))
                 self._see_robot(tick, target, bearing, reported)
 
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self.filter.landmark(bearing, x, y)
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool = False) -> None:
-        """Correct by a bearing to a robot at its reported pose, or `seen` by it."""
-        self.filter.robot(bearing, there, seen)
-
-    def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
-        """Test the reports of other senders by the sightings of one; this filter has no such test."""
-
-    def _take_sightings(self, tick: Tick) -> None:
-        """Correct by the received bearings to this robot; each message counts once."""
-        for target, received in tick.messages.items():
-            extra, sent = received.message.extra, tick.time - received.age
-            if "seen" not in extra or sent < self._received.get(target, -math.inf) + tick.dt / 2:
-                continue
-            self._received[target] = sent
-            if (sightings := sightings_of(extra)) is not None:
-                self._test_sightings(tick, target, sightings)
-                for seen, bearing in sightings.seen:
-                    if seen == self._me:
-                        self._see_robot(tick, target, bearing, sightings.by, seen=True)
+    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose) -> None:
+        """Correct by a bearing to a robot at its reported pose."""
+        self.filter.robot(bearing, there)
 
     def _estimate(self) -> Estimate:
         x, y, heading = self.filter.state[:3].tolist()
@@ -172,10 +130,25 @@ class PlanarRobust(PlanarEkf):
     """
 
     tuning: ClassVar[Tuning] = CALIBRATING
+    estimator = Mixture
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
+        self._me = setup.landmarks + setup.vehicle
         self._site = LEAST_LOST_STD
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose with a covariance (6, 6) in LEFT coordinates."""
+        super().reset(initial_pose, initial_covariance)
+        self._sightings: list[tuple[int, float]] = []
+        self._before = self._broadcast_pose()
+        self._received: dict[int, float] = {}
+        self._test, self._history = LossTest(), SightingHistory()
+        self._monitors = RobotMonitors(self.tuning.bearing_std)
+        self._now, self._next_search, self._failed, self._news = 0.0, 0.0, 0, False
+        self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
+        if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
+            self._declare_lost()
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
@@ -200,15 +173,25 @@ class PlanarRobust(PlanarEkf):
         return self._estimate()
 
     def message(self) -> Message:
-        """Return nothing while lost."""
+        """Return position and covariance, and the bearings to other robots since the last message; nothing while lost.
+
+        The pose sent with these bearings is the one before they corrected it. The receiver's own estimate therefore
+        does not return to it.
+        """
+        sightings, self._sightings = self._sightings, []
         if self.lost:
-            self._sightings.clear()
             return Message()
-        message = super().message()
-        if "seen" not in message.extra:
-            return message
-        extra: dict[str, Any] = {**message.extra, "sure": np.array([self._test.localised(self._now)], np.uint8)}
-        return replace(message, extra=extra)
+        if not sightings:
+            return super().message()
+        targets, bearings = zip(*sightings, strict=True)
+        pose = [*self._before.pose, *self._before.covariance[LOWER]]
+        extra: dict[str, Any] = {
+            "seen": np.array(targets, np.uint8),
+            "bearing": np.array(bearings, np.float32),
+            "from": np.array(pose, np.float32),
+            "sure": np.array([self._test.localised(self._now)], np.uint8),
+        }
+        return replace(super().message(), extra=extra)
 
     def tampered(self, message: Message) -> Message:
         """Return a message with a changed position whose sightings agree with it."""
@@ -218,16 +201,7 @@ class PlanarRobust(PlanarEkf):
         by[:2] += (message.position[:2] - self.filter.state[:2]).astype(by.dtype)
         return replace(message, extra={**message.extra, "from": by})
 
-    def _begin(self, pose: Array, covariance: Array) -> None:
-        self.filter: Mixture = Mixture(self.tuning, pose, covariance)
-        self._test, self._history = LossTest(), SightingHistory()
-        self._monitors = RobotMonitors(self.tuning.bearing_std)
-        self._now, self._next_search, self._failed, self._news = 0.0, 0.0, 0, False
-        self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
-        if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
-            self._declare_lost()
-
-    def _advance(self, dt: float, turn: float, path: float) -> OdometryStep:
+    def _advance(self, dt: float, turn: float, path: float) -> None:
         step = self.filter.advance(dt, turn, path)
         self._history.move(step)
         self._news = False
@@ -235,7 +209,6 @@ class PlanarRobust(PlanarEkf):
             self._inflate_while_lost(step)
         else:
             self.filter.split()
-        return step
 
     def _inflate_while_lost(self, step: OdometryStep) -> None:
         """Inflate the covariance by the turn and path since the loss: errors of scale and heading are constant."""
@@ -247,13 +220,41 @@ class PlanarRobust(PlanarEkf):
         variance = self._from + self._adrift**2 * min(heading, 1.0)
         self.filter.set_pose(state[:3].copy(), np.diag([variance, variance, heading]))
 
+    def _look(self, tick: Tick) -> None:
+        """Correct by the received bearings to this robot, each message once, then by the own bearings."""
+        for target, received in tick.messages.items():
+            extra, sent = received.message.extra, tick.time - received.age
+            if "seen" not in extra or sent < self._received.get(target, -math.inf) + tick.dt / 2:
+                continue
+            self._received[target] = sent
+            if (sightings := sightings_of(extra)) is not None:
+                self._monitors.test_sightings(tick, target, sightings)
+                self._inflate_after_exclusion(tick.time)
+                for seen, bearing in sightings.seen:
+                    if seen == self._me:
+                        self._fuse_robot(tick, target, bearing, sightings.by, seen=True)
+        super()._look(tick)
+
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self._remember(tick.time, target, bearing, True, PlanarPose(np.array([x, y, 0.0]), np.zeros((3, 3))))
         if not self.lost:
             self._test.take(tick.time, self.filter.landmark(bearing, x, y))
 
-    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool = False) -> None:
-        """Test the sender by the bearing; correct if it is not excluded."""
+    def _see_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose) -> None:
+        """Note the sighting for the next message, and correct."""
+        if not self._sightings:
+            self._before = self._broadcast_pose()
+        self._sightings.append((target, bearing))
+        self._fuse_robot(tick, target, bearing, there, seen=False)
+
+    def _broadcast_pose(self) -> PlanarPose:
+        """Return x, y and the heading from which bearings count (the camera's bias taken off), with their covariance."""
+        pick = np.eye(3, STATES)
+        pick[HEADING, BIAS] = -1.0
+        return PlanarPose(pick @ self.filter.state, pick @ self.filter.covariance @ pick.T)
+
+    def _fuse_robot(self, tick: Tick, target: int, bearing: float, there: PlanarPose, seen: bool) -> None:
+        """Test a sender by a bearing to its reported pose, or by one from it; correct if it is not excluded."""
         if not self.lost:
             ratio, variance = self.filter.misfit(bearing, there, seen)
             self._monitors.of(target).test_innovation(ratio, variance, self._test.localised(tick.time))
@@ -262,10 +263,6 @@ class PlanarRobust(PlanarEkf):
             self._remember(tick.time, target, angle, not seen, there)
             if not self.lost:
                 self._test.take_of_robot(tick.time, self.filter.robot(bearing, there, seen))
-
-    def _test_sightings(self, tick: Tick, by: int, sightings: Sightings) -> None:
-        self._monitors.test_sightings(tick, by, sightings)
-        self._inflate_after_exclusion(tick.time)
 
     def _inflate_after_exclusion(self, now: float) -> None:
         """Inflate the covariance if a sender whose reports were fused is excluded now."""
@@ -278,9 +275,8 @@ class PlanarRobust(PlanarEkf):
         self._news = True
         angle -= float(self.filter.state[BIAS]) if own else 0.0
         noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
-        point = (float(there.pose[0]), float(there.pose[1]))
         variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
-        self._history.add(Sighting(time, target, angle, own, point, variance, noise))
+        self._history.add(Sighting(time, target, angle, own, *there.pose[:2].tolist(), variance, noise))
 
     def _unclear(self) -> bool:
         variance = np.diag(self.filter.covariance)
@@ -304,15 +300,13 @@ class PlanarRobust(PlanarEkf):
     def _search(self, now: float) -> None:
         """Search for a pose that agrees with the sightings."""
         self._next_search = now + SEARCH_PERIOD_S
-        state, covariance = self.filter.state, self.filter.covariance
-        information: Array = np.asarray(np.linalg.inv(covariance[:3, :3]), dtype=np.float64)
-        before = PoseInformation(state[:3].copy(), information)
+        covariance = self.filter.covariance
+        before = PoseInformation(self.filter.state[:3].copy(), np.linalg.inv(covariance[:3, :3]))
         for span in SPANS_S:
             lines = self._history.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
             found, contradicted = find_pose(lines, before)
             if found is not None:
-                left = np.asarray(np.linalg.inv(found.information + information), dtype=np.float64)
-                self.filter.set_pose(found.pose, left)
+                self.filter.set_pose(*found)
                 self.lost = False
                 return
         self._failed += contradicted and len(lines.angle) >= ENOUGH

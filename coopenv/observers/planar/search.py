@@ -8,13 +8,12 @@ bearings agree with it, every other pose costs much more, and its covariance is 
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.planar.model import OdometryStep, wrapped
+from coopenv.observers.planar.model import OdometryStep, PlanarPose, wrapped
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
 WINDOW = 10  # bearings
@@ -75,21 +74,20 @@ MOST = 60  # sightings
 LARGEST_ERROR = 0.3  # rad; a sighting whose bearing is less certain by now is of no use
 
 
-@dataclass(frozen=True, slots=True)
-class Sighting:
+class Sighting(NamedTuple):
     """A line from the robot to a point, or the direction from a point to the robot, when it was seen."""
 
     time: float  # s
     target: int
     angle: float  # rad: a bearing from the robot's heading, or a direction in the map
     own: bool  # whether the robot's own camera saw it, so that the angle counts from its heading
-    point: tuple[float, float]  # m, map
+    x: float  # m, of the point, map
+    y: float  # m
     variance: float  # m^2, of the point along an axis
     angle_variance: float  # rad^2
 
 
-@dataclass(frozen=True, slots=True)
-class SightingLines:
+class SightingLines(NamedTuple):
     """m sightings, seen from where the robot is now: offset (m, 2) in m in its body, and so on, all (m,)."""
 
     offset: Array
@@ -128,26 +126,17 @@ class SightingHistory:
     def lines(self, now: float, span: float, scale_variance: float) -> SightingLines:
         """Return the sightings of the last `span` in s; `scale_variance` is that of the odometry's scale of turns."""
         x, y, heading, turn_sum, path_sum = self._trail
-        recent = [(s, at) for s, at in self._seen if now - s.time <= span]
-        kept, trail = [s for s, _ in recent], np.array([at for _, at in recent]).reshape(-1, 5)
-        c, sn = np.cos(heading), np.sin(heading)
+        recent = [(*s, *at) for s, at in self._seen if now - s.time <= span]
+        seen, trail = np.split(np.array(recent, np.float64).reshape(-1, 13), [8], axis=1)
+        _, target, angle, own, _, _, variance, angle_variance = seen.T
         away, turned = trail[:, :2] - (x, y), trail[:, 2] - heading
-        offset = np.column_stack([c * away[:, 0] + sn * away[:, 1], c * away[:, 1] - sn * away[:, 0]])
-        own = np.array([float(s.own) for s in kept])
+        offset = _turned(away, -heading)
         lost = np.abs(turn_sum - trail[:, 3]) + scale_variance * turned**2
-        spread = np.array([s.angle_variance for s in kept]) + own * lost
+        spread = angle_variance + own * lost
         # an error of the present heading also shifts the earlier positions
         drift = np.abs(path_sum - trail[:, 4]) + lost * (offset**2).sum(axis=1) / 3
-        use = spread < LARGEST_ERROR**2
-        return SightingLines(
-            offset[use],
-            (np.array([s.angle for s in kept]) + own * turned)[use],
-            own[use],
-            np.array([s.point for s in kept]).reshape(-1, 2)[use],
-            (np.array([s.variance for s in kept]) + drift)[use],
-            spread[use],
-            np.array([s.target for s in kept])[use],
-        )
+        lines = offset, angle + own * turned, own, seen[:, 4:6], variance + drift, spread, target
+        return SightingLines(*(part[spread < LARGEST_ERROR**2] for part in lines))
 
 
 HEADINGS = 72
@@ -173,17 +162,13 @@ class PoseInformation(NamedTuple):
     information: Array
 
 
-class SearchResult(NamedTuple):
-    """Result of a search."""
+def find_pose(lines: SightingLines, before: PoseInformation) -> tuple[PlanarPose | None, bool]:
+    """Return the pose that agrees with the sightings and with the prior `before`, None if it is unknown or ambiguous.
 
-    found: PoseInformation | None  # the pose, with the information of the sightings alone; None: unknown or ambiguous
-    contradicted: bool = False  # whether no pose fits both the sightings and the prior
-
-
-def find_pose(lines: SightingLines, before: PoseInformation) -> SearchResult:
-    """Return the pose that agrees with the sightings and with the prior `before`."""
+    The second is whether no pose fits both the sightings and the prior.
+    """
     if len(lines.angle) < FEWEST:
-        return SearchResult(None)
+        return None, False
     headings = np.arange(HEADINGS, dtype=np.float64) * (2 * np.pi / HEADINGS) - np.pi
     poses: Array = np.column_stack([_positions(lines, headings, before), headings])
     best = np.argsort(_cost(lines, poses, before))[:REFINED]
@@ -195,17 +180,15 @@ def find_pose(lines: SightingLines, before: PoseInformation) -> SearchResult:
     squares = _squares(lines, poses[first : first + 1])[0]
     agree = squares < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
-        return SearchResult(None, contradicted=True)
+        return None, True
     worse = float(squares[agree].mean())  # than noise, which has 1
-    if worse > WORST or len(np.unique(lines.target[agree])) < FEWEST_TARGETS:
-        return SearchResult(None)
-    if (other & (cost < cost[first] + MARGIN)).any():
-        return SearchResult(None)
+    few = len(np.unique(lines.target[agree])) < FEWEST_TARGETS
     of_sightings = information[first] / GROWTH
     left = np.linalg.inv(of_sightings + before.information)
-    if left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2:
-        return SearchResult(None)
-    return SearchResult(PoseInformation(poses[first], of_sightings / max(SHARED, worse)))
+    unsure = left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2
+    if worse > WORST or few or unsure or (other & (cost < cost[first] + MARGIN)).any():
+        return None, False
+    return PlanarPose(poses[first], np.linalg.inv(of_sightings / max(SHARED, worse) + before.information)), False
 
 
 def _positions(lines: SightingLines, headings: Array, before: PoseInformation) -> Array:
