@@ -166,21 +166,11 @@ class BearingMeasurements(NamedTuple):
     positions: Array  # (m, 3) of the points, as known or reported, map frame, m
     covariances: Array  # (m, 3, 3) of the points, m^2, zero for known points and without a reported covariance
     targets: NDArray[np.int64]  # (m,)
-    messages: tuple[Message | None, ...]  # (m,) None for landmarks
+    messages: NDArray[np.object_]  # (m,) of type Message, None for landmarks
 
-    def only(self, kept: NDArray[np.bool_]) -> "BearingMeasurements":
-        """Return the bearings of a mask (m,)."""
-        messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
-        return BearingMeasurements(
-            self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages
-        )
-
-    def one(self, n: int) -> "BearingMeasurements":
-        """Return the n-th bearing alone."""
-        k = slice(n, n + 1)
-        return BearingMeasurements(
-            self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k]
-        )
+    def only(self, kept: NDArray[np.bool_] | slice) -> Self:
+        """Return the bearings of a mask (m,) or a slice."""
+        return self._make(part[kept] for part in self)
 
 
 class LinearisedBearings(NamedTuple):
@@ -191,9 +181,9 @@ class LinearisedBearings(NamedTuple):
     N: Array  # (m, 2, 2) rad^2, covariance of the residuals given the own pose
     G: Array  # (m, 2, 3) derivative of the measurement by the points, map axes, rad/m
 
-    def only(self, kept: NDArray[np.bool_]) -> "LinearisedBearings":
+    def only(self, kept: NDArray[np.bool_]) -> Self:
         """Return the bearings of a mask (m,)."""
-        return LinearisedBearings(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
+        return self._make(part[kept] for part in self)
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
@@ -217,7 +207,11 @@ def usable_bearings(tick: Tick, weighed: bool = True) -> BearingMeasurements | N
                 covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
     return BearingMeasurements(
-        np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages
+        np.array(bearings, float),
+        np.array(positions, float),
+        covariances,
+        np.array(targets),
+        np.array(messages, dtype=object),
     )
 
 

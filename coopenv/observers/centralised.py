@@ -23,7 +23,7 @@ from coopenv.observers.bearing_measurements import (
     transition,
 )
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, Stacked, halfway
+from coopenv.observers.correction import InnovationGate, gain, joseph
 
 Masks = dict[int, NDArray[np.bool_]]
 """Of the targets of vehicles that saw any."""
@@ -89,19 +89,20 @@ class Centralised:
             i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
             for i, (of, in_front) in linear.items()
         }
-        seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
-        first = _stacked([of.only(kept[i]) for i, (of, _) in linear.items()])
-        if not len(first[0]):
+        residual, H, N = _stacked([of.only(kept[i]) for i, (of, _) in linear.items()])
+        if not len(residual):
             return
-
-        def look(at: Array) -> Stacked:
-            self.poses = moved(before, at)
-            residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
-            return residual, H.dot(recentring(at)), N
-
-        dx, P, _ = halfway(P, first, look)
+        for i, mask in seen.items():
+            seen[i] = mask.copy()
+            seen[i][mask] = kept[i]
+        _, dx, _ = gain(P, H, N, residual)
+        at = 0.5 * dx
+        self.poses = moved(before, at)
+        residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
+        H = H.dot(recentring(at))
+        K, dx, _ = gain(P, H, N, residual + H.dot(at))
         G = recentring(dx)
-        self.poses, self.P = moved(before, dx), G.dot(P).dot(G.T)
+        self.poses, self.P = moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
     def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
@@ -109,7 +110,7 @@ class Centralised:
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
-        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
+        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
         own = linearised(PoseEstimate(LEFT, R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
@@ -146,11 +147,5 @@ def recentring(dx: Array) -> Array:
     return G
 
 
-def _within(mask: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    result = mask.copy()
-    result[mask] = kept
-    return result
-
-
-def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:
+def _stacked(linear: Sequence[LinearisedBearings]) -> tuple[Array, Array, Array]:
     return LinearisedBearings(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()

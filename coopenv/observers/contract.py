@@ -277,8 +277,7 @@ def check_message(message: Message) -> None:
     """Refuse an invalid message with a CoopenvError; of `extra` only the kind of the arrays is checked."""
     _check_pose(message)
     for name, value in message.extra.items():
-        if np.asarray(value).dtype.kind not in "biufc":
-            raise CoopenvError(f"message: extra '{name}' is no array of numbers")
+        _checked_numbers(name, value)
 
 
 def check_received(message: Message, planar: bool = False) -> None:
@@ -299,7 +298,13 @@ def check_received(message: Message, planar: bool = False) -> None:
         if implausible or not (planar or is_definite(P, LEAST_VARIANCE, LARGEST_VARIANCE)):
             raise CoopenvError("message: covariance is not positive definite, or not plausible")
     for name, value in message.extra.items():
-        _check_extra(name, np.asarray(value))
+        numbers = _checked_numbers(name, value)  # a sum of squares is faster, but may overflow
+        if (
+            numbers.dtype.kind in "fc"
+            and not isfinite(abs(np.vdot(numbers, numbers)))
+            and not np.isfinite(numbers).all()
+        ):
+            raise CoopenvError(f"message: extra '{name}' is not finite")
 
 
 def _check_pose(message: Message) -> tuple[Array | None, Array | None, Array | None]:
@@ -312,13 +317,12 @@ def _check_pose(message: Message) -> tuple[Array | None, Array | None, Array | N
     )
 
 
-def _check_extra(name: str, value: NDArray[Any]) -> None:
-    """Refuse an array that does not hold finite numbers; a sum of squares is faster, but may overflow."""
-    kind = value.dtype.kind
-    if kind not in "biufc":
+def _checked_numbers(name: str, value: ArrayLike) -> NDArray[Any]:
+    """Return an array of a message; refuse other kinds than numbers."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufc":
         raise CoopenvError(f"message: extra '{name}' is no array of numbers")
-    if kind in "fc" and not isfinite(abs(np.vdot(value, value))) and not np.isfinite(value).all():
-        raise CoopenvError(f"message: extra '{name}' is not finite")
+    return array
 
 
 def is_definite(P: Array, least: float, largest: float) -> bool:

@@ -55,10 +55,11 @@ from coopenv.observers.bearing_measurements import (
 CLOSE = 1e-3  # rad: largest turn of a line of sight by the last step
 MOST = 8  # steps, and halvings of a step
 
-Stacked = tuple[Array, Array, Array]
-"""Residual (k,), its derivative H (k, n) by the error about the prediction, and its covariance N (k, k)."""
+Look = Callable[[Array], tuple[Array, Array, Array]]
+"""Returns measurements linearised at the prediction moved by an error (n,).
 
-Look = Callable[[Array], Stacked]
+That is the residual (k,), its derivative H (k, n) by the error about the prediction, and its covariance N (k, k).
+"""
 
 
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR)
@@ -93,24 +94,7 @@ def turn_of_sight(dx: Array, distance: float) -> float:
     return float(max(size[0], size[1] / distance))
 
 
-def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
-    """Return (dx, P+, r^T S^-1 r at the prediction) of an update linearised half way.
-
-    Args:
-        P: (n, n) before.
-        first: the measurements linearised at the prediction.
-        look: returns them linearised at the prediction moved by an error (n,), H still by the error about the
-            prediction.
-    """
-    residual, H, N = first
-    _, dx, nis = gain(P, H, N, residual)
-    at = 0.5 * dx
-    residual, H, N = look(at)
-    K, dx, _ = gain(P, H, N, residual + H.dot(at))
-    return dx, joseph(P, K, H, N), nis
-
-
-def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float]:
+def iterated(P: Array, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float]:
     """Return (dx, P+, r^T S^-1 r at the prediction) of an update iterated to convergence.
 
     Steps are halved until the cost x^T P^-1 x + r^T N^-1 r falls. `bend` returns the angle by which an error (n,) turns
@@ -120,7 +104,8 @@ def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float
     def cost(x: Array, residual: Array, N: Array) -> float:
         return float(x.dot(solve(P, x)) + residual.dot(solve(N, residual)))
 
-    at, (residual, H, N) = np.zeros(len(P)), first
+    at = np.zeros(len(P))
+    residual, H, N = look(at)
     K, dx, nis = gain(P, H, N, residual)
     least = cost(at, residual, N)
     for _ in range(MOST):

@@ -112,7 +112,7 @@ class CovarianceIntersection(Mekf):
         if known.any():
             self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.intersect(tick, measured.one(n))
+            self.intersect(tick, measured.only(slice(n, n + 1)))
 
     def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""

@@ -4,7 +4,6 @@ A source of ticks drives a group: the runner on a record, the environment on a w
 """
 
 import copy
-from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -24,7 +23,7 @@ from coopenv.observers.contract import (
     check_estimate,
     check_message,
 )
-from coopenv.observers.mailbox import Interference, Mailbox
+from coopenv.observers.mailbox import Interference, Mailbox, altered
 from coopenv.observers.recording import Sensed
 
 
@@ -67,23 +66,20 @@ class ObserverGroup:
         setups = self.observer_init.setups
         self.mail = Mailbox(self.observer_init)
         self.coordinates: Coordinates | None = None
-        self.observers: list[Observer] = []
+        self.observers: list[Any] = []
         covariances = [P.copy() for P in self.observer_init.start_covariance]
         poses = [(R.copy(), p.copy()) for R, p in zip(rotation, position, strict=True)]
-        if self.joint:
+        for i, of in enumerate([setups] if self.joint else setups):
             try:
-                self.whole: JointObserver = self.factory(setups)
-                self.whole.reset(poses, covariances)
+                observer = self.factory(of)
+                self.observers.append(observer)
+                if self.joint:
+                    observer.reset(poses, covariances)
+                else:
+                    observer.reset(poses[i], covariances[i])
+                    self._post(i, 0, observer.message(), interference, None)
             except ANYTHING as error:
-                raise self._blamed(error, 0) from error
-            return
-        for i, setup in enumerate(setups):
-            try:
-                self.observers.append(self.factory(setup))
-                self.observers[i].reset(poses[i], covariances[i])
-                self._post(i, 0, self.observers[i].message(), interference, None)
-            except ANYTHING as error:
-                raise self._blamed(error, 0, i) from error
+                raise self._blamed(error, 0, None if self.joint else i) from error
 
     def update(
         self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike, interference: Interference | None = None
@@ -130,7 +126,8 @@ class ObserverGroup:
         observer, replay, kept = self.observers[vehicle], 0, 0
         self.mail.expect_as(vehicle, message)
         if interference is not None:
-            message = interference.broadcast(observer, vehicle, message)
+            shift, turn, std = interference.shift[vehicle], interference.turn[vehicle], interference.std[vehicle]
+            message = altered(observer, message, shift, turn, float(std))
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
         if tamper is not None and tamper.applies(vehicle, k * self.observer_init.dt):
             message = tamper.broadcast(observer, message)
@@ -141,7 +138,7 @@ class ObserverGroup:
     def refused(self) -> NDArray[np.int64]:
         """(N,) received messages that were invalid, or that the vehicle's observer could not read."""
         own = [getattr(observer, "ignored_messages", 0) for observer in self.observers]
-        return self.mail.refused + np.array(own or 0, dtype=np.int64)
+        return self.mail.refused + np.array(own, dtype=np.int64)
 
     def update_all(self, sensed: Sensed) -> list[TimedEstimate]:
         """Let a joint observer take a tick of every vehicle."""
@@ -149,8 +146,8 @@ class ObserverGroup:
         try:
             ticks = [sensed.tick(setup, {}) for setup in setups]
             begin = perf_counter()
-            estimates = self.whole.update(ticks)
-            messages: Sequence[Message] = self.whole.messages()
+            estimates = self.observers[0].update(ticks)
+            messages = self.observers[0].messages()
             elapsed = (perf_counter() - begin) / len(setups)
             for i, (estimate, message) in enumerate(zip(estimates, messages, strict=True)):
                 self._check(estimate)
@@ -175,8 +172,7 @@ class ObserverGroup:
         """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""
         if not hasattr(self, "mail"):
             return {}
-        observers = self.whole if self.joint else self.observers
-        state = {"observers": observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
+        state = {"observers": self.observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
         try:
             return copy.deepcopy(state)
         except Exception as error:
@@ -192,9 +188,9 @@ class ObserverGroup:
             if copied == {} and not begun:
                 return {}
             observers, coordinates, mail = (copied[name] for name in ("observers", "coordinates", "mail"))
-            kind, listed = (JointObserver, [observers]) if self.joint else (Observer, observers)
-            fit = isinstance(listed, list) and all(isinstance(observer, kind) for observer in listed)
-            fit = fit and len(listed) == (1 if self.joint else len(self.observer_init.setups))
+            kind, count = (JointObserver, 1) if self.joint else (Observer, len(self.observer_init.setups))
+            fit = isinstance(observers, list) and len(observers) == count
+            fit = fit and all(isinstance(observer, kind) for observer in observers)
             if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             Mailbox(self.observer_init).set_state(mail)
@@ -209,7 +205,4 @@ class ObserverGroup:
             return
         self.coordinates, self.mail = state["coordinates"], Mailbox(self.observer_init)
         self.mail.set_state(state["mail"])
-        if self.joint:
-            self.whole = state["observers"]
-        else:
-            self.observers = state["observers"]
+        self.observers = state["observers"]

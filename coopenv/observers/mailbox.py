@@ -116,17 +116,13 @@ class Mailbox:
     def _receive(self, vehicle: int, sender: int, sent: int, message: Message | None, stamp: int) -> None:
         """Store a message that has reached a vehicle, or refuse it: then the last one stays."""
         lasts = self.received[vehicle]
-        if message is not None and self._fits(vehicle, message):
-            lasts[sender] = LastReceived(sent, message, stamp)
-            return
+        if message is not None:
+            form = np.shape(message.covariance)  # () of a message without one
+            if form in ((), self.forms.get(vehicle, form)):
+                lasts[sender] = LastReceived(sent, message, stamp)
+                return
         self.refused[vehicle] += 1
-        last = lasts.get(sender)
-        lasts[sender] = LastReceived(sent, None, stamp) if last is None else last._replace(sent=sent)
-
-    def _fits(self, vehicle: int, message: Message) -> bool:
-        """Return whether the shape of a message's covariance, if it has one, is the one that the receiver expects."""
-        P, form = message.covariance, self.forms.get(vehicle)
-        return P is None or form is None or P.shape == form
+        lasts[sender] = lasts.get(sender, LastReceived(sent, None, stamp))._replace(sent=sent)
 
     def _valid_copy(self, sender: int, message: Any) -> Message | None:
         """Return a read-only copy of a message; None if it is invalid."""
@@ -178,10 +174,7 @@ def _checked(message: Message | None) -> Message | None:
     if message is None:
         return None
     check_message(message)
-    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
-        if array is not None:
-            sealed(array)
-    return message
+    return _copied(message)
 
 
 def _copied(message: Message) -> Message:
@@ -198,8 +191,8 @@ def _floats(value: Array | None) -> Array | None:
     return sealed(np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64))
 
 
-FIELDS = ("broadcast_shift", "broadcast_turn")
-"""Of the state, at every tick."""
+PER_TICK = ("shift", "turn", "std", "replay", "restarts")
+"""Faults that change from tick to tick."""
 
 
 @dataclass(frozen=True)
@@ -216,13 +209,7 @@ class Interference:
 
     def at(self, k: int) -> "Interference":
         """Return the faults at tick k."""
-        return replace(
-            self, **{name: getattr(self, name)[k] for name in ("shift", "turn", "std", "replay", "restarts")}
-        )
-
-    def broadcast(self, observer: Any, vehicle: int, message: Message) -> Message:
-        """Return the message that a vehicle broadcasts in place of one."""
-        return altered(observer, message, self.shift[vehicle], self.turn[vehicle], float(self.std[vehicle]))
+        return replace(self, **{name: getattr(self, name)[k] for name in PER_TICK})
 
 
 def altered(observer: Any, message: Message, shift: Array, turn: Array | None = None, std: float = 0.0) -> Message:
@@ -253,11 +240,10 @@ def interference_of(
     fault = model.fault.numpy()
     begun = view("lie_tick")[world]
     lies = (begun >= 0) & (k >= begun)
-    shift, turn = (np.array(view(name)[world], dtype=float) for name in FIELDS)
     old = np.where(fault["lie"] == REPLAY, fault["lie_replay"], 0).astype(np.int64)
     return Interference(
-        shift=shift,
-        turn=turn,
+        shift=np.array(view("broadcast_shift")[world], dtype=float),
+        turn=np.array(view("broadcast_turn")[world], dtype=float),
         std=np.where(lies, fault["lie_std"], 0.0),
         replay=np.where(lies, old, 0),
         clock=view("clock")[world].astype(np.int64),
@@ -267,9 +253,7 @@ def interference_of(
 
 
 def stacked(ticks: list[Interference | None]) -> Interference | None:
-    """Return the faults at several ticks as one."""
-    there = [tick for tick in ticks if tick is not None]
-    if not there:
+    """Return the faults of one world at several ticks as one."""
+    if ticks[0] is None:
         return None
-    names = ("shift", "turn", "std", "replay", "restarts")
-    return replace(there[0], **{name: np.stack([getattr(tick, name) for tick in there]) for name in names})
+    return replace(ticks[0], **{name: np.stack([getattr(tick, name) for tick in ticks]) for name in PER_TICK})

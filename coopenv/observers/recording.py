@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -45,8 +46,21 @@ class Truth:
         return np.asarray(np.isfinite(whole).all(axis=(-1, -2)))
 
 
-@dataclass(frozen=True)
-class Sensed:
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """What N vehicles measure of T targets, of which the first L are landmarks; (K, ...) of several ticks."""
+
+    rotation: Array  # (..., N, 3, 3) odometry increments since the last tick
+    translation: Array  # (..., N, 3) m
+    velocity: Array  # (..., N, 3) m/s, last odometry sample
+    angular_velocity: Array  # (..., N, 3) rad/s
+    bearings: Array  # (..., N, T, 3) camera -> target, body frame, NaN where not measured
+    visible: NDArray[np.bool_]  # (..., N, T)
+    landmarks: Array  # (..., L, 3) map, m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensed(Measurements):
     """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it.
 
     Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. What a source
@@ -55,13 +69,6 @@ class Sensed:
 
     index: int  # k
     dt: float  # s, between ticks
-    rotation: Array  # (N, 3, 3) odometry increments since the last tick
-    translation: Array  # (N, 3) m
-    velocity: Array  # (N, 3) m/s, last odometry sample
-    angular_velocity: Array  # (N, 3) rad/s
-    bearings: Array  # (N, T, 3) camera -> target, body frame, NaN where not measured
-    visible: NDArray[np.bool_]  # (N, T)
-    landmarks: Array  # (L, 3) map, m
     due: bool = True  # whether the scenario's observer rate asks for a correction
     pan: Array | None = None  # (N,) rad, by which cameras are turned to the left; None: 0
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
@@ -108,20 +115,13 @@ class Drawn:
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, kw_only=True)
+class Recording(Measurements):
     """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
 
     setups: tuple[Setup, ...]  # (N,) what each vehicle knows before it starts
     order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
     dt: float  # s
-    rotation: Array  # (K, N, 3, 3) odometry increments
-    translation: Array  # (K, N, 3) m
-    velocity: Array  # (K, N, 3) m/s, last odometry sample
-    angular_velocity: Array  # (K, N, 3) rad/s
-    bearings: Array  # (K, N, T, 3) camera -> target, body frame, NaN where not measured
-    visible: NDArray[np.bool_]  # (K, N, T)
-    landmarks: Array  # (K, L, 3) map, m
     inbox_tick: NDArray[np.int64]  # (K, N receiver, N sender) tick of sending of the last received message; -1: none
     period: int  # ticks between messages
     staleness: float  # s
@@ -198,30 +198,30 @@ LARGEST_PAN = 3.15  # rad, after rounding
 LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
 
 
-def _vector(values: Array, fields: Fields, model: Any) -> Mask:
+def _vector(values: Array, others: Fields, model: Any) -> Mask:
     return everywhere(are_numbers(values), -1)
 
 
-def _direction(values: Array, fields: Fields, model: Any) -> Mask:
-    return are_unit_vectors(values) | (everywhere(np.isnan(values), -1) & ~fields["visible"])
+def _direction(values: Array, others: Fields, model: Any) -> Mask:
+    return are_unit_vectors(values) | (everywhere(np.isnan(values), -1) & ~others["visible"])
 
 
-def _sent(values: Array, fields: Fields, model: Any) -> Mask:
-    return np.asarray((values == -1) | ((values >= 0) & (values <= fields["now"]) & (values % fields["period"] == 0)))
+def _sent(values: Array, others: Fields, model: Any) -> Mask:
+    return np.asarray((values == -1) | ((values >= 0) & (values <= others["now"]) & (values % others["period"] == 0)))
 
 
 VECTOR = Rule(f"finite numbers of at most {LARGEST:g}", _vector, axes=1)
-ROTATION = Rule("a rotation", lambda values, fields, model: are_rotations(values), axes=2)
+ROTATION = Rule("a rotation", lambda values, others, model: are_rotations(values), axes=2)
 DIRECTION = Rule("unit vectors, or NaN where nothing is visible", _direction, axes=1)
 COVARIANCE = Rule(
     "a symmetric and positive definite matrix",
-    lambda values, fields, model: are_covariances(values, LEAST_EIGENVALUE),
+    lambda values, others, model: are_covariances(values, LEAST_EIGENVALUE),
     axes=2,
 )
 SENT = Rule("-1, nor a multiple of the message period up to now", _sent)
-FLAG = Rule("true or false", lambda values, fields, model: np.ones(values.shape, dtype=bool))
-AGE = Rule("a number of at least 0", lambda values, fields, model: values >= 0.0)
-ANGLE = Rule(f"within {LARGEST_PAN} rad", lambda values, fields, model: np.abs(values) <= LARGEST_PAN)
+FLAG = Rule("true or false", lambda values, others, model: np.ones(values.shape, dtype=bool))
+AGE = Rule("a number of at least 0", lambda values, others, model: values >= 0.0)
+ANGLE = Rule(f"within {LARGEST_PAN} rad", lambda values, others, model: np.abs(values) <= LARGEST_PAN)
 
 
 class ArraySpec(NamedTuple):
@@ -259,7 +259,7 @@ ARRAYS = {
     "start_covariance": ArraySpec("N66", COVARIANCE),
 }
 """Arrays by name; those of the truth are fields of `Truth`."""
-MEASURED = tuple(ARRAYS)[:7]
+MEASURED = tuple(field.name for field in fields(Measurements))
 """Arrays that every tick has."""
 PER_TICK = (*MEASURED, "inbox_tick")
 """Arrays of a recording that every tick of it has."""
@@ -271,12 +271,6 @@ KINDS_OF_TICKS = {"f": "fiu", "i": "iu", "b": "b"}
 def sizes_of(setups: Sequence[Setup]) -> dict[str, int]:
     """Return the lengths of the axes N, T and L."""
     return {"N": len(setups), "T": len(setups[0].target_names), "L": setups[0].landmarks}
-
-
-def _value_of(source: Any, name: str) -> Any:
-    whole, _, part = name.partition(".")
-    value = getattr(source, whole)
-    return getattr(value, part) if part and value is not None else value
 
 
 def _misshapen(values: Mapping[str, Any], sizes: Mapping[str, int], kinds: Mapping[str, str]) -> Iterator[str]:
@@ -314,7 +308,7 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     if tick.index != index:
         raise CoopenvError(f"tick {index}: index: got {tick.index!r:.40}")
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
-    given = {name: _value_of(tick, name) for name in names}
+    given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
     given = {name: value for name, value in given.items() if value is not None or name in MEASURED}
     for problem in _misshapen(given, sizes_of(observer_init.setups), KINDS_OF_TICKS):
         raise CoopenvError(f"tick {index}: {problem}")
@@ -422,7 +416,7 @@ def _check_radio(r: Recording) -> None:
 
 def _check_arrays(r: Recording) -> None:
     names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
-    values = {name: _value_of(r, name) for name in names}
+    values = {name: attrgetter(name)(r) for name in names}
     for problem in _misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
         raise DataError(problem)
     about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}

@@ -35,7 +35,6 @@ class ZooEntry:
     in_space: bool = True  # whether it is meant for vehicles in space
     on_a_plane: bool = True
     """Whether it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
-    kernels_on_a_plane: bool = True  # whether its kernels are those of the plug-in there
     covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
 
 
@@ -93,7 +92,12 @@ ZOO = {
         "This project's observer for vehicles in space: several hypotheses, gates",
         "robust.observer:ROBUST",
         on_a_plane=False,
-        kernels_on_a_plane=False,
+    ),
+    "robust_joint": ZooEntry(
+        "robust.joint_fusion:robust_joint",
+        "The robust observer with larger, joint messages, for vehicles in space",
+        "robust.joint_fusion:ROBUST_JOINT",
+        on_a_plane=False,
     ),
     "centralised": ZooEntry("centralised:Centralised", "One filter over all vehicles and all measurements"),
 }
@@ -263,7 +267,7 @@ def find_embedded(name: str, planar: bool = False) -> Embedded | None:
     if name not in ZOO:
         return _found(name).embedded
     row = ZOO[name]
-    return _attribute(row.kernels) if row.kernels and (row.kernels_on_a_plane or not planar) else None
+    return _attribute(row.kernels) if row.kernels and (row.on_a_plane or not planar) else None
 
 
 def _attribute(place: str) -> Any:

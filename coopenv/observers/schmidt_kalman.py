@@ -271,4 +271,4 @@ class Pairwise(ConsiderFilter):
         if known.any():
             self.nis, self.nis_dof = self.consider(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.consider(tick, measured.one(n))
+            self.consider(tick, measured.only(slice(n, n + 1)))

@@ -248,7 +248,7 @@ class PlanarRobust(PlanarEkf):
         self._fuse_robot(tick, target, bearing, there, seen=False)
 
     def _broadcast_pose(self) -> PlanarPose:
-        """Return x, y and the heading from which bearings count (the camera's bias taken off), with their covariance."""
+        """Return x, y and the heading from which bearings count (without the camera's bias), with their covariance."""
         pick = np.eye(3, STATES)
         pick[HEADING, BIAS] = -1.0
         return PlanarPose(pick @ self.filter.state, pick @ self.filter.covariance @ pick.T)
