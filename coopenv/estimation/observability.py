@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Annotated, NamedTuple, Self, get_type_hints
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from coopenv.base.files import replacing_file
 from coopenv.base.npz import read_npz
@@ -91,20 +92,22 @@ class Trajectory(RecordedGeometry):
     def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
         known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
-        if known.all():
-            return self
-        constant = ("terms", "vehicles", "targets", "target_moving")
-        return replace(self, **{f.name: getattr(self, f.name)[known] for f in fields(self) if f.name not in constant})
+        return self if known.all() else self._chosen("K", np.flatnonzero(known))
 
     def of_vehicles(self, indices: Sequence[int]) -> Self:
         """Return the record of some vehicles alone; the others stay among the targets."""
-        if [*indices] == [*range(len(self.vehicles))]:
-            return self
-        of_all = ("t", "target_position", "terms", "targets", "target_moving")
-        chosen = {
-            f.name: getattr(self, f.name)[:, [*indices]] for f in fields(self) if f.name not in (*of_all, "vehicles")
-        }
-        return replace(self, vehicles=self.vehicles[[*indices]], **chosen)
+        return self if [*indices] == [*range(len(self.vehicles))] else self._chosen("N", indices)
+
+    def _chosen(self, axis: str, indices: ArrayLike) -> Self:
+        """Return the record at some indices of an axis."""
+        axes = {name: shape.split()[1:] for name, shape in self._shapes().items()}
+        made = {n: np.take(getattr(self, n), indices, of.index(axis)) for n, of in axes.items() if axis in of}
+        return replace(self, **made)
+
+    @classmethod
+    def _shapes(cls) -> dict[str, str]:
+        """Return the annotations of the arrays."""
+        return {name: hint.__metadata__[0] for name, hint in get_type_hints(cls, include_extras=True).items()}
 
     def save(self, path: Path) -> None:
         """Write every array into a compressed `.npz` under its field name.
@@ -122,8 +125,7 @@ class Trajectory(RecordedGeometry):
         Raises:
             DataError: the file is no such record, an array is missing or of another shape, or it is too large.
         """
-        hints = get_type_hints(cls, include_extras=True)
-        return cls(**read_npz(path, "trajectory", {name: hint.__metadata__[0] for name, hint in hints.items()}))
+        return cls(**read_npz(path, "trajectory", cls._shapes()))
 
 
 @dataclass(frozen=True)

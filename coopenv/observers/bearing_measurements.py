@@ -170,7 +170,7 @@ class BearingMeasurements(NamedTuple):
 
     def only(self, kept: NDArray[np.bool_] | slice) -> Self:
         """Return the bearings of a mask (m,) or a slice."""
-        return self._make(part[kept] for part in self)
+        return type(self)(*[part[kept] for part in self])
 
 
 class LinearisedBearings(NamedTuple):
@@ -183,7 +183,7 @@ class LinearisedBearings(NamedTuple):
 
     def only(self, kept: NDArray[np.bool_]) -> Self:
         """Return the bearings of a mask (m,)."""
-        return self._make(part[kept] for part in self)
+        return type(self)(*[part[kept] for part in self])
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""

@@ -179,7 +179,7 @@ class ObserverGroup:
             raise CoopenvError(f"the observers' state cannot be copied: {error_text(error)}") from error
 
     def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
-        """Return a deep copy of what `get_state` of such a group returned, before or after the start of an episode.
+        """Return what `set_state` takes, from what `get_state` of such a group returned before or after a start.
 
         A CoopenvError means that it is of another group. The observers in it are not checked: they can run any code.
         """
@@ -193,16 +193,13 @@ class ObserverGroup:
             fit = fit and all(isinstance(observer, kind) for observer in observers)
             if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
-            Mailbox(self.observer_init).set_state(mail)
+            copied["mail"] = Mailbox(self.observer_init)
+            copied["mail"].set_state(mail)
         except Exception as error:  # of any other value
             raise CoopenvError(f"state: the observers do not fit: {error_text(error)}") from error
         return dict(copied)
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to what `checked_state` returned."""
-        if not state:
-            vars(self).pop("mail", None)
-            return
-        self.coordinates, self.mail = state["coordinates"], Mailbox(self.observer_init)
-        self.mail.set_state(state["mail"])
-        self.observers = state["observers"]
+        vars(self).pop("mail", None)
+        vars(self).update(state)

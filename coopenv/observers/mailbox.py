@@ -174,7 +174,10 @@ def _checked(message: Message | None) -> Message | None:
     if message is None:
         return None
     check_message(message)
-    return _copied(message)
+    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
+        if array is not None:
+            sealed(array)
+    return message
 
 
 def _copied(message: Message) -> Message:

@@ -8,13 +8,14 @@ delayed like those of the world's radio.
 import gc
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coopenv.estimation.metrics import nees as normalised_error
 from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, ObserverInit, SensorNoise, Setup
@@ -163,9 +164,7 @@ def _errors(
     stated = known & np.isfinite(P[..., 0, 0])
     if stated.any():
         e = coordinates.error(R[stated], p[stated], R_hat[stated], p_hat[stated])[..., states]
-        with suppress(np.linalg.LinAlgError):  # some P is singular
-            solved = np.linalg.solve(P[stated][:, states][..., states], e[..., None])[..., 0]
-            nees[stated] = np.einsum("...i,...i", e, solved)
+        nees[stated] = normalised_error(e, P[stated][:, states][..., states])
     return position_error, orientation_error, nees
 
 

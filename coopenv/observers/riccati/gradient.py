@@ -31,6 +31,7 @@ from coopenv.world.world import World
 scalar, vec2, vec3, vec4, mat33, mat66 = (
     getattr(precision("float64"), name) for name in ("scalar", "vec2", "vec3", "vec4", "mat33", "mat66")
 )
+mat23 = wp.types.matrix((2, 3), scalar)
 
 
 @wp.struct
@@ -60,17 +61,6 @@ class PoseBelief:
     rotation: mat33
     position: vec3
     covariance: mat66
-
-
-@wp.struct
-class Information:
-    """M = C^T Q C in blocks and r = C^T Q (y - C_2 phat), summed over the targets in view, (W, N)."""
-
-    M11: wp.array2d(dtype=mat33)
-    M12: wp.array2d(dtype=mat33)
-    M22: wp.array2d(dtype=mat33)
-    r1: wp.array2d(dtype=vec3)
-    r2: wp.array2d(dtype=vec3)
 
 
 def command_kernel(model: Any, action: wp.array2d(dtype=Any), command: wp.array2d(dtype=Any)):
@@ -128,10 +118,20 @@ def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float6
     after[world, vehicle] = PoseBelief(R, p, join6(A, B, wp.transpose(B), D))
 
 
-def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected: Any, vehicle: int, sums: Any):
+def inform_kernel(
+    model: Any,
+    state: Any,
+    truth: Any,
+    predicted: Any,
+    corrected: Any,
+    vehicle: int,
+    M: wp.array2d(dtype=Any),
+    r: wp.array2d(dtype=Any),
+):
     """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
-    `state` holds the same truth, for visibility; leaders have their corrected estimate of this tick already.
+    That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. `state` holds the same truth, for visibility; leaders
+    have their corrected estimate of this tick already.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
@@ -153,25 +153,29 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
         e = a - camera.position - predicted[world, vehicle].position
         o = type(own.rotation)()
         M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], o, o, o, type(e)(), type(e)())
-        wp.atomic_add(sums.M11, world, vehicle, M11)
-        wp.atomic_add(sums.M12, world, vehicle, M12)
-        wp.atomic_add(sums.M22, world, vehicle, M22)
-        wp.atomic_add(sums.r1, world, vehicle, r1)
-        wp.atomic_add(sums.r2, world, vehicle, r2)
+        wp.atomic_add(M, world, vehicle, join6(M11, M12, wp.transpose(M12), M22))
+        wp.atomic_add(r, world, vehicle, wp.matrix_from_rows(r1, r2))
 
 
-def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.float64, turn: wp.array(dtype=scalar)):
+def correct_kernel(
+    predicted: Any,
+    M: wp.array2d(dtype=Any),
+    r: wp.array2d(dtype=Any),
+    after: Any,
+    vehicle: int,
+    dt: wp.float64,
+    turn: wp.array(dtype=scalar),
+):
     """Correct the estimate of one vehicle over one tick."""
     world = wp.tid()
     belief = predicted[world, vehicle]
     R = belief.rotation
     P = belief.covariance
     L11, L21, L22, _, _ = cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
-    M11 = sums.M11[world, vehicle]
-    M12 = sums.M12[world, vehicle]
-    M22 = sums.M22[world, vehicle]
+    m = M[world, vehicle]
+    sums = r[world, vehicle]
     dx1, dx2, A, B, D = correct_kalman(
-        dt, M11, M12, M22, L11, L21, L22, sums.r1[world, vehicle], sums.r2[world, vehicle]
+        dt, block3(m, 0, 0), block3(m, 0, 3), block3(m, 3, 3), L11, L21, L22, sums[0], sums[1]
     )
     wp.atomic_max(turn, 0, wp.length(dx1))
     P_after = join6(A, B, wp.transpose(B), D)
@@ -280,12 +284,6 @@ class DifferentiableWorld:
             array.assign(records)
         return array
 
-    def _record(self, struct: Any) -> Any:
-        record = struct()
-        for name, var in struct.vars.items():
-            setattr(record, name, self._make(var.type.dtype))
-        return record
-
     def _start(self) -> tuple[Any, Any, Any]:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
@@ -323,13 +321,13 @@ class DifferentiableWorld:
         )
         dt = wp.float64(1.0 / rate)
         predicted, after = self._make(PoseBelief), self._make(PoseBelief)
-        sums = self._record(Information)
+        sums = [self._make(mat66), self._make(mat23)]
         self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
         for vehicle in self._order:
-            seen = [world.model, world.state, truth, predicted, after, vehicle, sums]
+            seen = [world.model, world.state, truth, predicted, after, vehicle, *sums]
             self._launch(inform_kernel, seen, dim=(world.worlds, int(counts[vehicle])))
-            self._launch(correct_kernel, [predicted, sums, after, vehicle, dt, turn], dim=world.worlds)
+            self._launch(correct_kernel, [predicted, *sums, after, vehicle, dt, turn], dim=world.worlds)
         return after
 
     def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:
