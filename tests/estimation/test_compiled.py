@@ -80,7 +80,15 @@ def test_without_a_folder_to_write_to_functions_are_compiled_all_the_same(monkey
     assert double(2.0) == 4.0
 
 
-def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path) -> None:
+def output(program: str, **environment: str) -> list[str]:
+    """Return the words that a program prints."""
+    command, merged = [sys.executable, "-c", program], {**os.environ, **environment}
+    done = subprocess.run(command, env=merged, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba looks at the function's own file only."""
     room = tmp_path / "package" / "estimation"
     room.mkdir(parents=True)
@@ -92,16 +100,13 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path) -> None:
         head + "from package.estimation.inner import f\n@compiled(NUMBER)\ndef g(x):\n    return 2.0 * f(x)\n"
     )
     show = "from package.estimation import outer, compiled; print(outer.g(1.0), len(compiled.fresh))"
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(compiled.PACKAGE.parent)])
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    path = os.pathsep.join([str(tmp_path), str(compiled.PACKAGE.parent)])
     said = []
     for limit in (1, None, 100):
         if limit is not None:
             (room / "inner.py").write_text(inner.format(limit))
-        done = subprocess.run(
-            [sys.executable, "-c", show], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-        )
-        said.append(done.stdout.split())
+        said.append(output(show, PYTHONPATH=path))
     assert said == [["4.0", "2"], ["4.0", "0"], ["202.0", "2"]]
     assert len(list((tmp_path / "package" / "__pycache__").glob("compiled-*"))) == 1
 
@@ -109,12 +114,10 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path) -> None:
 def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
     head = "from coopenv.estimation.compiled import NUMBER, compiled\n"
     (tmp_path / "doubled.py").write_text(head + "@compiled(NUMBER)\ndef double(x):\n    return 2.0 * x\n")
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), environment.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     show = "from doubled import double; print(double(2.0))"
     for _ in range(2):
-        done = subprocess.run([sys.executable, "-c", show], env=environment, capture_output=True, text=True, check=True)
-        assert done.stdout.split() == ["4.0"] and done.stderr == ""
+        assert output(show, PYTHONPATH=path, NUMBA_CACHE_DIR=str(tmp_path / "cache")) == ["4.0"]
         kept = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
         assert kept
         for path in kept:
@@ -123,6 +126,4 @@ def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
 
 def test_functions_run_as_python_where_compilation_is_off() -> None:
     show = "from coopenv.observers.bearing_measurements import across; print(across(0.0, 0.0, 1.0)[0])"
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, "-c", show], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["[", "1.", "-0.", "-0.]"]
+    assert output(show, NUMBA_DISABLE_JIT="1") == ["[", "1.", "-0.", "-0.]"]

@@ -12,13 +12,10 @@ from coopenv.estimation.observability import Trajectory, convergence_rates, leas
 from coopenv.runs.rollouts import rollout
 from coopenv.scenario import load_scenario
 from tests.helpers.synthetic import make_trajectory
+from tests.oracles.continuous import skew
 
 YAW_RATE, V, P0 = 0.7, (0.1, 1.0), (1.0, 100.0)
 Q = np.linspace(5.0, 12.0, 8)
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 def matrices(run: Trajectory, vehicle: int, t: float) -> tuple[np.ndarray, np.ndarray]:

@@ -16,31 +16,24 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
 from tests.helpers.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
+from tests.oracles.continuous import skew
 
 YAW_RATE = 0.7
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 def scene(position: np.ndarray, targets: np.ndarray, ticks: int = 61) -> Trajectory:
     """Return one vehicle along `position` (K, 3), or at rest (3,), that sees all fixed `targets` (T, 3)."""
     run = make_trajectory(ticks)
     path = np.broadcast_to(position, (ticks, 3))[:, None]
-    per_vehicle = {
-        field.name: getattr(run, field.name)[:, :1]
-        for field in dataclasses.fields(run)
-        if field.name not in ("t", "terms", "vehicles", "targets", "target_moving", "target_position")
-    }
     seen = np.ones((ticks, 1, len(targets)), bool)
     return dataclasses.replace(
-        run,
-        **per_vehicle
-        | {"position": path, "visible": seen, "sight": np.where(seen, Sight.VISIBLE, 0)}
-        | {"target_position": np.broadcast_to(targets, (ticks, *targets.shape))}
-        | {"vehicles": run.vehicles[:1], "targets": np.array([f"landmark_{i}" for i in range(len(targets))])}
-        | {"target_moving": np.zeros(len(targets), bool)},
+        run.of_vehicles([0]),
+        position=path,
+        visible=seen,
+        sight=np.where(seen, Sight.VISIBLE, 0),
+        target_position=np.broadcast_to(targets, (ticks, *targets.shape)),
+        targets=np.array([f"landmark_{i}" for i in range(len(targets))]),
+        target_moving=np.zeros(len(targets), bool),
     )
 
 
@@ -200,14 +193,10 @@ def test_uneven_ticks_weigh_by_their_duration() -> None:
     even = make_trajectory(ticks=121)
     keep = np.sort(np.random.default_rng(2).permutation(np.arange(1, 120))[:90])
     keep = np.concatenate([[0], keep, [120]])
-    uneven = {
-        f.name: getattr(even, f.name)[keep]
-        for f in dataclasses.fields(even)
-        if f.name not in ("terms", "vehicles", "targets", "target_moving")
-    }
-    window = 2.0
-    result = analyse_observability(dataclasses.replace(even, **uneven), window)
-    expected = analyse_observability(even, window)
+    gaps = even.position.copy()
+    gaps[np.setdiff1d(np.arange(121), keep)] = np.nan
+    uneven = dataclasses.replace(even, position=gaps).where_truth_is_known()
+    result, expected = analyse_observability(uneven, 2.0), analyse_observability(even, 2.0)
     for vehicle in (0, 1, 2):  # whose visibility does not switch in this time
         for name in ("min_eigenvalue", "condition_number", "local_eigenvalue"):
             assert getattr(result, name)[0, vehicle] == pytest.approx(getattr(expected, name)[0, vehicle], rel=1e-3)

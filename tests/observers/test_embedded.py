@@ -17,10 +17,10 @@ from coopenv.backends.replay import Replay
 from coopenv.base.errors import CoopenvError
 from coopenv.observers import find, register, run
 from coopenv.observers.registry import find_embedded
-from coopenv.runs import record
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.state import array
+from tests.helpers.recordings import simulated
 
 
 @wp.struct
@@ -80,7 +80,7 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
     rows.step(rows.action_space.sample())
     rows.engine.set_state(state)
     assert np.array_equal(rows.engine.get_state()["observer_ticks"], state["observer_ticks"])
-    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    recording = simulated()
     replay = Replay(recording, "second", {"observer.name": "toy_counter"})
     engine = Engine(replay.scenario, dtype="float64", backend=replay)
     engine.reset()
@@ -89,7 +89,7 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
 
 
 def test_it_is_compared_with_others() -> None:
-    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    recording = simulated()
     for observer in ("toy_counter", COUNTER):
         result = run(observer, recording)
         assert not result.failure
@@ -101,7 +101,7 @@ def test_it_is_compared_with_others() -> None:
 
 
 def test_a_saved_plug_in_goes_on() -> None:
-    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    recording = simulated()
     observer = find("toy_counter")(recording.setups[0])
     observer.reset((np.eye(3), np.zeros(3)), np.eye(6))
     for k in range(1, 10):

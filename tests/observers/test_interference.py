@@ -19,6 +19,7 @@ from coopenv.observers.contract import Tick, check_received
 from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.world.world import World
 from tests.helpers.builders import simulate
 
 OTHER = "vehicles.vehicle_2.faults"
@@ -46,33 +47,33 @@ def recorded(name: str, seed: int = 3) -> Recording:
 
 
 def in_kernels(made: Scenario, seed: int) -> np.ndarray:
-    """Return (K, N, 3) the positions that the world's own observers believe in, m."""
+    """Return (K, N, 3) the positions that the world's own observers estimate, m."""
     world = simulate(made, 1)
     world.reset([world_keys(seed)[0]])
     world.mask.zero_()
-    positions = []
-    for _ in range(made.horizon_ticks):
+    return positions(world, made.horizon_ticks)
+
+
+def positions(world: World, ticks: int) -> np.ndarray:
+    """Return (K, N, 3) the estimated positions over some ticks, m."""
+    found = []
+    for _ in range(ticks):
         world.advance(1)
         R, p = world.view("estimate_rotation")[0], world.view("estimate_position")[0]
-        positions.append(np.einsum("nij,nj->ni", R, p))
-    return np.array(positions)
+        found.append(np.einsum("nij,nj->ni", R, p))
+    return np.array(found)
 
 
+@pytest.mark.parametrize(
+    ("observer", "atol"),
+    [("riccati", 1e-9), *(pytest.param(name, 1e-6, marks=pytest.mark.slow) for name in ("robust", "robust_joint"))],
+)
 @pytest.mark.parametrize("name", list(FAULTS))
-def test_the_same_observer_meets_the_same_faults_on_the_host(name: str) -> None:
+def test_the_same_observer_meets_the_same_faults_on_the_host(name: str, observer: str, atol: float) -> None:
     """The host's messages, clocks and restarts are code of their own: Python and dictionaries in place of kernels."""
-    found = run("riccati", recorded(name))
+    found = run(observer, recorded(name))
     assert not found.failure
-    assert_allclose(found.position[1:], in_kernels(scene(name), 3), atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(FAULTS))
-def test_robust_meets_the_same_faults_on_the_host(name: str) -> None:
-    found = run("robust", recorded(name))
-    made = scene(name, **{"observer.name": "robust"})
-    assert not found.failure
-    assert_allclose(found.position[1:], in_kernels(made, 3), atol=1e-6)
+    assert_allclose(found.position[1:], in_kernels(scene(name, **{"observer.name": observer}), 3), atol=atol)
 
 
 class Listens(MekfCovariance):
@@ -280,9 +281,4 @@ def test_a_replay_has_the_faults_of_its_world(name: str) -> None:
     """They are drawn again from what the recording says of its seed."""
     world = Replay(recorded(name), "log").world(1, "float64", "cpu", 1)
     world.reset(None)
-    positions = []
-    for _ in range(recorded(name).ticks - 1):
-        world.advance(1)
-        R, p = world.view("estimate_rotation")[0], world.view("estimate_position")[0]
-        positions.append(np.einsum("nij,nj->ni", R, p))
-    assert_allclose(positions, in_kernels(scene(name), 3), atol=1e-9)
+    assert_allclose(positions(world, recorded(name).ticks - 1), in_kernels(scene(name), 3), atol=1e-9)

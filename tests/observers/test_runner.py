@@ -5,7 +5,6 @@ from __future__ import annotations
 import runpy
 import sys
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,15 +30,8 @@ from coopenv.observers import (
 from coopenv.observers.group import ObserverGroup
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.helpers.recordings import simulated as recording
 from tests.oracles.batch import small_errors
-
-
-@cache
-def recording(seed: int = 0, **overrides: Any) -> Recording:
-    return record(
-        load_scenario("busy_intersection", {"horizon": 1.0, **{k.replace("__", "."): v for k, v in overrides.items()}}),
-        seed,
-    )
 
 
 class Probe:

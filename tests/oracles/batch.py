@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -103,3 +104,10 @@ def solve(recording: Recording, vehicles: Sequence[int]) -> tuple[np.ndarray, np
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     last = covariance[-6 * n :, -6 * n :].reshape(n, 6, n, 6)
     return R[-1], p[-1], np.stack([last[c, :, c] for c in range(n)])
+
+
+def assert_same_covariance(found: np.ndarray, expected: np.ndarray, atol: float = 2e-3) -> None:
+    """Compare covariances (..., n, n) in units of the expected standard deviations."""
+    std = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
+    scale = std[..., :, None] * std[..., None, :]
+    assert_allclose(found / scale, expected / scale, atol=atol)

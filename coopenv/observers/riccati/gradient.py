@@ -130,8 +130,8 @@ def inform_kernel(
 ):
     """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
-    That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. `state` holds the same truth, for visibility; leaders
-    have their corrected estimate of this tick already.
+    That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. `state` holds the same truth, for visibility;
+    leaders have their corrected estimate of this tick already.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
