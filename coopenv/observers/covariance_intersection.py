@@ -109,12 +109,9 @@ class CovarianceIntersection(Mekf):
     def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([m is None or m.covariance is None for m in measured.messages])
-        if known.any():
-            self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
-        for n in np.flatnonzero(~known).tolist():
-            self.intersect(tick, measured.only(slice(n, n + 1)))
+        self.correct_in_turn(tick, measured, known)
 
-    def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
+    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
         state, linear = self.state, linearised(self.state, tick, one)
         w = weight(state.P, linear.H[0], linear.N[0], tick.noise.bearing_std**2)
@@ -126,13 +123,6 @@ class CovarianceIntersection(Mekf):
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])
 """Values of w that are tried: fine steps near 1, because small inflations add up at 60 Hz."""
-
-
-@compiled(MATRIX)
-def _det(A: Array) -> float:
-    """Return the determinant of (2, 2)."""
-    result: float = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    return result
 
 
 @compiled(MATRIX)
@@ -159,7 +149,8 @@ def best_split_weight(P_d: Array, P_i: Array, H: Array, N: Array, variance: floa
     best, least = 1.0, log_determinant(P_d + P_i)
     for w in WEIGHTS:
         P_1, P_2 = P_d / w + P_i, R_d / (1.0 - w) + R_i
-        cost = log_determinant(P_1) + np.log(_det(P_2) / _det(congruent(H, P_1) + P_2))
+        S = congruent(H, P_1) + P_2
+        cost = log_determinant(P_1) + np.log(_mixed(P_2, P_2) / _mixed(S, S))
         if cost < least:
             best, least = w, cost
     return best
@@ -192,7 +183,7 @@ class SplitCovarianceIntersection(CovarianceIntersection):
         self.independent = self.state._replace(P=self.independent).predicted(tick).P
         super().predict(tick)
 
-    def intersect(self, tick: Tick, one: BearingMeasurements) -> None:
+    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
         P, P_i, linear = self.state.P, self.independent, linearised(self.state, tick, one)
         w = best_split_weight(P - P_i, P_i, linear.H[0], linear.N[0], tick.noise.bearing_std**2)

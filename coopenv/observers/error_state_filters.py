@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, exp_so3, exp_translation, transformed
 from coopenv.estimation.poses import Array, cholesky, lengths, solve
@@ -101,6 +102,17 @@ class Mekf(PoseObserver):
         """Correct by bearings, which are linearised at the prediction."""
         self.nis = self.fuse(tick, measured)
         self.nis_dof = 2 * len(linear.residual)
+
+    def correct_in_turn(self, tick: Tick, measured: BearingMeasurements, known: NDArray[np.bool_]) -> None:
+        """Correct by the bearings of a mask (m,) at once, then by the others, to neighbours, one at a time."""
+        if known.any():
+            self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
+        for n in np.flatnonzero(~known).tolist():
+            self.fuse_neighbour(tick, measured.only(slice(n, n + 1)))
+
+    def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
+        """Correct by one bearing to a neighbour."""
+        self.fuse(tick, one)
 
     def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""

@@ -57,8 +57,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     camera.focal_std = known.focal_length
     fault = entry_struct(p, "fault")()
     fault.clock = known.clock_offset
-    model.fault = _shared_entry(fault, N)
-    model.camera, model.noise = _shared_entry(camera, N), _shared_entry(noise, N)
+    for name, entry in (("fault", fault), ("camera", camera), ("noise", noise)):
+        setattr(model, name, repeated(wp.array([entry], dtype=struct_of(entry), device="cpu"), 0, N))
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
@@ -71,11 +71,6 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.observer.p1, model.observer.p2 = gains.P0
     model.observer.max_turn = gains.max_turn
     return model
-
-
-def _shared_entry(entry: Any, count: int) -> Any:
-    """Return an array with the same entry for every vehicle."""
-    return repeated(wp.array([entry], dtype=struct_of(entry), device="cpu"), 0, count)
 
 
 PRECISION = "float64"

@@ -396,8 +396,7 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
         value = getattr(gains, name)
         _require(least < value <= LARGEST, f"{where}.gains.{name}: {shown(value)} is not in {least:g} .. {LARGEST:g}")
     for name, count in (("q", len(setup.target_names)), ("V", 2), ("P0", 2)):
-        values = np.asarray(getattr(gains, name))
-        positive = _is_array(values, (count,)) and (values > 0.0).all()
+        positive = _is_array(getattr(gains, name), (count,)) and np.min(getattr(gains, name)) > 0.0
         _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
 
 

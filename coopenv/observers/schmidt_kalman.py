@@ -132,7 +132,7 @@ class ConsiderFilter(Mekf):
         cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
         self.neighbours[target] = ConsideredNeighbour(now, message.rotation, message.covariance, cross)
 
-    def consider(self, tick: Tick, measured: BearingMeasurements, between: Array | None = None) -> float:
+    def fuse(self, tick: Tick, measured: BearingMeasurements, between: Array | None = None) -> float:
         """Correct by bearings to landmarks and to neighbours that are known; return the squared innovation.
 
         `between` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the bearings.
@@ -247,7 +247,7 @@ class SchmidtKalman(ConsiderFilter):
         for n, (target, message) in enumerate(seen):
             for m, (other, its) in enumerate(seen[:n]):
                 between[n, m] = sent_cross_covariance(message, other) + sent_cross_covariance(its, target).T
-        self.nis, self.nis_dof = self.consider(tick, measured, between), 2 * len(measured.targets)
+        self.nis, self.nis_dof = self.fuse(tick, measured, between), 2 * len(measured.targets)
 
 
 def sent_cross_covariance(message: Message, target: int) -> Array:
@@ -268,7 +268,4 @@ class Pairwise(ConsiderFilter):
     def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
-        if known.any():
-            self.nis, self.nis_dof = self.consider(tick, measured.only(known)), 2 * int(known.sum())
-        for n in np.flatnonzero(~known).tolist():
-            self.consider(tick, measured.only(slice(n, n + 1)))
+        self.correct_in_turn(tick, measured, known)

@@ -79,15 +79,6 @@ def test_a_rigid_motion_in_float32_follows_float64() -> None:
     assert_allclose(single, double, atol=1e-6)
 
 
-@given(rotation_vectors, vectors)
-@settings(max_examples=100, deadline=None)
-def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray) -> None:
-    turn, way = call(linalg.rigid_motion, "float64", w[None], u[None])
-    half_turn, half_way = call(linalg.rigid_motion, "float64", w[None] / 2, u[None] / 2)
-    assert_allclose(half_turn[0] @ half_turn[0], turn[0], atol=1e-13)
-    assert_allclose(half_way[0] + half_turn[0] @ half_way[0], way[0], atol=1e-13)
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
 def test_angle_is_accurate_everywhere(dtype: str, tolerance: float) -> None:
     w, angle = turns(ANGLES)

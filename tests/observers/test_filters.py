@@ -266,7 +266,7 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
         N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
         return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
 
-    fused.intersect(heard, BearingMeasurements(b, z, C[None], np.array([3]), (None,)))
+    fused.fuse_neighbour(heard, BearingMeasurements(b, z, C[None], np.array([3]), (None,)))
     best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
     assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
     assert best < np.linalg.slogdet(P)[1] - 0.05

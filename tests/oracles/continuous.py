@@ -152,7 +152,6 @@ class Result:
     P: Array  # (T, N, 6, 6)
     position_error: Array  # (T, N, 3) m, inertial: true position - R_hat p_hat
     angle_error_deg: Array  # (T, N)
-    evaluations: int
 
     def settle_times(self, position: float = 0.1, angle_deg: float = 1.0) -> Array:
         """Return per vehicle the first sample from which both errors stay below the bounds; NaN if none."""
@@ -248,7 +247,6 @@ def solve(
         P=state[..., 12:].reshape(-1, n, 6, 6),
         position_error=position - np.einsum("tnij,tnj->tni", R_hat, p_hat),
         angle_error_deg=angle_between_deg(R_hat, R),
-        evaluations=int(solution.nfev),
     )
 
 

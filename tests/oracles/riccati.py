@@ -32,7 +32,7 @@ class Riccati:
             seen = tick.usable()
             bearings, positions = [s[1] for s in seen], [s[2] for s in seen]
             q, k, most = self.gains.q[np.array([s[0] for s in seen], int)], self.gains.k, self.gains.max_turn
-            x, _ = splitting.correct(x, bearings, positions, q, k, self.since, tick.lever_arm, most)
+            x = splitting.correct(x, bearings, positions, q, k, self.since, tick.lever_arm, most)
             self.since = 0.0
         self.state = x
         return Estimate(x.R, x.position, (x.P + x.P.T) / 2, Coordinates.RICCATI)

@@ -103,29 +103,28 @@ def correct(
     h: float,
     lever_arm: ArrayLike = (0.0, 0.0, 0.0),
     theta_max: float = THETA_MAX,
-    max_substeps: int = MAX_SUBSTEPS,
-) -> tuple[Estimate, int]:
-    """Correct over h with bearings (m, 3) to targets at inertial `positions` (m, 3); count the sub-steps too.
+) -> Estimate:
+    """Correct over h with bearings (m, 3) to targets at inertial `positions` (m, 3).
 
     The last allowed sub-step takes all that remains, however far it turns.
     """
     bearings, positions = np.reshape(bearings, (-1, 3)), np.reshape(positions, (-1, 3))
     weights = np.broadcast_to(np.asarray(q, float), (len(bearings),))
     if not len(bearings):
-        return x, 0
+        return x
     lever = np.asarray(lever_arm, float)
     remaining, substeps = h, 0
     while remaining > 0.0:
         flow = frozen_flow(x.P, *information(x, bearings, positions, weights, lever), k)
         step, substeps = remaining, substeps + 1
         dx = flow.dx(step)
-        if substeps < max_substeps:
+        if substeps < MAX_SUBSTEPS:
             while (turn := float(np.linalg.norm(dx[:3]))) > theta_max:
                 step *= float(np.clip(0.9 * theta_max / turn, 0.1, 0.9))
                 dx = flow.dx(step)
         x = Estimate(x.R @ exponential(dx[:3]), x.p + dx[3:], flow.covariance(step))
         remaining = 0.0 if step == remaining else remaining - step
-    return x, substeps
+    return x
 
 
 def tick(
@@ -138,58 +137,33 @@ def tick(
     k: float,
     q: ArrayLike,
     V: ArrayLike,
-    lever_arm: ArrayLike = (0.0, 0.0, 0.0),
-    theta_max: float = THETA_MAX,
-    max_substeps: int = MAX_SUBSTEPS,
-) -> tuple[Estimate, int]:
+    lever_arm: ArrayLike,
+) -> Estimate:
     """Predict over dt to the time of the camera frame, then correct with it for as long."""
-    predicted = predict(x, omega, v, V, dt)
-    return correct(predicted, bearings, positions, q, k, dt, lever_arm, theta_max, max_substeps)
+    return correct(predict(x, omega, v, V, dt), bearings, positions, q, k, dt, lever_arm)
 
 
-def run(
-    scenario: Scenario,
-    horizon: float,
-    rate: float,
-    message_delay: int = 0,
-    theta_max: float = THETA_MAX,
-    max_substeps: int = MAX_SUBSTEPS,
-) -> Result:
+def run(scenario: Scenario, horizon: float, rate: float) -> Result:
     """Run the scenario at a camera rate, sampled at every tick (t = 0 included).
 
-    `message_delay` 0: a vehicle uses what its neighbours estimated in this very tick (lower numbers first);
-    d > 0: what they estimated d ticks ago.
+    A vehicle uses what its neighbours estimated in this very tick (lower numbers first).
     """
     n, dt = scenario.num_vehicles, 1.0 / rate
     steps = round(horizon * rate)
     x = [initial_estimate(scenario.R_hat[i], scenario.position_hat[i], scenario.P0) for i in range(n)]
     history: list[Sequence[Estimate]] = [tuple(x)]
-    evaluations = 0
     for s in range(1, steps + 1):
         landmarks = scenario.landmark_positions(s * dt)
-        sent = x if message_delay == 0 else history[max(0, s - message_delay)]
         for i, neighbours in enumerate(scenario.neighbours):
-            positions = [landmarks[j] if j < len(landmarks) else sent[j - len(landmarks)].position for j in neighbours]
-            x[i], substeps = tick(
-                x[i],
-                scenario.angular_velocity[i],
-                scenario.velocity[i],
-                scenario.bearings(s * dt, i),
-                positions,
-                dt,
-                scenario.k,
-                scenario.q,
-                scenario.V,
-                scenario.lever_arm[i],
-                theta_max,
-                max_substeps,
-            )
-            evaluations += substeps
+            omega, v, lever_arm = scenario.angular_velocity[i], scenario.velocity[i], scenario.lever_arm[i]
+            positions = [landmarks[j] if j < len(landmarks) else x[j - len(landmarks)].position for j in neighbours]
+            gains = scenario.k, scenario.q, scenario.V
+            x[i] = tick(x[i], omega, v, scenario.bearings(s * dt, i), positions, dt, *gains, lever_arm)
         history.append(tuple(x))
-    return _result(scenario, np.arange(steps + 1, dtype=np.float64) * dt, history, evaluations)
+    return _result(scenario, np.arange(steps + 1, dtype=np.float64) * dt, history)
 
 
-def _result(scenario: Scenario, t: Array, history: Sequence[Sequence[Estimate]], evaluations: int) -> Result:
+def _result(scenario: Scenario, t: Array, history: Sequence[Sequence[Estimate]]) -> Result:
     truth = [scenario.pose(float(s)) for s in t]
     R = np.array([r for r, _ in truth])
     R_hat = np.array([[e.R for e in row] for row in history])
@@ -201,5 +175,4 @@ def _result(scenario: Scenario, t: Array, history: Sequence[Sequence[Estimate]],
         P=np.array([[e.P for e in row] for row in history]),
         position_error=np.array([p for _, p in truth]) - estimated,
         angle_error_deg=angle_between_deg(R_hat, R),
-        evaluations=evaluations,
     )

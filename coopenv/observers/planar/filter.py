@@ -323,10 +323,7 @@ class Mixture:
     def set_pose(self, pose: Array, covariance: Array) -> None:
         """Set the pose (3,) and its covariance (3, 3); the calibration stays."""
         if len(self.filters) > 1:
-            mean, joint = self._moments()
-            one = self.filters[int(np.argmax(self._weights))]
-            one.state, one.covariance = mean, joint
-            self._keep([one], np.ones(1))
+            self._join([*range(len(self.filters))])
         self._known = None
         self.filters[0].set_pose(pose, covariance)
 
@@ -396,17 +393,16 @@ class Mixture:
                 joint = one.covariance[:3, :3] + other.covariance[:3, :3]
                 if float(off @ np.linalg.solve(joint, off)) < SAME:
                     one.state[HEADING] += turns
-                    self._join(i, j)
+                    self._join([i, j])
                     return
 
-    def _join(self, i: int, j: int) -> None:
-        pair = [i, j]
-        weights = self._weights[pair] / self._weights[pair].sum()
-        kept = self.filters[pair[int(np.argmax(weights))]]
-        kept.state, kept.covariance = _moments(weights, [self.filters[k] for k in pair])
-        self._weights[j] += self._weights[i]
-        self.filters[j] = kept
-        self._keep([one for k, one in enumerate(self.filters) if k != i], np.delete(self._weights, i))
+    def _join(self, chosen: list[int]) -> None:
+        """Merge filters into the likeliest of them, in the place of the last."""
+        weights, gone = self._weights[chosen], chosen[:-1]
+        kept = self.filters[chosen[int(np.argmax(weights))]]
+        kept.state, kept.covariance = _moments(weights / weights.sum(), [self.filters[k] for k in chosen])
+        self.filters[chosen[-1]], self._weights[chosen[-1]] = kept, weights.sum()
+        self._keep([one for k, one in enumerate(self.filters) if k not in gone], np.delete(self._weights, gone))
 
     def _moments(self) -> tuple[Array, Array]:
         if self._known is None:

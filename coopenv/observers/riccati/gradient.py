@@ -11,6 +11,7 @@ does not differentiate through variables that a dynamic loop changes.
 import math
 import warnings
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -339,16 +340,10 @@ class DifferentiableWorld:
 def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[float, bool]]:
     """Return the intervals between the events of a camera tick: (duration s, an odometry sample ends it)."""
     now, end = (tick - 1) / camera, tick / camera
-    first = math.floor(now * odometry + 1e-9) + 1  # the sample at t = 0 is the start speed
-    intervals = []
-    sample = first
-    while sample / odometry <= end + 1e-9:
-        intervals.append((sample / odometry - now, True))
-        now = sample / odometry
-        sample += 1
-    if end - now > 1e-12:
-        intervals.append((end - now, False))
-    return intervals
+    first, last = (math.floor(t * odometry + 1e-9) for t in (now, end))  # the sample at t = 0 is the start speed
+    times = [now, *(sample / odometry for sample in range(first + 1, last + 1))]
+    intervals = [(after - before, True) for before, after in pairwise(times)]
+    return [*intervals, (end - times[-1], False)] if end - times[-1] > 1e-12 else intervals
 
 
 def check_differentiable(scenario: Scenario) -> None:

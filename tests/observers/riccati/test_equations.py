@@ -115,16 +115,6 @@ def test_information_is_c_transposed_q_c(seed: int, q: float) -> None:
         assert_allclose(np.concatenate([r1[i], r2[i]]), q * C.T @ innovation, atol=1e-12 * q * 100)
 
 
-def test_information_does_not_know_the_sign_of_a_bearing() -> None:
-    a, b, e = view(0)
-    for plus, minus in zip(
-        call(information, "float64", a, b, e, [7.0] * 4),
-        call(information, "float64", a, -b, e, [7.0] * 4),
-        strict=True,
-    ):
-        assert_allclose(minus, plus, atol=1e-12)
-
-
 def test_prediction_solves_the_lyapunov_equation() -> None:
     """dP/dt = A P + P A^T + V with A = blkdiag(-S(omega), -S(omega)), by an ODE solver."""
     P0, omega, h = covariance(1), np.array([0.4, -0.8, 1.3]), 0.37

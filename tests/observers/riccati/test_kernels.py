@@ -79,7 +79,7 @@ def test_gains_per_vehicle_and_per_target() -> None:
     for i, targets in enumerate(described.neighbours):
         x = splitting.initial_estimate(described.R_hat[i], described.position_hat[i], described.P0)
         known = np.concatenate([described.landmark_positions(1 / 60), *(p[None] for p in positions)])
-        x, _ = splitting.tick(
+        x = splitting.tick(
             x,
             described.angular_velocity[i],
             described.velocity[i],
@@ -182,7 +182,7 @@ def test_slow_observer_corrects_at_its_own_rate_for_as_long() -> None:
     )
     landmarks = states[0]["position"][0, :4]
     bearings = (landmarks - position) / np.linalg.norm(landmarks - position, axis=1, keepdims=True)
-    x, _ = splitting.correct(x, bearings, landmarks, 10.0, 1.0, 3 / 60)
+    x = splitting.correct(x, bearings, landmarks, 10.0, 1.0, 3 / 60)
     assert_allclose(states[3]["covariance"][0, 0], x.P, atol=1e-9)
     assert_allclose(states[3]["estimate_rotation"][0, 0], x.R, atol=1e-9)
 
