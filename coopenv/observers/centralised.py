@@ -39,7 +39,6 @@ class Centralised:
 
     def __init__(self, setups: Sequence[Setup]) -> None:
         """Take the setups of all."""
-        self.gates = [InnovationGate() for _ in setups]
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
 
@@ -50,8 +49,7 @@ class Centralised:
         for i, covariance in enumerate(initial_covariances):
             self.P[self.block(i), self.block(i)] = covariance
         self.sent = [Message() for _ in self.poses]
-        for gate in self.gates:
-            gate.reset()
+        self.gates = [InnovationGate() for _ in self.poses]
 
     @staticmethod
     def block(i: int) -> slice:

@@ -137,10 +137,6 @@ class InnovationGate:
     """Innovation gate of one vehicle."""
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin anew."""
         self.share = 0.0  # of rejected bearings, averaged
         self.is_open = False
         self.time = 0.0  # s, of the last frame

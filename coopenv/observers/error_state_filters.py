@@ -60,14 +60,10 @@ class Mekf(PoseObserver):
     sends_covariance = False
     gated = True  # else every bearing is used
 
-    def __init__(self, setup: Setup) -> None:
-        super().__init__(setup)
-        self.gate = InnovationGate()
-
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
-        self.gate.reset()
+        self.gate = InnovationGate()
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""

@@ -44,7 +44,6 @@ class FactorGraph(PoseObserver):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self.gate = InnovationGate()
         self.lever_arm, self.noise = setup.lever_arm, setup.noise
         self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
         self.to_body = adjoint(np.eye(3), setup.lever_arm)
@@ -52,7 +51,7 @@ class FactorGraph(PoseObserver):
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
-        self.gate.reset()
+        self.gate = InnovationGate()
         self.time = 0.0
         self.keys = 0
         self.restart()

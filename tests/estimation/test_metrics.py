@@ -60,21 +60,6 @@ def test_roll_pitch_yaw_agrees_with_scipy(seed: int) -> None:
     assert_allclose(poses.roll_pitch_yaw_deg(R.as_matrix()), R.as_euler("xyz", degrees=True), atol=1e-9)
 
 
-def test_error_coordinates_to_first_order() -> None:
-    """A small turn theta and shift delta of the estimate, in the body frame, are (2 lambda, p - phat)."""
-    rng = np.random.default_rng(3)
-    R = Rotation.random(None, np.random.default_rng(3)).as_matrix()
-    position, theta, delta = (
-        rng.standard_normal(3),
-        1e-6 * rng.standard_normal(3),
-        1e-6 * rng.standard_normal(3),
-    )
-    R_hat = R @ Rotation.from_rotvec(theta).as_matrix().T  # Rtilde = Exp(theta)
-    position_estimate = R_hat @ (R.T @ position - delta)
-    error = poses.Coordinates.RICCATI.error(R, position, R_hat, position_estimate)
-    assert_allclose(error, np.concatenate([theta, delta]), atol=1e-12)
-
-
 def test_synthetic_errors_and_nees_are_recovered() -> None:
     run = make_trajectory(ticks=200, noise=0.02, yaw_rate=0.4)
     distance = np.linalg.norm(run.position - run.position_estimate, axis=-1)
@@ -239,6 +224,7 @@ def test_windows_beyond_the_end_do_not_count() -> None:
 def test_summary_of_the_synthetic_run() -> None:
     rows = metrics.summarise(make_trajectory(), steady_from=40.0)
     assert [row["vehicle"] for row in rows] == [f"vehicle_{i}" for i in range(1, 6)]
+    assert all(isinstance(value, str | float | bool | None) for row in rows for value in row.values())
     for row, initial, rate in zip(rows, np.linalg.norm(INITIAL_ERROR, axis=-1), RATE, strict=True):
         assert row["initial_position_error_m"] == pytest.approx(initial)
         assert row["initial_orientation_error_deg"] == pytest.approx(90.0)
@@ -254,11 +240,3 @@ def test_summary_of_the_synthetic_run() -> None:
 def test_mirror_is_told_by_the_end_of_the_run() -> None:
     errors = np.array([[179.0, 10.0, 0.0], [2.0, 178.0, 149.0]])
     assert metrics.mirrored(errors).tolist() == [False, True, False]
-
-
-def test_the_summary_is_plain_python() -> None:
-    assert all(
-        isinstance(v, str | float | bool | None)
-        for row in metrics.summarise(make_trajectory(60), 9.0)
-        for v in row.values()
-    )

@@ -1,9 +1,8 @@
 """Camera and occlusion geometry: pinhole field of view, plumb_bob distortion, segment against oriented box.
 
 The occlusion test asks how far inside a box a segment comes: the depth of a point is the smallest of its
-six signed distances to the faces (positive inside), concave along the segment, and its maximum is found
-either as a linear programme (`depth_by_linear_programme`) or by enumerating the breakpoints
-(`depth_by_enumeration`). The segment passes through the open box when that depth is positive; its size
+six signed distances to the faces (positive inside), concave along the segment, and its maximum is found by
+enumerating the breakpoints. The segment passes through the open box when that depth is positive; its size
 says how far the case is from grazing.
 """
 
@@ -13,7 +12,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linprog
 
 Array = NDArray[np.float64]
 
@@ -65,15 +63,6 @@ def in_field_of_view(
     return (uv >= 0.0).all(axis=-1) & (uv[..., 0] < width) & (uv[..., 1] < height)
 
 
-def in_field_of_view_by_planes(
-    point: ArrayLike, fx: float, fy: float, cx: float, cy: float, width: float, height: float
-) -> NDArray[np.bool_]:
-    """Do the same without distortion and without dividing: inside the four planes of the view pyramid."""
-    x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
-    sides = (fx * x + cx * z >= 0.0) & (fx * x + (cx - width) * z < 0.0)
-    return (z > 0.0) & sides & (fy * y + cy * z >= 0.0) & (fy * y + (cy - height) * z < 0.0)
-
-
 def in_range(point: ArrayLike, minimum: float = 0.0, maximum: float = np.inf) -> NDArray[np.bool_]:
     """Tell which camera-relative points (..., 3) are at a distance in [minimum, maximum]."""
     distance = np.linalg.norm(np.asarray(point, float), axis=-1)
@@ -104,37 +93,13 @@ def undistort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike, iterations: int 
     return guess
 
 
-def _segment_in_box(start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike) -> tuple[Array, Array]:
-    """Return both ends of the segment in the box frame; `R` maps box axes to inertial axes."""
-    centre, R = np.asarray(centre, float), np.asarray(R, float)
-    a = np.einsum("...ji,...j->...i", R, np.asarray(start, float) - centre)
-    b = np.einsum("...ji,...j->...i", R, np.asarray(end, float) - centre)
-    return a, b
-
-
-def depth_by_linear_programme(
-    start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike, half_extents: ArrayLike
-) -> float:
-    """Return the depth of one segment in one box: max t such that some point keeps t to all six faces."""
-    a, b = _segment_in_box(start, end, centre, R)
-    half = np.asarray(half_extents, float)
-    rows = np.vstack([np.eye(3), -np.eye(3)])
-    # n.(a + s (b - a)) + t <= half, 0 <= s <= 1
-    upper = np.column_stack([rows @ (b - a), np.ones(6)])
-    limit = np.tile(half, 2) - rows @ a
-    solution = linprog([0.0, -1.0], A_ub=upper, b_ub=limit, bounds=[(0.0, 1.0), (None, None)])
-    if not solution.success:
-        raise RuntimeError(solution.message)
-    return float(solution.x[1])
-
-
 def depth_by_enumeration(
     start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike, half_extents: ArrayLike
 ) -> Array:
     """Return the depth of segments in boxes, over leading axes: the best breakpoint of the six lines."""
-    a, b = _segment_in_box(start, end, centre, R)
-    half = np.asarray(half_extents, float)
-    a, b, half = np.broadcast_arrays(a, b, half)
+    centre, R = np.asarray(centre, float), np.asarray(R, float)  # box axes to inertial axes
+    ends = (np.einsum("...ji,...j->...i", R, np.asarray(point, float) - centre) for point in (start, end))
+    a, b, half = np.broadcast_arrays(*ends, np.asarray(half_extents, float))
     at_start = np.concatenate([half - a, half + a], axis=-1)  # signed distances to the six faces
     slope = np.concatenate([a - b, b - a], axis=-1)
     candidates = [np.zeros(a.shape[:-1]), np.ones(a.shape[:-1])]
