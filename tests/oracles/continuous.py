@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -25,12 +26,6 @@ def skew(x: ArrayLike) -> Array:
     S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = x[..., 0], x[..., 1], x[..., 2]
     S[..., 1, 2], S[..., 2, 0], S[..., 0, 1] = -x[..., 0], -x[..., 1], -x[..., 2]
     return S
-
-
-def quaternion_matrix(scalar: float, vector: ArrayLike) -> Array:
-    """Return the rotation matrix of a unit quaternion by the paper's Rodrigues formula."""
-    S = skew(vector)
-    return np.eye(3) + 2.0 * S @ (scalar * np.eye(3) + S)
 
 
 def exponential(theta: ArrayLike) -> Array:
@@ -58,16 +53,8 @@ def left_jacobian(theta: ArrayLike) -> Array:
 def angle_between_deg(R_hat: ArrayLike, R: ArrayLike) -> Array:
     """Return the geodesic angle between rotations (..., 3, 3) in degrees, accurate near 0 and near 180."""
     relative = np.swapaxes(np.asarray(R_hat, float), -1, -2) @ np.asarray(R, float)
-    twice_sine = np.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    twice_cosine = np.trace(relative, axis1=-2, axis2=-1) - 1.0
-    return np.degrees(np.arctan2(np.linalg.norm(twice_sine, axis=-1), twice_cosine))
+    angles = Rotation.from_matrix(relative.reshape(-1, 3, 3)).magnitude()
+    return np.degrees(angles).reshape(relative.shape[:-2])
 
 
 @dataclass(frozen=True)
@@ -131,7 +118,7 @@ class Scenario:
 
 def busy_intersection(mirror: bool = False) -> Scenario:
     """Return the paper's five-vehicle simulation; `mirror` takes the initial rotation the other way round."""
-    turn = quaternion_matrix(np.sqrt(0.5), (0.0, 0.0, np.sqrt(0.5)))
+    turn = exponential([0.0, 0.0, np.pi / 2])
     return Scenario(
         landmarks=np.array([[-4.0, 5.0, 3.0], [4.0, 4.0, 5.0], [4.0, -3.0, 4.0]]),
         neighbours=((0, 1, 2), (1, 2, 3), (1, 2, 4), (2, 4, 5), (3, 4, 6)),

@@ -31,13 +31,6 @@ def point_in_camera(
     return (in_body - np.asarray(lever_arm, float)) @ np.asarray(optical_to_body, float)
 
 
-def bearing(target: ArrayLike, R: ArrayLike, position: ArrayLike, lever_arm: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-    """Return the body-frame unit vectors from the camera to inertial points (..., 3)."""
-    d = (np.asarray(target, float) - np.asarray(position, float)) @ np.asarray(R, float)
-    d = d - np.asarray(lever_arm, float)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
 def project(point: ArrayLike, fx: float, fy: float, cx: float, cy: float, distortion: ArrayLike = ()) -> Array:
     """Return the pixels (..., 2) of optical-frame points (..., 3); NaN for points that are not in front."""
     point = np.asarray(point, float)
@@ -63,12 +56,6 @@ def in_field_of_view(
     return (uv >= 0.0).all(axis=-1) & (uv[..., 0] < width) & (uv[..., 1] < height)
 
 
-def in_range(point: ArrayLike, minimum: float = 0.0, maximum: float = np.inf) -> NDArray[np.bool_]:
-    """Tell which camera-relative points (..., 3) are at a distance in [minimum, maximum]."""
-    distance = np.linalg.norm(np.asarray(point, float), axis=-1)
-    return (distance >= minimum) & (distance <= maximum)
-
-
 def distort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike) -> Array:
     """Apply the plumb_bob model (k1, k2, p1, p2, k3) to normalised image points (..., 2)."""
     k1, k2, p1, p2, k3 = np.resize(np.append(np.asarray(coefficients, float), np.zeros(5)), 5)
@@ -78,19 +65,6 @@ def distort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike) -> Array:
     x_distorted = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     y_distorted = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     return np.stack([x_distorted, y_distorted], axis=-1)
-
-
-def undistort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike, iterations: int = 50) -> Array:
-    """Invert `distort_plumb_bob` by Newton's method with a difference quotient for the Jacobian."""
-    target = np.asarray(xy, float)
-    guess, step = target.copy(), 1e-6
-    for _ in range(iterations):
-        residual = distort_plumb_bob(guess, coefficients) - target
-        ahead = [distort_plumb_bob(guess + e, coefficients) for e in step * np.eye(2)]
-        behind = [distort_plumb_bob(guess - e, coefficients) for e in step * np.eye(2)]
-        jacobian = (np.stack(ahead, axis=-1) - np.stack(behind, axis=-1)) / (2.0 * step)
-        guess = guess - np.linalg.solve(jacobian, residual[..., None])[..., 0]
-    return guess
 
 
 def depth_by_enumeration(

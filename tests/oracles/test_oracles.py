@@ -77,14 +77,7 @@ def test_camera_axes() -> None:
     np.testing.assert_allclose(seen, [0.1, -0.3, 1.7], atol=1e-12)
 
 
-def test_range() -> None:
-    assert geometry.in_range([[0, 0, 1], [0, 3, 4], [0, 6, 8]], 2.0, 5.0).tolist() == [False, True, False]
-
-
-def test_distortion_and_back() -> None:
-    xy = np.random.default_rng(1).uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.7]
-    distorted = geometry.distort_plumb_bob(xy, PLUMB_BOB)
-    np.testing.assert_allclose(geometry.undistort_plumb_bob(distorted, PLUMB_BOB), xy, atol=1e-10)
+def test_distortion() -> None:
     # by hand at (0.5, 0): r2 = 0.25, radial = 0.9206066875
     np.testing.assert_allclose(
         geometry.distort_plumb_bob([0.5, 0.0], PLUMB_BOB),
