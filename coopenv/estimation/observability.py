@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Annotated, NamedTuple, Self, get_type_hints
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from coopenv.base.files import replacing_file
 from coopenv.base.npz import read_npz
@@ -98,7 +98,7 @@ class Trajectory(RecordedGeometry):
         """Return the record of some vehicles alone; the others stay among the targets."""
         return self if [*indices] == [*range(len(self.vehicles))] else self._chosen("N", indices)
 
-    def _chosen(self, axis: str, indices: ArrayLike) -> Self:
+    def _chosen(self, axis: str, indices: Sequence[int] | NDArray[np.int64]) -> Self:
         """Return the record at some indices of an axis."""
         axes = {name: shape.split()[1:] for name, shape in self._shapes().items()}
         made = {n: np.take(getattr(self, n), indices, of.index(axis)) for n, of in axes.items() if axis in of}

@@ -1,7 +1,7 @@
 """Bearings of a frame as measurements: residuals, Jacobians, validity, and pose errors that odometry propagates."""
 
 import math
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import types
@@ -170,7 +170,8 @@ class BearingMeasurements(NamedTuple):
 
     def only(self, kept: NDArray[np.bool_] | slice) -> Self:
         """Return the bearings of a mask (m,) or a slice."""
-        return type(self)(*[part[kept] for part in self])
+        parts: list[Any] = [part[kept] for part in self]
+        return type(self)(*parts)
 
 
 class LinearisedBearings(NamedTuple):

@@ -204,7 +204,7 @@ def steps(recording: Recording, ticks: range, states: list[int] = POSE) -> Array
     made[..., 3:6, :3] = -E @ skew(way)
     made[..., 3:6, 6:7] = -E @ way[..., None]
     made[..., :3, 7:10] = -recording.dt * np.eye(3) * (into > 0)[:, None, None, None]
-    return made[(..., *np.ix_(states, states))]
+    return np.asarray(made[..., states, :][..., states])
 
 
 def information(

@@ -23,7 +23,7 @@ from coopenv.observers.bearing_measurements import (
     transition,
 )
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, gain, joseph
+from coopenv.observers.correction import InnovationGate, Stacked, gain, joseph
 
 Masks = dict[int, NDArray[np.bool_]]
 """Of the targets of vehicles that saw any."""
@@ -145,5 +145,5 @@ def recentring(dx: Array) -> Array:
     return G
 
 
-def _stacked(linear: Sequence[LinearisedBearings]) -> tuple[Array, Array, Array]:
+def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:
     return LinearisedBearings(*(np.concatenate(parts) for parts in zip(*linear, strict=True))).stacked()

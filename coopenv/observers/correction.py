@@ -55,11 +55,11 @@ from coopenv.observers.bearing_measurements import (
 CLOSE = 1e-3  # rad: largest turn of a line of sight by the last step
 MOST = 8  # steps, and halvings of a step
 
-Look = Callable[[Array], tuple[Array, Array, Array]]
-"""Returns measurements linearised at the prediction moved by an error (n,).
+Stacked = tuple[Array, Array, Array]
+"""Residual (k,), its derivative H (k, n) by the error about the prediction, and its covariance N (k, k)."""
 
-That is the residual (k,), its derivative H (k, n) by the error about the prediction, and its covariance N (k, k).
-"""
+Look = Callable[[Array], Stacked]
+"""Returns measurements linearised at the prediction moved by an error (n,)."""
 
 
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR)

@@ -27,7 +27,7 @@ from coopenv.observers.bearing_measurements import (
     usable_bearings,
 )
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import InnovationGate, iterated, turn_of_sight, updated
+from coopenv.observers.correction import InnovationGate, Stacked, iterated, turn_of_sight, updated
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.riccati.kernels import RICCATI
 
@@ -156,7 +156,7 @@ class IteratedEkf(MekfCovariance):
         """Correct by bearings, linearised anew until convergence; return their normalised innovation squared."""
         before, distance = self.state, float(lengths(measured.positions - self.state.p).min())
 
-        def look(at: Array) -> tuple[Array, Array, Array]:
+        def look(at: Array) -> Stacked:
             residual, H, N = linearised(before.moved(at, before.P), tick, measured).stacked()
             return residual, H.dot(recentring(before.kind, at)), N
 

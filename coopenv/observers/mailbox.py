@@ -117,7 +117,7 @@ class Mailbox:
         """Store a message that has reached a vehicle, or refuse it: then the last one stays."""
         lasts = self.received[vehicle]
         if message is not None:
-            form = np.shape(message.covariance)  # () of a message without one
+            form = () if message.covariance is None else message.covariance.shape
             if form in ((), self.forms.get(vehicle, form)):
                 lasts[sender] = LastReceived(sent, message, stamp)
                 return

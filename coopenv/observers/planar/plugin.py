@@ -275,8 +275,9 @@ class PlanarRobust(PlanarEkf):
         self._news = True
         angle -= float(self.filter.state[BIAS]) if own else 0.0
         noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
+        x, y = there.pose[:2].tolist()
         variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
-        self._history.add(Sighting(time, target, angle, own, *there.pose[:2].tolist(), variance, noise))
+        self._history.add(Sighting(time, target, angle, own, x, y, variance, noise))
 
     def _unclear(self) -> bool:
         variance = np.diag(self.filter.covariance)

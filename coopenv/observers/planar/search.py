@@ -212,7 +212,7 @@ def _positions(lines: SightingLines, headings: Array, before: PoseInformation) -
     return p
 
 
-def _turned(offset: Array, heading: Array) -> Array:
+def _turned(offset: Array, heading: Array | float) -> Array:
     c, s = np.cos(heading), np.sin(heading)
     return np.stack([c * offset[:, 0] - s * offset[:, 1], s * offset[:, 0] + c * offset[:, 1]], axis=-1)
 
