@@ -212,7 +212,7 @@ def usable_bearings(tick: Tick, weighed: bool = True) -> BearingMeasurements | N
         np.array(positions, float),
         covariances,
         np.array(targets),
-        np.array(messages, dtype=object),
+        np.fromiter(messages, dtype=object, count=len(seen)),
     )
 
 

@@ -114,10 +114,10 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path, monkeypatch
 def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
     head = "from coopenv.estimation.compiled import NUMBER, compiled\n"
     (tmp_path / "doubled.py").write_text(head + "@compiled(NUMBER)\ndef double(x):\n    return 2.0 * x\n")
-    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    modules = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     show = "from doubled import double; print(double(2.0))"
     for _ in range(2):
-        assert output(show, PYTHONPATH=path, NUMBA_CACHE_DIR=str(tmp_path / "cache")) == ["4.0"]
+        assert output(show, PYTHONPATH=modules, NUMBA_CACHE_DIR=str(tmp_path / "cache")) == ["4.0"]
         kept = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
         assert kept
         for path in kept:

@@ -239,7 +239,7 @@ def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
     for i in made.order:
         group.update(i, sensed, made.inbox_tick[1, i])
     if restored:
-        group.set_state(group.get_state())
+        group.set_state(group.checked_state(group.get_state(), begun=True))
     heard = [r.message for i in made.order for r in group.mail.inbox(1, i, made.inbox_tick[1, i]).values()]
     assert heard
     for message in heard:
