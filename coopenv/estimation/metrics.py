@@ -8,7 +8,6 @@ Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
 with chi-square bounds); Wilson, Probable inference, JASA 22, 1927 (interval of a share).
 
 Source: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
-Maps here are global, so nothing is aligned: an alignment would hide the mirrored solution.
 """
 
 import math
