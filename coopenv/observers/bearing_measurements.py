@@ -1,7 +1,7 @@
 """Bearings of a frame as measurements: residuals, Jacobians, validity, and pose errors that odometry propagates."""
 
 import math
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numba import types
@@ -166,12 +166,21 @@ class BearingMeasurements(NamedTuple):
     positions: Array  # (m, 3) of the points, as known or reported, map frame, m
     covariances: Array  # (m, 3, 3) of the points, m^2, zero for known points and without a reported covariance
     targets: NDArray[np.int64]  # (m,)
-    messages: NDArray[np.object_]  # (m,) of type Message, None for landmarks
+    messages: tuple[Message | None, ...]  # (m,) None for landmarks
 
-    def only(self, kept: NDArray[np.bool_] | slice) -> Self:
-        """Return the bearings of a mask (m,) or a slice."""
-        parts: list[Any] = [part[kept] for part in self]
-        return type(self)(*parts)
+    def only(self, kept: NDArray[np.bool_]) -> "BearingMeasurements":
+        """Return the bearings of a mask (m,)."""
+        messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
+        return BearingMeasurements(
+            self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages
+        )
+
+    def one(self, n: int) -> "BearingMeasurements":
+        """Return the n-th bearing alone."""
+        k = slice(n, n + 1)
+        return BearingMeasurements(
+            self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k]
+        )
 
 
 class LinearisedBearings(NamedTuple):
@@ -182,9 +191,9 @@ class LinearisedBearings(NamedTuple):
     N: Array  # (m, 2, 2) rad^2, covariance of the residuals given the own pose
     G: Array  # (m, 2, 3) derivative of the measurement by the points, map axes, rad/m
 
-    def only(self, kept: NDArray[np.bool_]) -> Self:
+    def only(self, kept: NDArray[np.bool_]) -> "LinearisedBearings":
         """Return the bearings of a mask (m,)."""
-        return type(self)(*[part[kept] for part in self])
+        return LinearisedBearings(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
@@ -208,11 +217,7 @@ def usable_bearings(tick: Tick, weighed: bool = True) -> BearingMeasurements | N
                 covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
     return BearingMeasurements(
-        np.array(bearings, float),
-        np.array(positions, float),
-        covariances,
-        np.array(targets),
-        np.fromiter(messages, dtype=object, count=len(seen)),
+        np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages
     )
 
 

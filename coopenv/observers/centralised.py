@@ -108,7 +108,7 @@ class Centralised:
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
-        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
+        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
         own = linearised(PoseEstimate(LEFT, R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H

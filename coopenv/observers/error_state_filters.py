@@ -104,7 +104,7 @@ class Mekf(PoseObserver):
         if known.any():
             self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.fuse_neighbour(tick, measured.only(slice(n, n + 1)))
+            self.fuse_neighbour(tick, measured.one(n))
 
     def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
         """Correct by one bearing to a neighbour."""
