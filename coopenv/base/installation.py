@@ -38,6 +38,22 @@ def data_directory(kind: str) -> Path:
     return shipped if shipped.is_dir() else package.parent / kind
 
 
+@cache
+def message_types(release: str) -> Any:
+    """Return the store of message types of a release of ROS, such as ROS2_JAZZY, with those of `coopenv/messages`.
+
+    Raises:
+        ImportError: rosbags is not installed.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store, folder = get_typestore(Stores[release]), Path(__file__).resolve().parents[1] / "messages"
+    for file in folder.rglob("*.msg"):
+        kind = file.relative_to(folder).with_suffix("").as_posix()
+        store.register(get_types_from_msg(file.read_text(encoding="utf-8"), kind))
+    return store
+
+
 def list_envs() -> list[str]:
     """Return the names of the environments that ship with coopenv: the file stems of `envs/`."""
     return sorted(path.stem for path in data_directory("envs").glob("*.toml"))

@@ -8,119 +8,14 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.profile import SVEA, CarProfile, Role
-
-CAMERA = {
-    "pixy_camera/msg/ObjectInfo": """
-int32 signature
-int32 center_x
-int32 center_y
-int32 width
-int32 height
-int32 angle
-int32 index
-int32 age
-""",
-    "pixy_camera/msg/ObjectInfoArrayStamped": """
-std_msgs/Header header
-pixy_camera/ObjectInfo[] objects
-""",
-    "pixy_camera/msg/ObjectBearing": """
-int32 id
-float32 bearing_x
-float32 bearing_y
-float32 bearing_z
-""",
-    "pixy_camera/msg/ObjectBearingArrayStamped": """
-std_msgs/Header header
-pixy_camera/ObjectBearing[] bearing
-""",
-}
-"""Of the camera, in ROS 1 and ROS 2."""
-
-ROS_1 = {
-    **CAMERA,
-    "svea_msgs/msg/lli_ctrl": """
-int8 steering
-int8 velocity
-int8 trans_diff
-int8 ctrl
-""",
-}
+from coopenv.base.installation import message_types
+from coopenv.cars.profile import SVEA, CarProfile
 
 TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""
 
 STOPPED = "coopenv_msgs/msg/Stopped"
 """Type of the message there with the reason for which the watchdog stopped the cars."""
-
-ROS_2 = {
-    **CAMERA,
-    SVEA.topics[Role.MANUAL].type: "\n".join(
-        ["std_msgs/Header header", *(f"{kind} {name}" for name, (kind, _) in SVEA.command.neutral.items())]
-    ),
-    "mavros_msgs/msg/State": """
-std_msgs/Header header
-bool connected
-bool armed
-bool guided
-bool manual_input
-string mode
-uint8 system_status
-""",
-    "mavros_msgs/msg/RCIn": """
-std_msgs/Header header
-uint8 rssi
-uint16[] channels
-""",
-    "ackermann_msgs/msg/AckermannDrive": """
-float32 steering_angle
-float32 steering_angle_velocity
-float32 speed
-float32 acceleration
-float32 jerk
-""",
-    "ackermann_msgs/msg/AckermannDriveStamped": """
-std_msgs/Header header
-ackermann_msgs/AckermannDrive drive
-""",
-    "coopenv_msgs/msg/RobustReport": """
-std_msgs/Header header  # frame_id: map
-bool valid  # false: the sender has no position
-geometry_msgs/Pose pose  # of the body
-float64[36] covariance  # rotation (rad), then position (m); see docs/robust.md
-geometry_msgs/Pose odometry  # dead reckoning since the start
-uint64 depends_on  # a bit per vehicle whose information is in it
-""",
-    TICK: """
-std_msgs/Header header
-int64 index  # 0: an episode begins
-uint64 key  # of its random draws
-uint32 episode
-""",
-    STOPPED: """
-std_msgs/Header header
-string reason
-string car  # that caused it; empty: no single car
-""",
-    "coopenv_msgs/msg/Arm": """
-std_msgs/Header header
-string session  # of which commands are to be accepted
-string nonce  # that the gate has shown last
-bool armed  # false: disarm
-""",
-    "coopenv_msgs/msg/GateStatus": """
-std_msgs/Header header
-string session  # empty: none
-string nonce
-string state  # disarmed, armed, timed_out, stopped
-uint64 accepted
-uint64 last_sequence
-string[] rejections  # reasons
-uint64[] counts  # how often each
-""",
-}
-
 
 MOST_BYTES = 65_536
 """Of one message: a frame of a camera with 7 colours has hundreds of bytes, and nothing here has images."""
@@ -129,24 +24,20 @@ MOST_BYTES = 65_536
 @cache
 def ros2() -> Any:
     """Return the store of ROS 2 types, ours and the cars' among them. Raises CoopenvError: no extra."""
-    return _store("ROS2_JAZZY", ROS_2)
+    return _store("ROS2_JAZZY")
 
 
 @cache
 def ros1() -> Any:
     """Return the store of ROS 1 types, likewise."""
-    return _store("ROS1_NOETIC", ROS_1)
+    return _store("ROS1_NOETIC")
 
 
-def _store(name: str, definitions: dict[str, str]) -> Any:
+def _store(name: str) -> Any:
     try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        return message_types(name)
     except ImportError:
         raise CoopenvError("messages of cars need an extra: pip install '.[svea]'") from None
-    store = get_typestore(Stores[name])
-    for kind, text in definitions.items():
-        store.register(get_types_from_msg(text, kind))
-    return store
 
 
 def make(kind: str, **fields: Any) -> Any:

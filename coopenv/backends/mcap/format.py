@@ -19,6 +19,7 @@ from pydantic import Field, create_model
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
+from coopenv.base.installation import message_types, version
 from coopenv.base.sections import Section, validated
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
@@ -29,36 +30,6 @@ from coopenv.scenario.own_terms import without_own_terms
 FORMAT = "coopenv recording 1"
 ATTACHMENT = "recording.json"
 LANDMARKS = "/landmarks"
-
-DEFINITIONS = {
-    "coopenv_msgs/msg/Odometry": """
-std_msgs/Header header
-float64[9] rotation  # increment over the tick, row by row: R <- R dR
-float64[3] translation  # m, body frame at the tick's start: p <- p + R dp
-float64[3] velocity  # m/s, last sample, body frame
-float64[3] angular_velocity  # rad/s
-""",
-    "coopenv_msgs/msg/Bearings": """
-std_msgs/Header header
-bool due  # a correction is due at this frame
-uint32[] targets  # landmarks first, then vehicles; see recording.json
-bool[] visible
-float64[] vectors  # x, y, z per target: unit vector camera -> target, body frame
-""",
-    "coopenv_msgs/msg/Inbox": """
-std_msgs/Header header
-int64[] tick_sent  # per sender: when the last received message was sent; -1: none
-""",
-    "coopenv_msgs/msg/Pan": """
-std_msgs/Header header
-float64[1] angle  # rad, by which the camera is turned to the left
-""",
-    "coopenv_msgs/msg/Truth": """
-std_msgs/Header header
-float64[9] rotation  # body to map, row by row; NaN: not known
-float64[3] position  # m, map
-""",
-}
 
 EXACT = {
     "increment": "coopenv_msgs/msg/Odometry",
@@ -101,13 +72,10 @@ def codec() -> Any:
     """Return the store of message types, with ours in it. Raises CoopenvError: the extra is not installed."""
     try:
         import mcap  # noqa: F401
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        return message_types("ROS2_JAZZY")
     except ImportError:
         raise CoopenvError("MCAP files need an extra: pip install '.[log]'") from None
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
-    return store
 
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
@@ -293,3 +261,24 @@ class LogClock(NamedTuple):
 def ros_definition(kind: str) -> bytes:
     """Return the definition of a ROS 2 type as MCAP files hold it (`ros2msg`)."""
     return str(codec().generate_msgdef(kind, ros_version=2)[0]).encode()
+
+
+class RosLog:
+    """An MCAP file of ROS 2 messages under way; topics and types are described as they come."""
+
+    def __init__(self, stream: Any) -> None:
+        """Begin the file. Raises ImportError: the extra is not installed."""
+        from mcap.writer import Writer
+
+        self.writer = Writer(stream)
+        self.writer.start(profile="ros2", library=f"coopenv {version()}")
+        self.schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def channel(self, name: str, kind: str) -> int:
+        """Return the channel of a topic with messages of a type."""
+        if name not in self._channels:
+            if kind not in self.schemas:
+                self.schemas[kind] = self.writer.register_schema(kind, "ros2msg", ros_definition(kind))
+            self._channels[name] = self.writer.register_channel(name, "cdr", self.schemas[kind])
+        return self._channels[name]

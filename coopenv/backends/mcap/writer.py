@@ -18,11 +18,11 @@ from coopenv.backends.mcap.format import (
     LANDMARKS_TYPE,
     SHOWN,
     LogClock,
+    RosLog,
     View,
     codec,
     exact_topics,
     header_of,
-    ros_definition,
     topic,
 )
 from coopenv.base.errors import OutputError
@@ -59,19 +59,14 @@ def check_target(path: str | Path) -> None:
     check_file(path)
 
 
-class _Log:
+class _Log(RosLog):
     """One file under way."""
 
     def __init__(self, stream: Any, recording: Recording, clock: LogClock) -> None:
-        from mcap.writer import Writer
-
+        super().__init__(stream)
         self.recording, self.clock, self.codec = recording, clock, codec()
         self.exact = exact_topics(recording.pan is not None)
         self.types = {name.removeprefix("geometry_msgs/msg/"): kind for name, kind in self.codec.types.items()}
-        self.writer = Writer(stream)
-        self.writer.start(profile="ros2", library=f"coopenv {version()}")
-        self.schemas: dict[str, int] = {}
-        self.channels: dict[str, int] = {}
 
     def write(self, views: Sequence[View]) -> None:
         """Write everything, tick by tick, as players like it."""
@@ -83,7 +78,7 @@ class _Log:
         self.writer.add_attachment(begun, begun, ATTACHMENT, "application/json", header)
         for setup in r.setups:  # so that topics are there even if nothing is ever known
             for name, kind in {**self.exact, **SHOWN}.items():
-                self._channel(topic(setup.name, name), kind)
+                self.channel(topic(setup.name, name), kind)
         changed = (r.landmarks[1:] != r.landmarks[:-1]).any(axis=(1, 2))
         moved = {0, *(np.flatnonzero(changed) + 1).tolist()}
         vehicles = [self._ticks_of(i, setup.name) for i, setup in enumerate(r.setups)]
@@ -153,18 +148,11 @@ class _Log:
         stamp = self.types["builtin_interfaces/msg/Time"](*divmod(self.clock.nanoseconds(k), 10**9))
         header = self.types["std_msgs/msg/Header"](stamp, frame)
         data = bytes(self.codec.serialize_cdr(self.codec.types[kind](header=header, **fields), kind))
-        self._add(self._channel(name, kind), k, data)
+        self._add(self.channel(name, kind), k, data)
 
     def _add(self, channel: int, k: int, data: bytes) -> None:
         nanoseconds = self.clock.nanoseconds(k)
         self.writer.add_message(channel, nanoseconds, data, nanoseconds, k)
-
-    def _channel(self, name: str, kind: str) -> int:
-        if name not in self.channels:
-            if kind not in self.schemas:
-                self.schemas[kind] = self.writer.register_schema(kind, "ros2msg", ros_definition(kind))
-            self.channels[name] = self.writer.register_channel(name, "cdr", self.schemas[kind])
-        return self.channels[name]
 
 
 def _dead_reckoned(recording: Recording, vehicle: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap.format import CUT_OFF, codec, metadata_names
+from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
-from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, ros2, stamp_of
+from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
@@ -57,10 +57,8 @@ class DriveRecorder:
             OutputError: the file is there, or cannot be written.
             CoopenvError: the extra is not installed.
         """
-        try:
-            from mcap.writer import Writer
-        except ImportError:
-            raise CoopenvError("recording cars needs an extra: pip install '.[svea]'") from None
+        if find_spec("mcap") is None:
+            raise CoopenvError("recording cars needs an extra: pip install '.[svea]'")
         if path.suffix != ".mcap":
             raise OutputError(f"{path}: the name must end in .mcap")
         if path.exists():
@@ -68,14 +66,12 @@ class DriveRecorder:
         self._path, self._types = path, {**types, **MARKS}
         self.begun = False
         """Whether an episode has begun: without one there is nothing to replay."""
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
         self._sequence = 0
         self._error: OSError | None = None
         with writing(path):
             self._stream = path.open("xb")
-            self._writer = Writer(self._stream)
-            self._writer.start(profile="ros2", library=f"coopenv {version()}")
+            self._log = RosLog(self._stream)
+            self._writer = self._log.writer
             self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
             self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
             self._stream.flush()
@@ -136,7 +132,8 @@ class DriveRecorder:
                 topic, payload, now = item
                 if topic:
                     self._sequence += 1
-                    self._writer.add_message(self._channel(topic), now, payload, now, self._sequence % 2**32)
+                    channel = self._log.channel(f"/{topic}", self._types[topic])
+                    self._writer.add_message(channel, now, payload, now, self._sequence % 2**32)
                 if topic == STOPPED_TOPIC or time.monotonic() >= due:
                     self._writer.flush()
                     due = time.monotonic() + FLUSH
@@ -144,15 +141,6 @@ class DriveRecorder:
             self._error = error
             while self._queue.get() is not None:
                 pass
-
-    def _channel(self, topic: str) -> int:
-        if topic not in self._channels:
-            kind = self._types[topic]
-            if kind not in self._schemas:
-                text, _ = ros2().generate_msgdef(kind, ros_version=2)
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.register_channel(f"/{topic}", "cdr", self._schemas[kind])
-        return self._channels[topic]
 
 
 def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes:
