@@ -89,14 +89,13 @@ class Health:
     received: int = 0  # messages from vehicles or sensors, of any kind
     rejected: int = 0  # those of them that were refused
 
-    def count(self, tick: Sensed) -> None:
-        """Count one tick."""
+    def count(self, tick: Sensed, vehicles: Any = slice(None)) -> None:
+        """Count one tick, in the rows of some vehicles, or of all."""
         missing = np.zeros(len(tick.visible), bool) if tick.missing is None else np.asarray(tick.missing, bool)
         self.ticks += 1
-        self.received += len(tick.messages)
-        self.late += 0 if tick.late is None else int(np.sum(tick.late))
-        self.missing += int(missing.sum())
-        self.empty += int((~np.any(tick.visible, axis=-1) & ~missing).sum())
+        self.late += 0 if tick.late is None else int(np.sum(tick.late[vehicles]))
+        self.missing += int(missing[vehicles].sum())
+        self.empty += int((~np.any(tick.visible, axis=-1) & ~missing)[vehicles].sum())
 
 
 @runtime_checkable
@@ -174,6 +173,14 @@ IGNORED_OPTIONS = ("options", "arm")
 """What PettingZoo's own tests of conformance pass to every environment, and what lets cars drive: simulated ones do."""
 
 
+def check_options(options: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse options of a reset that a backend does not know. Raises CoopenvError: there is one."""
+    for key in options:
+        if key not in known and key not in IGNORED_OPTIONS:
+            names = ", ".join(known) or "none"
+            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), known)}; known: {names}")
+
+
 class TickGenerator(ABC):
     """A backend whose episodes are generators of ticks, in simulated time; see `Backend` for its methods."""
 
@@ -193,10 +200,7 @@ class TickGenerator(ABC):
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
         """Begin an episode and return tick 0. Raises CoopenvError: an option is not known, or there is no tick."""
-        for key in options:
-            if key not in self.options and key not in IGNORED_OPTIONS:
-                known = ", ".join(self.options) or "none"
-                raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), self.options)}; known: {known}")
+        check_options(options, self.options)
         self.stop("reset")
         self._episode = self.episode(seed, options)
         first = next(self._episode, None)
@@ -227,6 +231,7 @@ class TickGenerator(ABC):
 
     def _counted(self, tick: Sensed) -> Sensed:
         self.health.count(tick)
+        self.health.received += len(tick.messages)
         self.clock = tick.index * tick.dt if tick.time is None else tick.time
         return tick
 

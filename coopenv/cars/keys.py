@@ -184,6 +184,22 @@ def load_verifier(path: str | Path) -> Verifier:
     return Verifier(keys)
 
 
+def load_keys(
+    folder: Path | None, identity: str, senders: Iterable[str]
+) -> tuple[Signer, Verifier] | tuple[None, None]:
+    """Return what signs as an identity, and what knows the keys of some senders; without a folder neither.
+
+    Raises:
+        KeyFileError: a sender's key is missing; others as for `load_signer`.
+    """
+    if folder is None:
+        return None, None
+    verifier = load_verifier(folder)
+    for name in senders:
+        check_known(verifier, name, folder)
+    return load_signer(folder, identity), verifier
+
+
 def check_known(verifier: Verifier, identity: str, path: str | Path) -> None:
     """Refuse public keys among which an identity's is missing. Raises KeyFileError: it is."""
     known = verifier.identities

@@ -37,7 +37,7 @@ def links_line(backend: Svea) -> str:
         f"{notes['name']} {notes['gate']}" + (f", {here + there} refused" if here + there else "")
         for notes, here, there in _links(backend)
     ]
-    late = f"; {backend.link.missed} deadlines missed" if backend.link.missed else ""
+    late = f"; {backend.pacer.missed} deadlines missed" if backend.pacer.missed else ""
     return "; ".join(parts) + late
 
 
@@ -57,7 +57,7 @@ def kept_drive(path: Path | None, backend: Svea) -> str:
 
 def links_report(backend: Svea, out: Console) -> None:
     """Print a table with a row per car, and a line on time and on why it ended."""
-    health = backend.link
+    health = backend.health
     table = Table(title="Links", title_justify="left", box=None)
     for name in ("car", "gate", "clock offset", "messages refused", "gate refused"):
         table.add_column(name, justify="left" if name in ("car", "gate") else "right")
@@ -66,11 +66,11 @@ def links_report(backend: Svea, out: Console) -> None:
     out.print(table)
     late = 1e3 * backend.pacer.late(0.99)
     out.print(
-        f"{health.received} messages, {health.ticks} ticks, {health.missed} missed deadlines, "
+        f"{health.received} messages, {health.ticks} ticks, {backend.pacer.missed} missed deadlines, "
         f"wake-up lateness p99 {late:.2f} ms",
         soft_wrap=True,
     )
-    if left_out := [f"{name} {count}" for name, count in health.refused.items() if count]:
+    if left_out := [f"{name} {count}" for name, count in backend.refused.items() if count]:
         out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
     if backend.watchdog.trip is not None:
         out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
@@ -253,7 +253,7 @@ class Demo:
         self.time += run.ticks_recorded / run.scenario.rates.camera
         decisions = -(-run.ticks_recorded // run.scenario.ticks_per_decision)
         self.decisions += decisions
-        self.missed += backend.link.missed if known else decisions
+        self.missed += backend.pacer.missed if known else decisions
         self.delays.extend(backend.pacer.lateness)
 
     def _simulate(self, scenario: Scenario, episodes: int, log: Console) -> list[Rows]:

@@ -8,7 +8,8 @@ setups, gains, noise, starts, scenario. `metadata_names` and `is_cut_off` look i
 import json
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
@@ -228,6 +229,19 @@ def topics_of(path: str | Path) -> list[str]:
     if summary is None:
         raise DataError(f"{path}: an MCAP file without an index")
     return sorted(channel.topic for channel in summary.channels.values())
+
+
+@contextmanager
+def reading(where: str) -> Iterator[None]:
+    """Turn whatever is raised about an MCAP file into a DataError that begins with `where`."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
+    except CoopenvError as error:
+        raise error if isinstance(error, DataError) else DataError(f"{where}: {error}") from None
+    except Exception as error:  # whatever the libraries raise at bytes that make no sense
+        raise DataError(f"{where}: damaged MCAP file ({str(error) or type(error).__name__})") from None
 
 
 class View(NamedTuple):

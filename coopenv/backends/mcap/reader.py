@@ -19,9 +19,10 @@ from coopenv.backends.mcap.format import (
     Header,
     codec,
     exact_topics,
+    reading,
     topic,
 )
-from coopenv.base.errors import CoopenvError, DataError, check_memory, shown
+from coopenv.base.errors import DataError, check_memory, shown
 from coopenv.observers.contract import Setup
 from coopenv.observers.recording import ARRAYS, Recording, Truth, check_recording, sizes_of
 
@@ -114,16 +115,8 @@ def read_recording(path: str | Path) -> Recording:
     from coopenv.backends.mcap.container import Container
 
     where = str(path)
-    try:
+    with reading(where):
         recording = _read(Container(Path(path)), where)
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
-    except DataError:
-        raise
-    except CoopenvError as error:
-        raise DataError(f"{where}: {error}") from None
-    except Exception as error:  # whatever the libraries raise at bytes that make no sense
-        raise DataError(f"{where}: damaged MCAP file ({str(error) or type(error).__name__})") from None
     check_recording(recording, where)
     return recording
 

@@ -5,7 +5,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from coopenv.cars.backend.status import ROLES, StatusBoard
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, since
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
-from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
+from coopenv.cars.keys import Signer, Verifier, load_keys
 from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.zenoh import open_transport
@@ -38,14 +37,6 @@ from coopenv.scenario.files import OVERRIDES
 
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
-
-
-@dataclass
-class LinkHealth(Health):
-    """What has come over the network as well."""
-
-    missed: int = 0  # decisions that came too late for their first tick
-    refused: dict[str, int] = field(default_factory=dict)  # samples that were not used, by reason
 
 
 FIRST_MESSAGES_TIME = 3.0  # s to wait for first messages at the first reset
@@ -90,8 +81,9 @@ class Svea:
             batched=False,
             estimated=None if not binding.remote else binding.local,
         )
-        self.link = LinkHealth()
-        self.health: Health = self.link
+        self.health = Health()
+        self.refused: dict[str, int] = {}
+        """Samples that were not used, by reason."""
         self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision)
         self._origin = np.array(self.scenario.map.origin)
         self._armed, self._received_once, self._began, self._index = False, False, 0, 0
@@ -198,7 +190,6 @@ class Svea:
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
         self.pacer.decide()
-        self.link.missed = self.pacer.missed
         self.watchdog.beat(self.pacer.in_a_row)
         if self._armed:
             self.gates.next()
@@ -229,14 +220,9 @@ class Svea:
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
-        local = list(self.binding.local)
-        missing = np.asarray(tick.missing)[local]
-        self.health.ticks += 1
-        self.health.late += int(np.asarray(tick.late)[local].sum())
-        self.health.missing += int(missing.sum())
-        self.health.empty += int((~tick.visible[local].any(axis=-1) & ~missing).sum())
+        self.health.count(tick, list(self.binding.local))
         refused = sum(self.intake.rejected.values(), self._assembler.refused + self.station.dropped)
-        self.link.refused, self.health.rejected = dict(refused), sum(refused.values())
+        self.refused, self.health.rejected = dict(refused), sum(refused.values())
         return tick
 
     def broadcast(self, sent: Sequence[VehicleBroadcast]) -> None:
@@ -263,8 +249,8 @@ class Svea:
             "stopped_by": trip.car,
             "gate": self.gates.states[name].state,
             "gate_rejections": self.gates.refused(name),
-            "rejections": dict(self.link.refused),
-            "missed_deadlines": self.link.missed,
+            "rejections": dict(self.refused),
+            "missed_deadlines": self.pacer.missed,
             "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,
             "clock_offset": float("nan") if offset is None else offset,
         }
@@ -334,7 +320,7 @@ def open_svea(
     if binding.unmarked:
         remark = f"{Path(path).name}: no markers, so cameras cannot identify them: {listed(binding.unmarked)}"
         warnings.warn(DataWarning(remark), stacklevel=2)
-    signer, verifier = _keys(deployment, binding, car)
+    signer, verifier = load_keys(deployment.keys, car or deployment.security.identity, binding.cars)
     link = open_transport(deployment) if transport is None else transport
     try:
         types = _types(binding, deployment.security.identity)
@@ -376,16 +362,6 @@ def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapp
             if str(of_the_file).startswith("override"):
                 raise CoopenvError(f"{file}: {str(of_the_file).replace(OVERRIDES, 'overrides', 1)}") from None
         raise error
-
-
-def _keys(deployment: Deployment, binding: Binding, car: str | None) -> tuple[Signer | None, Verifier | None]:
-    folder = deployment.keys
-    if folder is None:
-        return None, None
-    verifier = load_verifier(folder)
-    for name in binding.cars:
-        check_known(verifier, name, folder)
-    return load_signer(folder, car or deployment.security.identity), verifier
 
 
 def _types(binding: Binding, identity: str) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import IGNORED_OPTIONS, VehicleBroadcast
+from coopenv.backends.base import VehicleBroadcast, check_options
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make, pose
@@ -121,9 +121,7 @@ def reset_options(options: Mapping[str, Any]) -> tuple[bool, bool]:
     Raises:
         CoopenvError: an option is not known, or not what it must be.
     """
-    for key in options:
-        if key not in OPTIONS and key not in IGNORED_OPTIONS:
-            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm, release")
+    check_options(options, OPTIONS)
     for name in OPTIONS:
         if not isinstance(value := options.get(name, False), bool):
             raise CoopenvError(f"option '{name}' must be true or false, got {shown(value)}")

@@ -11,12 +11,13 @@ import threading
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names
+from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names, reading
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import version
@@ -181,7 +182,7 @@ class Drive(TickGenerator):
         from coopenv.backends.mcap.container import Container
 
         self._where = str(path)
-        with _reading(self._where):
+        with reading(self._where):
             container = Container(Path(path), forgiving=True)
             metadata, attachments = container.extras()
         nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
@@ -190,7 +191,7 @@ class Drive(TickGenerator):
         if metadata.get(NAME, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
-        with _reading(self._where):
+        with reading(self._where):
             self._messages = list(_messages(container))
         indices = [m.index for m in self._messages if not isinstance(m, Arrival) and m.__msgtype__ == TICK]
         if 0 not in indices:
@@ -253,19 +254,6 @@ def _messages(container: "Container") -> Iterator[Any]:
         topic = channel.topic.lstrip("/")
         kind = MARKS.get(topic)
         yield decode(message.data, kind) if kind else Arrival(topic, bytes(message.data), message.log_time)
-
-
-@contextmanager
-def _reading(where: str) -> Iterator[None]:
-    """Turn whatever is raised about a file into a DataError that begins with `where`."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
-    except CoopenvError as error:
-        raise error if isinstance(error, DataError) else DataError(f"{where}: {error}") from None
-    except Exception as error:  # whatever the libraries raise at bytes that make no sense
-        raise DataError(f"{where}: damaged MCAP file ({type(error).__name__})") from None
 
 
 PRESENCE = "std_msgs/msg/Bool"

@@ -202,7 +202,11 @@ class Watchdog:
     def _problems(self) -> Iterator[tuple[str, str]]:
         """Yield the car and the reason of each violated rule; a car is empty where it is no single one."""
         for car in self._cars:
-            yield from ((car, why) for why in self._of_car(car))
+            yield from ((car, why) for why in self.silent(car))
+            if not self._present[presence_of(car)]:
+                yield car, "is gone"
+            if why := self._happened(car):
+                yield car, why
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
                 yield car, f"its gate is silent for {gate.age:.2f} s"
@@ -217,13 +221,6 @@ class Watchdog:
             if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
                 yield "", f"no decision for {age:.2f} s"
             yield from self.misplaced()
-
-    def _of_car(self, car: str) -> Iterator[str]:
-        yield from self.silent(car)
-        if not self._present[presence_of(car)]:
-            yield "is gone"
-        if why := self._happened(car):
-            yield why
 
     def silent(self, car: str) -> Iterator[str]:
         """Yield the topics of a car's odometry without a message, or a usable one, for too long, in words."""

@@ -60,15 +60,9 @@ def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, in
     found: dict[str, Shift] = {}
     for delays, recorder in zip(files, behind, strict=True):
         for source, delay in delays.items():
-            if source in found:
-                continue
-            if source in stated:
-                found[source] = Shift(stated[source], stated[source])
-            elif recorder is None:
-                found[source] = Shift(None, 0)
-            else:
-                offset = delay + recorder
-                found[source] = Shift(offset, offset if abs(offset) > tolerance else 0)
+            offset = stated.get(source, None if recorder is None else delay + recorder)
+            moved = offset is not None and (source in stated or abs(offset) > tolerance)
+            found.setdefault(source, Shift(offset, offset if offset is not None and moved else 0))
     return Clocks(found, tuple(recorder or 0 for recorder in behind))
 
 

@@ -197,26 +197,19 @@ class Gate:
         self._limits, self._clock, self._verifier, self._station = limits, clock, verifier, station
         self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
         self._counts = dict.fromkeys(Reason, 0)
-        self._state, self._nonce = GateMode.DISARMED, secrets.token_hex(8)
+        self._state = GateMode.DISARMED
+        self.nonce = secrets.token_hex(8)
+        """What the next arming has to name."""
         self._session, self._sequence, self._accepted = "", -1, 0
         self._wanted: Drive | None = None  # by the last valid command, while it counts
-        self._commanded = self._ticked = clock.steady()
-        self._output = NEUTRAL
-
-    @property
-    def nonce(self) -> str:
-        """What the next arming has to name."""
-        return self._nonce
-
-    @property
-    def commanded(self) -> int:
+        self.commanded = self._ticked = clock.steady()
         """When the last valid command came, steady clock, ns."""
-        return self._commanded
+        self._output = NEUTRAL
 
     @property
     def state(self) -> GateMode:
         """The state at this instant."""
-        if self._wanted is not None and self._clock.steady() - self._commanded > TIMEOUT:
+        if self._wanted is not None and self._clock.steady() - self.commanded > TIMEOUT:
             self._come_to_a_stand(GateMode.TIMED_OUT)
         return self._state
 
@@ -259,7 +252,7 @@ class Gate:
         state = self.state
         session = self._session if state in (GateMode.ARMED, GateMode.TIMED_OUT) else ""
         last, counts = max(self._sequence, 0), {str(reason): count for reason, count in self._counts.items()}
-        return write_status(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts)
+        return write_status(self._clock.wall(), session, self.nonce, state, self._accepted, last, counts)
 
     def _command(self, payload: bytes, attachment: bytes) -> None:
         stamp, frame, *numbers = read(payload, COMMAND)
@@ -280,7 +273,7 @@ class Gate:
         if not self._limits.permit(speed, steering):
             raise Rejected(Reason.LIMITS)
         self._sequence, self._accepted = int(digits), self._accepted + 1
-        self._wanted, self._commanded = Drive(steering, speed), self._clock.steady()
+        self._wanted, self.commanded = Drive(steering, speed), self._clock.steady()
         self._state = GateMode.ARMED
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
@@ -290,7 +283,7 @@ class Gate:
             if self.state is not GateMode.STOPPED:
                 self._come_to_a_stand(GateMode.DISARMED)
             return
-        if nonce != self._nonce:
+        if nonce != self.nonce:
             raise Rejected(Reason.NONCE)
         if not is_identity(session):
             raise Rejected(Reason.SESSION)
@@ -306,7 +299,7 @@ class Gate:
         """Go on in a state with neutral output; unless it is a mere time-out, earlier armings are worth nothing."""
         self._state, self._wanted, self._output = state, None, NEUTRAL
         if state is not GateMode.TIMED_OUT:
-            self._nonce = secrets.token_hex(8)
+            self.nonce = secrets.token_hex(8)
 
     def _check(self, role: Role, stamp: int, payload: bytes, attachment: bytes) -> None:
         """Reject a message that is not of this moment, or not of the station."""

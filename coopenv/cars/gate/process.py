@@ -12,7 +12,7 @@ from typing import Any
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Car, Deployment, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, write
-from coopenv.cars.keys import Signer, check_identity, check_known, load_signer, load_verifier
+from coopenv.cars.keys import Signer, check_identity, load_keys
 from coopenv.cars.profile import Role, presence_of
 from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
 
@@ -162,12 +162,7 @@ def prepare_gate(
     profile, station, folder = fleet.profile, station or fleet.security.identity, keys or fleet.keys
     given = {name: value for name, value in (limits or {}).items() if value is not None}
     bounds = replace(fleet.limits, **given).check(profile.hardest)
-    signer, verifier = None, None
-    if folder is not None:
-        verifier = load_verifier(folder)
-        check_known(verifier, station, folder)
-        signer = load_signer(folder, car)
-
+    signer, verifier = load_keys(folder, car, [station])
     return lambda transport, clock: GateConnection(
         Gate(car, bounds, clock, verifier, station, profile), transport, signer
     )

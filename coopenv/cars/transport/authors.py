@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from coopenv.base.errors import CoopenvError
@@ -77,16 +78,6 @@ class Route:
             payload = encode(make(self.theirs, header=message.header, point=message.pose.pose.position))
         return ros1_of(payload, self.theirs)
 
-    def back(self, payload: bytes) -> bytes:
-        """Return CDR bytes for ROS 1 bytes, likewise."""
-        return cdr_of(payload, self.theirs)
-
-    def warm_up(self) -> None:
-        """Translate once, since the first time compiles and takes a tenth of a second."""
-        translated = self.out(encode(make(self.ours)))
-        if self.exact:
-            self.back(translated)
-
 
 def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[Route, ...]:
     """Return those of a car. Raises DeploymentError: it has no number."""
@@ -116,7 +107,9 @@ class Authors:
         self._routes = {route.topic: route for route in routes}
         self._names = {route.name for route in self._routes.values()}
         for route in {(route.ours, route.theirs): route for route in self._routes.values()}.values():
-            route.warm_up()
+            translated = route.out(encode(make(route.ours)))  # the first time compiles and takes a tenth of a second
+            if route.exact:
+                cdr_of(translated, route.theirs)
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -136,7 +129,7 @@ class Authors:
         matches = matcher(pattern)
         for route in self._routes.values():
             if route.exact and matches(route.topic):
-                self._wire.subscribe(route.name, self._translating(route, callback))
+                self._wire.subscribe(route.name, partial(_translate, route, callback))
         if pattern in self._routes and self._routes[pattern].exact:
             return
 
@@ -146,13 +139,11 @@ class Authors:
 
         self._wire.subscribe(pattern, pass_on)
 
-    @staticmethod
-    def _translating(route: Route, callback: Callback) -> Callback:
-        def arrive(arrival: Arrival) -> None:
-            try:
-                payload = route.back(arrival.payload)
-            except CoopenvError:
-                return
-            callback(Arrival(route.topic, payload, arrival.received, arrival.attachment))
 
-        return arrive
+def _translate(route: Route, callback: Callback, arrival: Arrival) -> None:
+    """Pass on what came under an authors' name; bytes of another type go no further."""
+    try:
+        payload = cdr_of(arrival.payload, route.theirs)
+    except CoopenvError:
+        return
+    callback(Arrival(route.topic, payload, arrival.received, arrival.attachment))
