@@ -151,11 +151,6 @@ def quaternion(rotation: Any) -> list[float]:
     return [x, y, z, w]
 
 
-@cache
-def _compile(kind: str) -> None:
-    decode(encode(make(kind)), kind)
-
-
 def warm_up(profile: CarProfile = SVEA) -> None:
     """Encode and decode one message of every type, which compiles the codec.
 
@@ -165,4 +160,4 @@ def warm_up(profile: CarProfile = SVEA) -> None:
     for role, topic in profile.topics.items():
         if topic.type not in ros2().types:
             raise CoopenvError(f"profile: topics.{role}.type: {topic.type} is not known")
-        _compile(topic.type)
+        decode(encode(make(topic.type)), topic.type)

@@ -122,6 +122,16 @@ class Role(StrEnum):
 VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "odometry": (Role.ODOMETRY,), "wheel": (Role.WHEEL,)}
 """Sources of body twists, best first."""
 
+AUTHORS = {
+    Role.DETECTIONS: ("{agent}/pixy_node/objectsInfo",),
+    Role.BEARINGS: ("{agent}/pixy_landmark_detection/objectsBearing",),
+    Role.CAMERA_INFO: ("{agent}/pixy_node/camera_info",),
+    Role.WHEEL: ("{agent}/actuation_twist",),
+    Role.POINT: ("{agent}/riccatiPoint",),
+    Role.TRUTH: ("qualisys/{body}/pose", "qualisys/{body}/odom"),
+}
+"""The authors' topics: names that bags have, best first; the last one is that on a network."""
+
 GATE_TYPES = {
     Role.COMMAND: "ackermann_msgs/msg/AckermannDriveStamped",
     Role.ARM: "coopenv_msgs/msg/Arm",

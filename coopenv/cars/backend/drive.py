@@ -10,11 +10,11 @@ import queue
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names, reading
@@ -29,9 +29,6 @@ from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.scenario.files import override, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
-
-if TYPE_CHECKING:
-    from coopenv.backends.mcap.container import Container
 
 FORMAT = "coopenv drive 1"
 NAME = "coopenv-drive"
@@ -192,7 +189,12 @@ class Drive(TickGenerator):
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
         with reading(self._where):
-            self._messages = list(_messages(container))
+            self._messages: list[Any] = []
+            """Arrivals, and decoded marks of ticks and stops among them."""
+            for channel, _, message in container.messages():
+                topic = channel.topic.lstrip("/")
+                kind, data = MARKS.get(topic), bytes(message.data)
+                self._messages.append(decode(data, kind) if kind else Arrival(topic, data, message.log_time))
         indices = [m.index for m in self._messages if not isinstance(m, Arrival) and m.__msgtype__ == TICK]
         if 0 not in indices:
             raise DataError(nothing)
@@ -246,14 +248,6 @@ class Drive(TickGenerator):
                 tick = assembler.tick(message.index, stamp_of(message))
             if number == wanted:
                 yield tick
-
-
-def _messages(container: "Container") -> Iterator[Any]:
-    """Yield the arrivals, and decoded marks of ticks and stops among them."""
-    for channel, _, message in container.messages():
-        topic = channel.topic.lstrip("/")
-        kind = MARKS.get(topic)
-        yield decode(message.data, kind) if kind else Arrival(topic, bytes(message.data), message.log_time)
 
 
 PRESENCE = "std_msgs/msg/Bool"

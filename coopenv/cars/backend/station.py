@@ -100,13 +100,9 @@ class Pacer:
         """Give the period of ticks in s, and how many make a decision."""
         self._period = round(period * 1e9)
         self._decision = self._period * per_decision
-        self._wall = time.time_ns() - time.monotonic_ns()
-        self._due = 0  # before the first decision
-        self.missed = 0
-        """Decisions that missed their deadline."""
-        self.in_a_row = 0
         self.lateness: deque[float] = deque(maxlen=KEPT)
         """s by which ticks were given after their time."""
+        self.start()
 
     def now(self) -> int:
         """Return the time."""
@@ -115,7 +111,9 @@ class Pacer:
     def start(self) -> int:
         """Begin anew: time counts from the first decision on. Returns the time now."""
         self._wall = time.time_ns() - time.monotonic_ns()
-        self.missed = self.in_a_row = self._due = 0
+        self._due = 0  # before the first decision
+        self.missed = self.in_a_row = 0
+        """Decisions that missed their deadline, in all and in a row up to now."""
         self.lateness.clear()
         return self.now()
 

@@ -37,15 +37,14 @@ class LinkMonitor:
         """Choose the source of the judged positions: motion capture, or the cars' estimates."""
         self._judging = (Role.TRUTH,) if judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
         self._known_at: dict[tuple[str, Role], int] = {}
-        self.places: Mapping[str, Place] = {}
-        """Replaced as a whole whenever one changes."""
-        self.looked = 0
-        """When messages were looked at last."""
-        self._begun = 0
+        self.begin(0)
 
     def begin(self, now: int) -> None:
         """Forget where the cars were."""
-        self.places, self.looked, self._begun = {}, now, now
+        self.places: Mapping[str, Place] = {}
+        """Replaced as a whole whenever one changes."""
+        self.looked = self._begun = now
+        """When messages were looked at last."""
 
     def put(self, sample: Sample) -> None:
         """Take a sample that is newer than all before of its car and role."""

@@ -59,6 +59,7 @@ class Bag(TickGenerator):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
             scenario = load_scenario(self.map.environment_path, changes)
+        self._rate = float(scenario.rates.camera)
         self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None)
         self.log = read_log([Path(path) for path in paths], self.map, self.binding)
         self._begin, ticks = self._ticks()
@@ -84,10 +85,6 @@ class Bag(TickGenerator):
                 f"{self.where}: {span:.3g} s in which everything that is needed comes, too few for two ticks"
             )
         return begin, ticks
-
-    @property
-    def _rate(self) -> float:
-        return float(self.binding.scenario.rates.camera)
 
     def _scenario(self, changes: dict[str, Any], ticks: int) -> Scenario:
         """Return the environment with the bag's length as its horizon."""

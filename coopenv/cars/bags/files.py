@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self
@@ -129,10 +130,8 @@ class BagFile:
 
 def check_extra() -> None:
     """Make sure that bags can be read. Raises CoopenvError: the extra is not installed."""
-    try:
-        import rosbags.highlevel  # noqa: F401
-    except ImportError:
-        raise CoopenvError("ROS bags need an extra: pip install '.[log]'") from None
+    if find_spec("rosbags") is None:
+        raise CoopenvError("ROS bags need an extra: pip install '.[log]'")
 
 
 _allowance: ContextVar["Allowance | None"] = ContextVar("_allowance", default=None)

@@ -10,18 +10,11 @@ from pydantic import Field, model_validator
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
-from coopenv.cars.profile import PREFIX, VELOCITY, Number, Positive, Role, load_profile
+from coopenv.cars.profile import AUTHORS, PREFIX, VELOCITY, Number, Positive, Role, load_profile
 from coopenv.cars.readings import READERS
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
-    "authors": {
-        Role.DETECTIONS: ("/{agent}/pixy_node/objectsInfo",),
-        Role.BEARINGS: ("/{agent}/pixy_landmark_detection/objectsBearing",),
-        Role.CAMERA_INFO: ("/{agent}/pixy_node/camera_info",),
-        Role.WHEEL: ("/{agent}/actuation_twist",),
-        Role.POINT: ("/{agent}/riccatiPoint",),
-        Role.TRUTH: ("/qualisys/{body}/pose", "/qualisys/{body}/odom"),
-    },
+    "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
     "none": {},
 }
 """By name and role: the first of them that a bag has counts."""

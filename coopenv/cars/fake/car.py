@@ -106,7 +106,10 @@ class Fake:
         else:
             acts.append((LEADER_RATE, self._leader))
         self.begin(seed)
-        self._warm_up()
+        warm_up(self._profile)  # once what takes long at the first time: codecs and kernels are compiled, or loaded
+        self._move(self._began + 1)
+        if self._drives:
+            self.world.look(0)
         transport.subscribe(RESET_TOPIC, self._later(self._reset))
         transport.subscribe(fault_topic(name), self._later(self._fault))
         if self._drives and gate is not None:
@@ -130,13 +133,6 @@ class Fake:
             self._sensors.begin(self._rng)
             self._pixy.begin(self._rng)
 
-    def _warm_up(self) -> None:
-        """Do once what takes long at the first time: kernels and codecs are compiled, or loaded."""
-        warm_up(self._profile)
-        self._move(self._began + 1)
-        if self._drives:
-            self.world.look(0)
-
     @property
     def next(self) -> int:
         """When something is due next, steady clock, ns."""
@@ -153,19 +149,16 @@ class Fake:
             end_process()
             return
         self._wire.flush()
-        self._take_inbox()
-        for due, act in self._schedule.until(now):
-            self._move(due)
-            act(due, self._stamp(due) + self._faults.clock_error(due))
-        if self._link is not None and self._link.news.is_set():
-            self._link.publish_status()
-
-    def _take_inbox(self) -> None:
         while self._inbox:
             try:
                 self._inbox.popleft()()
             except CoopenvError as error:
                 print(f"{self.name}: {error}", file=sys.stderr, flush=True)
+        for due, act in self._schedule.until(now):
+            self._move(due)
+            act(due, self._stamp(due) + self._faults.clock_error(due))
+        if self._link is not None and self._link.news.is_set():
+            self._link.publish_status()
 
     def close(self) -> None:
         """Tell the wheels to stand, and forget what is under way."""

@@ -52,10 +52,6 @@ class Faults:
     def __init__(self) -> None:
         self._known: list[tuple[int, int | None, Fault]] = []
 
-    def __bool__(self) -> bool:
-        """Whether any has been asked for."""
-        return bool(self._known)
-
     def add(self, fault: Fault, now: int) -> None:
         """Let a fault happen, its start counted from now."""
         begin = now + round(fault.start_in(0.0) * 1e9)
@@ -125,11 +121,9 @@ class Wire:
             first[2]()
 
     def _pass_on(self, act: Callable[[], None]) -> None:
-        if not self._faults:
-            act()
-            return
         now, faults = self._steady(), self._faults
-        if faults.value("freeze", now) or self._rng.random() < faults.value("loss", now):
+        loss = faults.value("loss", now)
+        if faults.value("freeze", now) or (loss and self._rng.random() < loss):
             return
         if delay := faults.value("delay", now):
             self._late.put((now + round(delay * 1e9), next(self._numbers), act))

@@ -15,7 +15,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import cdr_of, decode, encode, make, ros1, ros1_of
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.gate.core import read_drive
-from coopenv.cars.profile import SVEA, CarProfile, CommandMessage, Drive, Role
+from coopenv.cars.profile import AUTHORS, SVEA, CarProfile, CommandMessage, Drive, Role
 from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
@@ -37,16 +37,11 @@ def low_level(drive: Drive, command: CommandMessage) -> Any:
 
 
 NAMES = {
-    Role.DETECTIONS: "agent{agent}/pixy_node/objectsInfo",
-    Role.BEARINGS: "agent{agent}/pixy_landmark_detection/objectsBearing",
-    Role.CAMERA_INFO: "agent{agent}/pixy_node/camera_info",
-    Role.WHEEL: "agent{agent}/actuation_twist",
-    Role.TRUTH: "qualisys/{car}/odom",
-    Role.POINT: "agent{agent}/riccatiPoint",
-    Role.ESTIMATE: "agent{agent}/riccatiPoint",
-    Role.MANUAL: "agent{agent}/lli/ctrl_request",
+    **{role: names[-1] for role, names in AUTHORS.items()},
+    Role.ESTIMATE: AUTHORS[Role.POINT][-1],
+    Role.MANUAL: "{agent}/lli/ctrl_request",
 }
-"""The authors' topics with the content of ours, by the agent's number and the car's name.
+"""The authors' topics with the content of ours, by `agentN` and the car's name.
 
 Commands are not among them: they go to the gate, and what the gate has let through to the low level."""
 LOSSY = {Role.ESTIMATE: SVEA.topics[Role.POINT].type, Role.MANUAL: "svea_msgs/msg/lli_ctrl"}
@@ -84,10 +79,11 @@ def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[Route, ...]:
     agent = car.agent_number
     if agent is None:
         raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
+    names = {"agent": f"agent{agent}", "body": car.name}
     return tuple(
         Route(
             *(role, profile.topic_of(car.name, role), profile.topics[role].type),
-            *(name.format(agent=agent, car=car.name), LOSSY.get(role, SVEA.topics[role].type), profile.command),
+            *(name.format(**names), LOSSY.get(role, SVEA.topics[role].type), profile.command),
         )
         for role, name in NAMES.items()
     )
