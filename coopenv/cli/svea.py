@@ -185,16 +185,15 @@ def health(
 
 def next_status(transport: "Transport", topic: str, patience: float) -> Any | None:
     """Return the next message of a gate's topic that is one (None: none within s); whatever else comes is dropped."""
-    from coopenv.cars.codec import MOST_BYTES, decode
+    from coopenv.cars.codec import decode
     from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import Arrival
 
     heard = Queue[Any](1)
 
     def keep(arrival: Arrival) -> None:
-        if len(arrival.payload) <= MOST_BYTES:
-            with suppress(CoopenvError, Full):
-                heard.put_nowait(decode(arrival.payload, GATE_TYPES[Role.GATE]))
+        with suppress(CoopenvError, Full):
+            heard.put_nowait(decode(arrival.payload, GATE_TYPES[Role.GATE]))
 
     transport.subscribe(topic, keep)
     with suppress(Empty):

@@ -57,9 +57,7 @@ class Station:
             transport.subscribe(topic, self._keep)
 
     def _keep(self, arrival: Arrival) -> None:
-        waiting = self._waiting.get(arrival.topic)
-        if waiting is None:
-            return
+        waiting = self._waiting[arrival.topic]
         why = refusal(arrival, self._verifier, self._signers.get(arrival.topic))
         with self._lock:
             if why:
@@ -81,8 +79,7 @@ class Station:
     def silence(self, topic: str) -> float:
         """Return for how long nothing has come on a topic, s; inf: never anything."""
         with self._lock:
-            last = self._last.get(topic)
-        return float("inf") if last is None else time.monotonic() - last
+            return time.monotonic() - self._last.get(topic, float("-inf"))
 
 
 KEPT = 100_000  # lateness of so many ticks is kept for the statistics

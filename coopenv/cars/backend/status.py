@@ -67,15 +67,14 @@ class StatusBoard:
             least: share of its battery that it needs.
             used: calibration of its camera, which its own has to agree with.
         """
-        needed = self._conditions_needed
         remote, state = self._conditions[car, Role.REMOTE].status, self._conditions[car, Role.STATE].status
         battery = self._conditions[car, Role.BATTERY].status.battery
-        yield from filter(None, (self._silent(car, role) for role in needed))
+        yield from filter(None, (self._silent(car, role) for role in self._conditions_needed))
         if why := self._driven(remote):
             yield why
-        if Role.STATE in needed and not state.armed:
+        if Role.STATE in self._conditions_needed and not state.armed:
             yield "its autopilot is not armed"
-        if battery is None and Role.BATTERY in needed and least > 0.0:
+        if battery is None and Role.BATTERY in self._conditions_needed and least > 0.0:
             yield "its battery publishes no charge (safety.min_battery = 0 needs none)"
         if battery is not None and battery < least:
             yield f"its battery is at {100 * battery:.0f} %, {100 * least:.0f} % are needed"

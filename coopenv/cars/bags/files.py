@@ -101,8 +101,6 @@ class BagFile:
                 first = received if first is None else first
                 last = received
                 yield connection.topic, received, partial(self._decode, data, connection.msgtype)
-        except GeneratorExit:
-            raise
         except Exception as error:
             if last is None or first is None or is_too_large(error):
                 raise self._unreadable(error) from None

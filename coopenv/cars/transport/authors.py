@@ -114,11 +114,10 @@ class Authors:
         route = self._routes.get(topic)
         if route is None or not route.exact:
             self._wire.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        if route is None:
-            return
-        with suppress(CoopenvError):  # no message of its topic's type, which goes no further
-            beside = attachment if route.exact else b""
-            self._wire.publish(route.name, route.out(payload), beside, urgent=urgent, reliable=reliable)
+        if route is not None:
+            with suppress(CoopenvError):  # no message of its topic's type, which goes no further
+                beside = attachment if route.exact else b""
+                self._wire.publish(route.name, route.out(payload), beside, urgent=urgent, reliable=reliable)
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
