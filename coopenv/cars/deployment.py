@@ -290,20 +290,13 @@ class Deployment(Section):
     """Where it stands; set by `load_deployment`."""
 
     @model_validator(mode="after")
-    def _nothing_is_used_twice(self) -> Self:
+    def _parts_fit_together(self) -> Self:
+        """Refuse repeated names, limits beyond those of the make, and a gate's endpoints of another network."""
         refuse_repeated(self.cars, self.markers, self.profile.markers)
-        return self
-
-    @model_validator(mode="after")
-    def _limits_are_those_of_the_make(self) -> Self:
         for key in self.safety.model_fields_set & {f"max_{name}" for name in LIMITED}:
             value, most = getattr(self.safety, key), getattr(self.profile.hardest, key.removeprefix("max_"))
             if value > most:
                 raise ValueError(f"safety.{key}: {value:g} is over {most:.4g}, the largest of this make")
-        return self
-
-    @model_validator(mode="after")
-    def _gates_speak_like_the_cars(self) -> Self:
         refuse_foreign(self.network.kind, self.gate_connect, "gate.connect")
         return self
 

@@ -212,9 +212,9 @@ class ClockOffset:
             self._least.popleft()
 
     @property
-    def seconds(self) -> float | None:
-        """Offset of the car's clock behind the receiver's, network delay included, s; None: no message yet."""
-        return self._least[0][1] * 1e-9 if self._least else None
+    def seconds(self) -> float:
+        """Offset of the car's clock behind the receiver's, network delay included, s; NaN: no message yet."""
+        return self._least[0][1] * 1e-9 if self._least else float("nan")
 
 
 class Intake:

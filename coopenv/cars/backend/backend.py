@@ -174,7 +174,7 @@ class Svea:
         safety, profile = self.deployment.safety, self.binding.profile
         for car in self._local:
             offset = self.intake.offsets[car].seconds  # other ages depend on it
-            if offset is not None and abs(offset) > safety.max_clock_offset:
+            if abs(offset) > safety.max_clock_offset:
                 where = f"{abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'}"
                 allowed = f"{safety.max_clock_offset * 1e3:.0f} ms are allowed"
                 yield car, f"its clock is {where} this computer's, {allowed}: let chrony or PTP synchronise them"
@@ -241,7 +241,6 @@ class Svea:
         """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""
         name = self.binding.names[vehicle]
         trip = self.watchdog.trip or Trip("")
-        offset = self.intake.offsets[name].seconds
         return {
             "name": name,
             "armed": self._armed,
@@ -252,7 +251,7 @@ class Svea:
             "rejections": dict(self.refused),
             "missed_deadlines": self.pacer.missed,
             "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,
-            "clock_offset": float("nan") if offset is None else offset,
+            "clock_offset": self.intake.offsets[name].seconds,
         }
 
     def _write_down(self, trip: Trip) -> None:

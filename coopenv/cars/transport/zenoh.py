@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
@@ -35,7 +36,7 @@ class Zenoh:
     ) -> None:
         """Send, see `Transport`."""
         z = self._zenoh
-        try:
+        with suppress(z.ZError):  # the session is closed
             self._session.put(
                 topic,
                 payload,
@@ -44,8 +45,6 @@ class Zenoh:
                 priority=z.Priority.REAL_TIME if urgent else z.Priority.DATA,
                 congestion_control=z.CongestionControl.BLOCK if reliable else z.CongestionControl.DROP,
             )
-        except z.ZError:  # the session is closed
-            return
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
         """Subscribe, see `Transport`."""
