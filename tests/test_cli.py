@@ -324,7 +324,7 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 def test_an_interrupted_run_leaves_the_earlier_result(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from coopenv.runs.rollouts import Views
+    from coopenv.evaluation.episodes import Views
 
     take = Views.take
 

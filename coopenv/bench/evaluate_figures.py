@@ -17,11 +17,10 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.bench.cards import Entrant, Evaluation
 from coopenv.evaluation import held_out_seeds
-from coopenv.evaluation.episodes import Episodes
+from coopenv.evaluation.episodes import Episodes, play
 from coopenv.evaluation.metrics import Quantile, interval, resamples
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
-from coopenv.runs.rollouts import play
 from coopenv.runs.scenes import frame_stride, scene_of, video_path, write_page, write_pictures
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle

@@ -1,7 +1,8 @@
-"""Drive one episode in every world of a batch and keep what drivers are judged by."""
+"""Episodes in every world of a batch: stepping, and what drivers are judged by."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -97,6 +98,77 @@ def driven_vehicles(scenario: Scenario) -> list[int]:
     return [i for i, vehicle in enumerate(scenario.vehicles) if vehicle.motion.kind == "driven"]
 
 
+def play(
+    engine: Engine,
+    seeds: int | Sequence[int],
+    ticks: int,
+    policy: Policy | None = None,
+    to_the_end: bool = True,
+    options: Mapping[str, Any] | None = None,
+    stride: int = 1,
+) -> Iterator[int]:
+    """Start an episode in every world and yield the number of camera ticks since then, from 0, once they are there.
+
+    Args:
+        engine: what is run, on any backend; it is stopped when something fails meanwhile.
+        seeds: of the batch, or one per world.
+        ticks: after the start; fewer where the backend has no more.
+        policy: drives every vehicle, its rows are (world, vehicle); None: action zero.
+        to_the_end: go on when all vehicles that are estimated here have ended.
+        options: for a backend that takes some at a reset.
+        stride: ticks from one number to the next, at most those of a decision.
+
+    Raises:
+        CoopenvError: the policy returns something else than actions.
+    """
+    whole = isinstance(seeds, int)
+    with engine.stopping():
+        keys = world_keys(seeds, engine.world.worlds) if whole else [world_keys(seed)[0] for seed in seeds]
+        engine.reset(keys, options=options)
+        engine.set_actions(np.zeros_like(engine.view("actions")))
+        shape, here = engine.view("actions").shape, [*estimated_here(engine)]
+        rows = shape[0] * shape[1]
+        if policy is not None:
+            restart(policy, np.ones(rows, dtype=bool))
+        yield 0
+        for tick in range(0, ticks, stride):
+            if tick % engine.world.model.ticks_per_decision == 0:
+                if not to_the_end and engine.view("ended")[:, here].all():
+                    return
+                if policy is not None:
+                    observations = engine.view("observation").reshape(rows, -1).copy()
+                    engine.set_actions(decide(policy, observations, shape[-1]).reshape(shape))
+            engine.step(ticks=min(stride, ticks - tick))
+            if engine.view("exhausted")[0]:
+                return
+            yield min(tick + stride, ticks)
+
+
+def estimated_here(engine: Engine) -> tuple[int, ...]:
+    """Return which vehicles are estimated here, not elsewhere and heard by radio."""
+    here = engine.backend.capabilities.estimated
+    return tuple(range(engine.world.model.vehicles)) if here is None else here
+
+
+class Views:
+    """Fields of an engine at several ticks; one whose copying was interrupted does not count."""
+
+    def __init__(self, engine: Engine, names: Iterable[str]) -> None:
+        self._engine = engine
+        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        self.taken = 0
+
+    def take(self) -> None:
+        """Copy the fields as they are now."""
+        for name, rows in self._rows.items():
+            rows.append(self._engine.view(name).copy())
+        self.taken += 1
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return (K, W, ...) of one field."""
+        return np.stack(self._rows[name][: self.taken])
+
+
 def drive(
     engine: Engine,
     policy: Policy,
@@ -115,29 +187,18 @@ def drive(
         CoopenvError: the policy returns something else than actions.
     """
     scenario, view = engine.backend.scenario, engine.view
-    chosen, first = driven_vehicles(scenario), len(scenario.landmarks)
-    rows, width = view("alive").size, view("actions").shape[-1]
-    steps = -(-scenario.horizon_ticks // scenario.ticks_per_decision)
-    kept: dict[str, list[np.ndarray]] = {name: [] for name in KEPT}
-    agents = [first + i for i in chosen]
-    with engine.stopping():
-        engine.reset([world_keys(seed)[0] for seed in seeds])
-        route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
-        restart(policy, np.ones(rows, dtype=bool))
-        place = [view("position")[:, agents, :2].astype(np.float32)]
-        headings = []
-        for step in range(steps):
-            observations = view("observation").reshape(rows, -1).copy()
-            engine.step(decide(policy, observations, width).reshape(view("actions").shape))
-            for name, values in kept.items():
-                values.append(view(name)[:, chosen])
-            forward = view("rotation")[:, agents][..., :2, 0]
-            headings.append(np.arctan2(forward[..., 1], forward[..., 0]).astype(np.float32))
-            place.append(view("position")[:, agents, :2].astype(np.float32))
-            on_progress((step + 1) / steps)
-            if view("over").all():
-                break
-    record = {name: np.stack(values) for name, values in kept.items()}
+    chosen, ticks = driven_vehicles(scenario), scenario.horizon_ticks
+    agents = [len(scenario.landmarks) + i for i in chosen]
+    kept, place, headings = Views(engine, KEPT), [], []
+    for tick in play(engine, seeds, ticks, policy, False, stride=scenario.ticks_per_decision):
+        if tick == 0:
+            route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
+        kept.take()
+        place.append(view("position")[:, agents, :2].astype(np.float32))
+        forward = view("rotation")[:, agents][..., :2, 0]
+        headings.append(np.arctan2(forward[..., 1], forward[..., 0]).astype(np.float32))
+        on_progress(tick / ticks)
+    record = {name: kept[name][1:, :, chosen] for name in KEPT}
     errors = {name: np.nan_to_num(record.pop(name), nan=DIVERGED, posinf=DIVERGED) for name in ERRORS}
     return Episodes(
         vehicles=tuple(scenario.vehicle_names[i] for i in chosen),
@@ -146,7 +207,7 @@ def drive(
         **errors,
         **record,
         position=np.stack(place),
-        heading=np.stack(headings),
+        heading=np.stack(headings[1:]),
         route=route,
         outcome=view("ended")[:, chosen].copy(),
     )

@@ -15,15 +15,14 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
-from coopenv.base.errors import CoopenvError, OutputError, world_keys
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_folder, writing
 from coopenv.base.installation import environment, environment_id, version
-from coopenv.evaluation.episodes import driven_vehicles
-from coopenv.policies import Policy, decide, restart
-from coopenv.runs.rollouts import Views
+from coopenv.evaluation.episodes import Views, driven_vehicles, play
+from coopenv.policies import Policy
 from coopenv.scenario import Scenario
 
-KEPT = ("observation", "reward", "terminated", "truncated", "position_error")
+KEPT = ("observation", "actions", "reward", "terminated", "truncated", "position_error")
 
 
 @dataclass(frozen=True)
@@ -68,29 +67,19 @@ def drive_vehicles(
     if not scenario.driven:
         raise CoopenvError("all motion here is prescribed, there is nothing to drive")
     engine = Engine(scenario, worlds)
-    view, steps = engine.view, -(-scenario.horizon_ticks // scenario.ticks_per_decision)
-    rows, width = view("alive").size, view("actions").shape[-1]
-    kept, actions = Views(engine, KEPT), list[np.ndarray]()
-    with engine.stopping():
-        engine.reset(world_keys(seed, worlds))
-        there = view("alive").copy()
-        restart(policy, np.ones(rows, dtype=bool))
+    kept, ticks = Views(engine, KEPT), scenario.horizon_ticks
+    for tick in play(engine, seed, ticks, policy, False, stride=scenario.ticks_per_decision):
         kept.take()
-        for step in range(steps):
-            chosen = decide(policy, view("observation").reshape(rows, -1).copy(), width)
-            actions.append(chosen.reshape(view("actions").shape).astype(np.float32))
-            engine.step(actions[-1])
-            kept.take()
-            on_progress((step + 1) / steps)
-            if view("over").all():
-                break
+        on_progress(tick / ticks)
+        if tick == 0:
+            there = engine.view("alive").copy()
     engine.close()
-    observations, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
-    driven, ended, episodes = np.stack(actions), ((terminated + truncated) > 0)[1:], []
+    observations, actions, rewards, terminated, truncated, errors = (kept[name] for name in KEPT)
+    driven, ended, episodes = actions[1:], ((terminated + truncated) > 0)[1:], []
     for world, vehicle in product(range(worlds), driven_vehicles(scenario)):
         if not there[world, vehicle]:
             continue
-        length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(actions) - 1)) + 1
+        length = int(next(iter(np.flatnonzero(ended[:, world, vehicle])), len(driven) - 1)) + 1
         before, after, whole = slice(length), slice(1, length + 1), slice(length + 1)
         episodes.append(
             DrivenEpisode(

@@ -12,10 +12,10 @@ from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import action_fields
 from coopenv.backends.base import Backend
 from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.evaluation.episodes import play
 from coopenv.observers.registry import available_names
 from coopenv.policies import Policy, restart
 from coopenv.runs.console import compile_notice
-from coopenv.runs.rollouts import play
 from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import Frame, SceneRecord, Source

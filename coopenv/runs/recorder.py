@@ -12,10 +12,10 @@ from coopenv.backends.sources import simulation_of
 from coopenv.base.files import replace_text, writing
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
+from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.mailbox import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
-from coopenv.runs.rollouts import Views, play
 from coopenv.scenario import Scenario
 
 

@@ -22,12 +22,12 @@ from coopenv.backends.sources import SourceKind, kind_of, open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_file, writing
 from coopenv.base.installation import list_envs
+from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, states_covariance
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.rollouts import play
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import SCENE_FILE, Frame, SceneRecord, Source
 

@@ -20,12 +20,12 @@ from coopenv.bench.executors import Executor
 from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
 from coopenv.estimation.metrics import CONVERGED, SETTLED, Interval, settling_time, wilson_interval
+from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable
 from coopenv.observers.runner import run
 from coopenv.runs.console import number_table
-from coopenv.runs.rollouts import Views, play
 from coopenv.scenario import Scenario
 
 RADIUS = 15.0  # m
