@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.estimation.poses import Array, are_numbers, are_rotations
 from coopenv.observers.contract import Message, ObserverInit, check_message
 from coopenv.observers.recording import Sensed
@@ -200,7 +200,9 @@ class TickGenerator(ABC):
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
         """Begin an episode and return tick 0. Raises CoopenvError: an option is not known, or there is no tick."""
-        check_options(options, self.options)
+        for key in options:
+            if key not in IGNORED_OPTIONS:
+                check_one_of("unknown option", key, self.options)
         self.stop("reset")
         self._episode = self.episode(seed, options)
         first = next(self._episode, None)

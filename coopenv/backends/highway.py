@@ -9,6 +9,7 @@ import numpy as np
 
 from coopenv.backends.simulated import CosimulatedWorld, Poses, Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
+from coopenv.base.installation import needing
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
@@ -95,11 +96,9 @@ def make_environment(scenario: Scenario) -> Any:
 
 def _creator(name: str) -> Any:
     """Return the class of an environment."""
-    try:
+    with needing(NO_ENVIRONMENT):
         import gymnasium
         import highway_env  # noqa: F401  (registers its environments)
-    except ImportError:
-        raise CoopenvError(NO_ENVIRONMENT) from None
     from gymnasium.envs.registration import load_env_creator
 
     known = {i: s.entry_point for i, s in gymnasium.registry.items() if str(s.entry_point).startswith("highway_env.")}

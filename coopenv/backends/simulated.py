@@ -12,7 +12,7 @@ from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGener
 from coopenv.backends.feed import recall_truth
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight
-from coopenv.estimation.poses import Array
+from coopenv.estimation.poses import Array, about_z
 from coopenv.observers.contract import sealed
 from coopenv.observers.recording import Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
@@ -292,10 +292,10 @@ class CosimulatedWorld(SimulatedWorld):
     def _put(self, world: int, poses: Poses, velocity: Array, yaw_rate: Array) -> None:
         row = {name: values[world] for name, values in self._motion.items()}
         self.remember(world, poses)
-        row["true_rotation"][...] = _about_z(poses.heading)
+        row["true_rotation"][...] = about_z(poses.heading)
         row["true_position"][..., :2] = poses.xy
         row["true_velocity"][..., :2], row["true_angular_velocity"][..., 2] = velocity, yaw_rate
-        row["traffic_rotation"][...] = _about_z(poses.traffic_heading)
+        row["traffic_rotation"][...] = about_z(poses.traffic_heading)
         for name in ("speed", "steering", "crashed", "left", "traffic_position", "traffic_half"):
             row[name][...] = getattr(poses, name)
 
@@ -309,13 +309,3 @@ class CosimulatedWorld(SimulatedWorld):
         for _ in range(ticks):
             self.fetch()
             super().advance(1)
-
-
-def _about_z(heading: Array) -> Array:
-    """Return the rotations (n, 3, 3) by headings (n,) rad."""
-    R = np.zeros((len(heading), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(heading)
-    R[:, 1, 0] = np.sin(heading)
-    R[:, 0, 1] = -R[:, 1, 0]
-    R[:, 2, 2] = 1.0
-    return R

@@ -12,7 +12,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from coopenv.base.errors import CoopenvError, DataError, suggest
+from coopenv.base.errors import CoopenvError, DataError, check_one_of
 from coopenv.base.installation import list_envs
 
 if TYPE_CHECKING:
@@ -171,9 +171,8 @@ def open_backend(
         )
         return backend
     _refuse(cars, ": is for backend='svea'")
-    if backend is not None and backend not in BACKENDS:
-        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
-        raise CoopenvError(f"unknown backend '{backend}'{known}")
+    if backend is not None:
+        check_one_of("unknown backend", str(backend), BACKENDS)
     if backend in (None, "replay") and is_bag(name_or_path, topics):
         return open_bags([name_or_path], topics, overrides, data, variant)
     _refuse({f"topics {topics}": topics}, f": is for ROS bags, '{name_or_path}' is none")

@@ -138,6 +138,13 @@ def listed(names: Sequence[str], most: int = 12) -> str:
     return ", ".join(few)
 
 
+def check_one_of(what: str, name: object, valid: Iterable[str], error: type[ValueError] = CoopenvError) -> None:
+    """Refuse a name that is not valid, with the nearest and all that are; `what` begins the error."""
+    names = [*valid]
+    if name not in names:
+        raise error(f"{what} {shown(name)}{suggest(str(name), names)}; known: {listed(names) or 'none'}")
+
+
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
     near = get_close_matches(word[:MAX_MESSAGE], list(valid), n=1, cutoff=0.5)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf, nan
 
-from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 
 GRAMMAR = "[VEHICLE:]NAME[=VALUE][@START[+DURATION]][,OPTION=VALUE...]"
 _FORM = re.compile(
@@ -77,8 +77,7 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
     if found is None:
         raise FaultError(f"fault {shown(text)}: expected {GRAMMAR}; faults: {listed([*kinds])}")
     name = found["name"]
-    if name not in kinds:
-        raise FaultError(f"unknown fault {shown(name)}{suggest(name, kinds)}; known: {listed([*kinds])}")
+    check_one_of("unknown fault", name, kinds, FaultError)
     kind, where = kinds[name], f"fault {name}"
     allowed = {"vehicles": kind.vehicles, "start": kind.start, "duration": kind.duration}
     for part in (part for part, may in allowed.items() if found[part] is not None and not may):
@@ -112,10 +111,7 @@ def _value(text: str | None, kind: FaultKind, where: str, name: str) -> tuple[st
     """Return the word and the number of a value."""
     if kind.words:
         word, colon, number = (text or "").partition(":")
-        if word not in kind.words:
-            raise FaultError(
-                f"{where}: unknown {name} {shown(word)}{suggest(word, kind.words)}; known: {listed([*kind.words])}"
-            )
+        check_one_of(f"{where}: unknown {name}", word, kind.words, FaultError)
         return word, _number(number, f"{where}: value", kind.low, kind.high) if colon else kind.words[word]
     if text is None:
         if kind.default is None:

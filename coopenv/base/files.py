@@ -224,6 +224,12 @@ def new_folder(folder: Path) -> Iterator[Path]:
         raise
 
 
+def check_new(path: Path, force: bool, named: Path | None = None) -> None:
+    """Keep what is there, which errors call `named`. Raises OutputError: there is a file, and `force` is not given."""
+    if path.exists() and not force:
+        raise OutputError(f"{named or path}: exists already; --force replaces it")
+
+
 def check_file(path: str | Path) -> None:
     """Check before any work that a file can be written. Raises OutputError: it cannot."""
     with _staging(path, _check_file):

@@ -147,6 +147,15 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
+@contextmanager
+def needing(words: str) -> Iterator[None]:
+    """Turn the absence of a package into a `CoopenvError`, whose words say what needs it, and how to install it."""
+    try:
+        yield
+    except ImportError as error:
+        raise CoopenvError(f"{words} ({error})") from None
+
+
 def is_reference(text: str) -> bool:
     """Return whether a text is meant to name a place in code."""
     return ":" in text

@@ -6,8 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from coopenv.base.errors import OutputError
-from coopenv.base.files import replace_text, replacing_folder
+from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version, versions
 from coopenv.bench.cards import (
@@ -83,8 +82,7 @@ def run(
 
     if out is None:
         return driven()
-    if (out / JSON_FILE).exists() and not force:
-        raise OutputError(f"{out / JSON_FILE}: exists already; --force replaces it")
+    check_new(out / JSON_FILE, force)
     names = [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS, REPLAY_FILE]
     with replacing_folder(out, [*names, *(path.name for path in out.glob("replay_*.html"))]) as new:
         evaluation = driven()

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import ONE_THREAD, available_cores, environment
+from coopenv.base.installation import ONE_THREAD, available_cores, environment, needing
 from coopenv.base.interrupts import end_with_parent, held
 
 T = TypeVar("T")
@@ -118,10 +118,8 @@ class Ray:
             CoopenvError: Ray is not installed, or the cluster does not answer in time.
         """
         os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is one line, printed here
-        try:
+        with needing("--engine ray needs Ray: pip install '.[ray]'"):
             import ray
-        except ImportError:
-            raise CoopenvError("--engine ray needs Ray: pip install '.[ray]'") from None
         if ray.is_initialized():
             return ray
         failure: list[BaseException | None] = []

@@ -2,13 +2,13 @@
 
 import json
 import tomllib
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import compress, groupby, product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple
 
 import tomlkit
 from pydantic import Field
@@ -28,7 +28,6 @@ from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.runs.console import Progress, number_table
 from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
 
-T = TypeVar("T")
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
 
@@ -174,31 +173,23 @@ class Judge:
         """Take so many worlds of either block."""
         self.worlds = worlds
         self._episodes: dict[Driven, Episodes] = {}
-        self._known: dict[Hashable, Any] = {}
+        self._score = cache(lambda driven: score(self._drive(driven)))
+        self._compare = cache(lambda own, other: compare_paired(self._drive(own), self._drive(other)))
 
     def results(
         self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None, block: int = REPORTED
     ) -> list[Result]:
         """Return the figures of an agent in the worlds of a block, under overrides of the environment."""
-        driven = _driven(environment, agent, overrides or {}, block)
-        return self._once(driven, lambda: score(self._drive(driven)))
+        return self._score(_driven(environment, agent, overrides or {}, block))
 
     def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
         """Return how much an agent's figures differ from another's in the same worlds."""
-        own, others = (_driven(environment, each, {}, REPORTED) for each in (agent, other))
-        return self._once((own, others), lambda: compare_paired(self._drive(own), self._drive(others)))
+        return self._compare(*(_driven(environment, each, {}, REPORTED) for each in (agent, other)))
 
     def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
         """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""
         results = self.results(environment, agent, overrides, CHOSEN)
         return {result.metric: result.mean for result in results}["return"]
-
-    def _once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Return what is known of a key, or make it."""
-        if key not in self._known:
-            self._known[key] = make()
-        found: T = self._known[key]
-        return found
 
     def _drive(self, driven: Driven) -> Episodes:
         """Return episodes; large ones stay only as long as others of their environment are wanted for comparison."""

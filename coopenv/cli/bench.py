@@ -177,11 +177,10 @@ def bench_learning(
     logs: Annotated[Path, typer.Option(help="Folder for TensorBoard's files.")] = Path("out", "tensorboard"),
 ) -> None:
     """Train agents by environment, arm and seed, and write their cards; goes on where it was interrupted."""
-    try:
+    from coopenv.base.installation import available_cores, needing
+
+    with needing("coopenv bench learning needs the extra train: pip install '.[train]'"):
         from coopenv.bench import learning
-    except ImportError as error:
-        raise CoopenvError(f"coopenv bench learning needs the extra train: pip install '.[train]' ({error})") from None
-    from coopenv.base.installation import available_cores
 
     whole, log = learning.read_study(study), options.console(stderr=True)
     chosen, folder = whole.only(options.words(only)), out or study.parent

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coopenv.base.errors import CoopenvError, DataWarning, OutputError
+from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.cli import options
 
 if TYPE_CHECKING:
@@ -107,6 +107,7 @@ def record(given: RecordOptions) -> None:
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
     from coopenv.backends.sources import is_bag, is_recorded, open_recording
+    from coopenv.base.files import check_new
     from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record as recorded
     from coopenv.runs.scenes import (
@@ -178,12 +179,6 @@ def check_log(out: Path, observer: str | None, scene: bool) -> None:
         check_scene(observer)
     elif observer is not None:
         raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
-
-
-def check_new(path: Path, force: bool) -> None:
-    """Keep a file that is there. Raises OutputError: there is one, and `force` is not given."""
-    if path.exists() and not force:
-        raise OutputError(f"{path}: exists already; --force replaces it")
 
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
@@ -282,6 +277,7 @@ def import_(
         _print(rows, as_json)
         return
     from coopenv.backends.sources import open_bags
+    from coopenv.base.files import check_new
 
     if out is not None:
         check_log(out, observer, scene)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import needing
 from coopenv.cli import options
 
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
@@ -89,12 +90,10 @@ def train(given: TrainOptions) -> None:
 
     from coopenv.runs.console import Progress
 
-    try:
+    needs = "torch, stable-baselines3, tensorboard and tomlkit: pip install '.[train]'"
+    with needing(f"coopenv train needs {needs}"):
         from coopenv.training.command import Reports
         from coopenv.training.command import train as perform
-    except ImportError as error:
-        needs = "torch, stable-baselines3, tensorboard and tomlkit: pip install '.[train]'"
-        raise CoopenvError(f"coopenv train needs {needs} ({error})") from None
     folder = given.out or Path("out", "train", Path(given.environment).stem)
     plan, log = given.plan(folder), options.console(stderr=True)
     with options.warned():

@@ -123,7 +123,7 @@ def settling_times(
 
 def steady_mean(t: np.ndarray, values: np.ndarray, steady_from: float) -> np.ndarray:
     """Return the mean of values (K, ...) over the ticks with t > steady_from; NaN if there are none."""
-    return _mean(values[t > steady_from])
+    return mean_or_nan(values[t > steady_from])
 
 
 def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndarray:
@@ -134,7 +134,7 @@ def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndar
 
 def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
     """Return (...) targets measured per tick, on average, of `visible` (K, ..., T)."""
-    return _mean(np.sum(visible, axis=-1))
+    return mean_or_nan(np.sum(visible, axis=-1))
 
 
 def mirrored(orientation_error: np.ndarray) -> np.ndarray:
@@ -203,8 +203,6 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
 
     Steady RMSE and mean NEES are over the ticks after `steady_from`, s; nothing counts after `ends`, see `live_ticks`.
     """
-    settled = settling_times(trajectory, ends, SETTLED)
-    converged = settling_times(trajectory, ends, CONVERGED)
     rows = []
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
         t = trajectory.t[:ticks]
@@ -217,8 +215,8 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
                 "vehicle": str(trajectory.vehicles[vehicle]),
                 "initial_position_error_m": float(position[0]),
                 "initial_orientation_error_deg": float(orientation[0]),
-                "settle_time_s": float(settled[vehicle]),
-                "convergence_time_s": float(converged[vehicle]),
+                "settle_time_s": float(settling_time(t, position, orientation, SETTLED)),
+                "convergence_time_s": float(settling_time(t, position, orientation, CONVERGED)),
                 "steady_position_rmse_m": float(steady_rmse(t, position, steady_from)),
                 "steady_orientation_rmse_deg": float(steady_rmse(t, orientation, steady_from)),
                 "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:ticks, vehicle])),
@@ -235,7 +233,7 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
     return rows
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
+def mean_or_nan(values: np.ndarray) -> np.ndarray:
     """Return the mean over the first axis, NaN when it is empty."""
     return np.mean(values, axis=0) if len(values) else np.full(values.shape[1:], np.nan)
 

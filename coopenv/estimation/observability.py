@@ -32,7 +32,7 @@ isotropic. As in the theorem, neighbours count as known, and lambda and p are ab
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, Self, get_type_hints
+from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,22 +92,23 @@ class Trajectory(RecordedGeometry):
     def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
         known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
-        return self if known.all() else self._chosen("K", np.flatnonzero(known))
+        return self if known.all() else self._along("K", known)
 
     def of_vehicles(self, indices: Sequence[int]) -> Self:
         """Return the record of some vehicles alone; the others stay among the targets."""
-        return self if [*indices] == [*range(len(self.vehicles))] else self._chosen("N", indices)
+        return self if [*indices] == [*range(len(self.vehicles))] else self._along("N", [*indices])
 
-    def _chosen(self, axis: str, indices: Sequence[int] | NDArray[np.int64]) -> Self:
-        """Return the record at some indices of an axis."""
-        axes = {name: shape.split()[1:] for name, shape in self._shapes().items()}
-        made = {n: np.take(getattr(self, n), indices, of.index(axis)) for n, of in axes.items() if axis in of}
-        return replace(self, **made)
+    def _along(self, axis: str, chosen: Any) -> Self:
+        """Return the record with the chosen entries of an axis, in every array that has it."""
+        places = {name: kinds.split()[1:] for name, kinds in self.kinds().items()}
+        arrays = {name: (getattr(self, name), axes.index(axis)) for name, axes in places.items() if axis in axes}
+        return replace(self, **{name: array[(slice(None),) * k + (chosen,)] for name, (array, k) in arrays.items()})
 
     @classmethod
-    def _shapes(cls) -> dict[str, str]:
-        """Return the annotations of the arrays."""
-        return {name: hint.__metadata__[0] for name, hint in get_type_hints(cls, include_extras=True).items()}
+    def kinds(cls) -> dict[str, str]:
+        """Return the kinds of the dtype and the axes of every array, by name, as `read_npz` takes them."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {name: hint.__metadata__[0] for name, hint in hints.items()}
 
     def save(self, path: Path) -> None:
         """Write every array into a compressed `.npz` under its field name.
@@ -125,7 +126,7 @@ class Trajectory(RecordedGeometry):
         Raises:
             DataError: the file is no such record, an array is missing or of another shape, or it is too large.
         """
-        return cls(**read_npz(path, "trajectory", cls._shapes()))
+        return cls(**read_npz(path, "trajectory", cls.kinds()))
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,13 @@ def adjoint(R: Array, p: Array) -> Array:
     return A
 
 
+def about_z(angle: Array) -> Array:
+    """Return the rotations (..., 3, 3) about z by angles (...) rad; NaN where an angle is."""
+    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
+    rows = [np.stack(row, axis=-1) for row in ((c, -s, zero), (s, c, zero), (zero, zero, zero + 1.0))]
+    return np.stack(rows, axis=-2)
+
+
 def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
     """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
     return np.asarray(np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float))

@@ -6,7 +6,6 @@ Hinkley, Bootstrap Methods and their Application, 1997, 3.8 (resampling of clust
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +69,7 @@ class Quantile:
         return int(np.count_nonzero(self._seen.any(axis=1)))
 
     def resampled(self, counts: np.ndarray) -> np.ndarray:
-        """See `Ratio.resampled`."""
+        """Return the figure, (R,), for multiplicities of the worlds, (R, W); NaN where none has a value."""
         if len(self._edges) < 2:
             return np.where(counts @ self._seen[:, 0] > 0, self.value, np.nan)
         reached = np.cumsum(counts @ self._seen, axis=1)

@@ -16,8 +16,8 @@ from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.base.files import replacing_folder, writing
-from coopenv.base.installation import environment, environment_id, version
+from coopenv.base.files import check_new, replacing_folder, writing
+from coopenv.base.installation import environment, environment_id, needing, version
 from coopenv.evaluation.episodes import Views, driven_vehicles, play
 from coopenv.policies import Policy
 from coopenv.scenario import Scenario
@@ -114,19 +114,16 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
         CoopenvError: Minari is not installed, or the identity is not one.
         OutputError: the dataset is there.
     """
-    try:
+    with needing("a dataset needs Minari: pip install '.[minari]'"):
         import h5py  # noqa: F401 (Minari imports it late)
         from minari.dataset.minari_dataset import parse_dataset_id
-    except ImportError as error:
-        raise CoopenvError(f"a dataset needs Minari: pip install '.[minari]' ({error})") from None
     try:
         parse_dataset_id(identity)
     except (ValueError, TypeError):
         raise CoopenvError(f"--id {identity}: expected NAMESPACE/NAME-v0, of letters, digits, - and _") from None
     own = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
     place = (root or Path(own)) / identity / "data"
-    if place.exists() and not force:
-        raise OutputError(f"{place.parent}: exists already; --force replaces it")
+    check_new(place, force, place.parent)
     return place
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.base.errors import UnknownEnvironmentError, listed, shown, suggest
+from coopenv.base.errors import UnknownEnvironmentError, check_one_of, shown
 
 LANDMARKS = {"SL1": (-4.0, 5.0, 3.0), "SL2": (4.0, 4.0, 5.0), "SL3": (4.0, -3.0, 4.0)}
 """Name to position, m; as in busy_intersection."""
@@ -231,8 +231,7 @@ def scene_text(name: str) -> str:
         UnknownEnvironmentError: no such scene or option, or a number that is not allowed.
     """
     kind, _, rest = name.partition(":")
-    if kind not in SCENES:
-        raise UnknownEnvironmentError(f"unknown scene {shown(kind)}{suggest(kind, SCENES)}; known: {listed([*SCENES])}")
+    check_one_of("unknown scene", kind, SCENES, UnknownEnvironmentError)
     scene, options = SCENES[kind], _options(kind, rest)
     placed = [*scene.build(**options)]
     head = HEAD.format(

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from coopenv.base.errors import ScenarioWarning, listed, shown, suggest
+from coopenv.base.errors import ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.sections import Section
 from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
@@ -410,9 +410,7 @@ def neighbour_sets(scenario: Scenario) -> list[list[int]]:
             continue
         where = f"vehicles.{i}.neighbours"
         for name in vehicle.neighbours:
-            if name not in index:
-                known = f"{suggest(name, index)}; known: {listed([*index])}"
-                raise ValueError(f"{where}: unknown target {shown(name)}{known}")
+            check_one_of(f"{where}: unknown target", name, index, ValueError)
             if index[name] == own:
                 raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
         result.append(sorted({index[name] for name in vehicle.neighbours}))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot
 from coopenv.base.errors import DataError, suggest
-from coopenv.estimation.poses import Array
+from coopenv.estimation.poses import Array, about_z
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, Truth, check_recording
 
@@ -68,14 +68,14 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         reckoned = held.pose(t)
         arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
         arrays["translation"][1:, i, :2] = _turned(np.diff(reckoned[:, :2], axis=0), -reckoned[:-1, 2])
-        arrays["rotation"][1:, i] = _yaw(np.diff(reckoned[:, 2]))
+        arrays["rotation"][1:, i] = about_z(np.diff(reckoned[:, 2]))
         k, seen, vectors = _seen(robot, variant, held, t)
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
         start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in subjects[:L]])
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
-    arrays["start_rotation"], arrays["start_position"] = _yaw(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
+    arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
     for array in arrays.values():
         array.setflags(write=False)  # observers get views
     recording = Recording(
@@ -86,7 +86,7 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         period=MESSAGE_PERIOD_TICKS,
         staleness=math.inf,
         due=np.ones(K, bool),
-        truth=Truth(_yaw(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        truth=Truth(about_z(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
         **arrays,
     )
     check_recording(recording, dataset.name)
@@ -187,10 +187,3 @@ def _turned(vectors: Array, angle: Array) -> Array:
     """Return vectors (K, 2) turned by angles (K,)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=-1)
-
-
-def _yaw(angle: Array) -> Array:
-    """Return rotations (..., 3, 3) about z; NaN where the angle is."""
-    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
-    rows = [np.stack(row, axis=-1) for row in ((c, -s, zero), (s, c, zero), (zero, zero, zero + 1.0))]
-    return np.stack(rows, axis=-2)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
-from coopenv.base.errors import CoopenvError, checked_seed, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import replace_text
+from coopenv.base.installation import needing
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import Task, judge
@@ -50,10 +51,8 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: pandas is not installed.
         """
-        try:
+        with needing("a table of pandas needs pandas: pip install pandas"):
             from pandas import DataFrame
-        except ImportError:
-            raise CoopenvError("a table of pandas needs pandas: pip install pandas") from None
         rows, kind = (self.window_rows, WindowRow) if windows else (self.rows, Row)
         return DataFrame([asdict(row) for row in rows], columns=[f.name for f in fields(kind)])
 
@@ -103,8 +102,7 @@ class Comparison(Leaderboard):
         from coopenv.viz import figures
         from coopenv.viz.style import save
 
-        if kind not in KINDS:
-            raise CoopenvError(f"unknown figure '{kind}'{suggest(kind, KINDS)}; known: {', '.join(KINDS)}")
+        check_one_of("unknown figure", kind, KINDS)
         drawn = KINDS[kind](self, self._checked(variant), figures.inches_of(width))
         if drawn is None:
             raise CoopenvError(f"figure '{kind}': there is nothing to draw")

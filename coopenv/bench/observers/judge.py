@@ -17,6 +17,7 @@ from coopenv.estimation.metrics import (
     absolute_error,
     diverged,
     fit_exponential_rate,
+    mean_or_nan,
     position_std,
     relative_error,
     settling_time,
@@ -132,7 +133,8 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         bounds = _bounds(recording)
         bound = bounds[0].position[kept]
         ticks = [window.ticks(recording.t) for window in windows]
-        within = np.array([[_mean(of.position[chosen] ** 2) for chosen in ticks] for of in bounds]).swapaxes(1, 2)
+        means = [[mean_or_nan(of.position[chosen] ** 2) for chosen in ticks] for of in bounds]
+        within = np.array(means).swapaxes(1, 2)
     if known:
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
@@ -152,11 +154,6 @@ def _geometry(recording: Recording) -> RecordedGeometry:
 def kept_ticks(recording: Recording) -> np.ndarray:
     """Return the ticks of which figures show something."""
     return np.unique(np.linspace(0, recording.ticks - 1, SERIES_TICKS).round().astype(int))
-
-
-def _mean(values: Array) -> Array:
-    """Return the mean over the first axis, NaN when it is empty."""
-    return np.mean(values, axis=0) if len(values) else np.full(values.shape[1:], np.nan)
 
 
 def _bounds(recording: Recording) -> list[Bound]:
