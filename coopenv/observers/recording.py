@@ -115,9 +115,12 @@ class Drawn:
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recording(Measurements):
-    """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
+@dataclass(frozen=True)
+class Recording:
+    """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks.
+
+    Its arrays become read-only, because observers get views.
+    """
 
     setups: tuple[Setup, ...]  # (N,) what each vehicle knows before it starts
     order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
@@ -134,6 +137,11 @@ class Recording(Measurements):
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
     interference: "Interference | None" = None  # of the world's faults with messages and observers; None: there is none
+
+    def __post_init__(self) -> None:
+        for values in vars(self).values():
+            if isinstance(values, np.ndarray):
+                values.setflags(write=False)
 
     @property
     def ticks(self) -> int:
@@ -161,10 +169,10 @@ class Recording(Measurements):
 
     def at(self, k: int) -> Sensed:
         """Return what all vehicles sense at tick k."""
-        sensed: dict[str, Any] = {name: sealed(getattr(self, name)[k]) for name in PER_TICK}
+        sensed: dict[str, Any] = {name: getattr(self, name)[k] for name in PER_TICK}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
         if self.pan is not None:
-            sensed["pan"] = sealed(self.pan[k])
+            sensed["pan"] = self.pan[k]
         return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
 
     def odometry_age(self, rate: float) -> Array:

@@ -59,8 +59,6 @@ def record(
     names = MEASURED if scenario.action.pan is None else (*MEASURED, "pan")
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
     start_rotation = views["estimate_rotation"][0, 0]
-    for values in (*kept.values(), start_rotation):
-        values.setflags(write=False)  # observers get views
     return Recording(
         setups=observer_init.setups,
         order=observer_init.order,

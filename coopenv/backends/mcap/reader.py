@@ -98,8 +98,6 @@ class TickArrays:
         lengths = np.diff([*changes, self._ticks])
         arrays["landmarks"] = np.repeat([self._landmarks[k] for k in changes], lengths, axis=0)
         truth = Truth(arrays.pop("truth.rotation"), arrays.pop("truth.position"))
-        for values in arrays.values():
-            values.setflags(write=False)  # observers get views
         return {**arrays, "truth": truth}
 
 

@@ -76,8 +76,6 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in subjects[:L]])
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
     arrays["start_rotation"], arrays["start_position"] = about_z(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
-    for array in arrays.values():
-        array.setflags(write=False)  # observers get views
     recording = Recording(
         setups=_setups(subjects, L),
         order=tuple(range(N)),
@@ -185,5 +183,4 @@ def _moved(pose: Array, before: Array, after: Array) -> Array:
 
 def _turned(vectors: Array, angle: Array) -> Array:
     """Return vectors (K, 2) turned by angles (K,)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=-1)
+    return np.asarray((about_z(angle)[:, :2, :2] @ vectors[..., None])[..., 0])

@@ -5,7 +5,7 @@ Of initial estimates the attitude is uniform over SO(3), the position uniform in
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,9 +17,9 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
-from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
 from coopenv.estimation.metrics import CONVERGED, SETTLED, Interval, settling_time, wilson_interval
+from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.evaluation.episodes import Views, play
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
@@ -30,7 +30,6 @@ from coopenv.scenario import Scenario
 
 RADIUS = 15.0  # m
 ANGLE_BINS = tuple(range(0, 181, 30))  # deg
-UNIFORM_ANGLE_VARIANCE = (np.pi**2 / 3.0 + 2.0) / 3.0  # rad^2, per axis of the vectors of rotations uniform over SO(3)
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,8 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = radius * generator.random((N, 1)) ** (1 / 3)
     rotations = np.array(Rotation.random(N, generator).as_matrix())
-    covariance = np.diag(np.repeat([UNIFORM_ANGLE_VARIANCE, radius**2 / 5.0], 3))
-    return changed(
+    covariance = np.diag(np.repeat([UNIFORM_ROTATION, radius**2 / 5.0], 3))
+    return replace(
         recording,
         start_rotation=rotations,
         start_position=recording.truth.position[0] + distance * direction,

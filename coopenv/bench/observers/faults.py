@@ -35,7 +35,7 @@ def with_loss(recording: Recording, fault: Fault, seed: int) -> Recording:
     inbox = recording.inbox_tick
     news = np.diff(inbox, axis=0, prepend=-1) > 0
     kept = news & (np.random.default_rng([seed, 1]).random(inbox.shape) >= fault.value)
-    return changed(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
+    return replace(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
 
 
 def with_delay(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -43,7 +43,7 @@ def with_delay(recording: Recording, fault: Fault, seed: int) -> Recording:
     ticks = min(round(fault.value / recording.dt), recording.ticks)
     inbox = np.full_like(recording.inbox_tick, -1)
     inbox[ticks:] = recording.inbox_tick[: recording.ticks - ticks]
-    return changed(recording, inbox_tick=inbox)
+    return replace(recording, inbox_tick=inbox)
 
 
 def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -62,7 +62,7 @@ def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Rec
         if len(others):
             pair = [target, others[int(partners[k, i, target] * len(others))]]
             bearings[k, i, pair] = bearings[k, i, pair[::-1]]
-    return changed(recording, bearings=bearings)
+    return replace(recording, bearings=bearings)
 
 
 def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -72,7 +72,7 @@ def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recordin
     landmarks = np.arange(recording.visible.shape[2]) < recording.landmarks.shape[1]
     hidden = lost[:, None, None] & landmarks
     bearings = np.where(hidden[..., None], np.nan, recording.bearings)
-    return changed(recording, visible=recording.visible & ~hidden, bearings=bearings)
+    return replace(recording, visible=recording.visible & ~hidden, bearings=bearings)
 
 
 def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -371,10 +371,3 @@ def check_recorded(variant: FaultVariant, vehicles: Sequence[str]) -> None:
         if isinstance(FAULTS[fault.name], WorldFault):
             raise CoopenvError(f"fault {fault.text}: is of a simulated world, this one is recorded")
         check_vehicles(fault, vehicles)
-
-
-def changed(recording: Recording, **arrays: Any) -> Recording:
-    """Return the record with other arrays, which are read-only."""
-    for array in arrays.values():
-        array.setflags(write=False)
-    return replace(recording, **arrays)
