@@ -121,9 +121,11 @@ def play(
     Raises:
         CoopenvError: the policy returns something else than actions.
     """
-    whole = isinstance(seeds, int)
     with engine.stopping():
-        keys = world_keys(seeds, engine.world.worlds) if whole else [world_keys(seed)[0] for seed in seeds]
+        if isinstance(seeds, int):
+            keys = world_keys(seeds, engine.world.worlds)
+        else:
+            keys = [world_keys(seed)[0] for seed in seeds]
         engine.reset(keys, options=options)
         engine.set_actions(np.zeros_like(engine.view("actions")))
         shape, here = engine.view("actions").shape, [*estimated_here(engine)]
