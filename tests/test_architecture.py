@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2100, 7),
     "estimation": (1706, 8),
     "evaluation": (500, 3),
-    "observers": (12130, 45),
+    "observers": (12138, 45),
     "policies": (1280, 7),
     "runs": (3150, 13),
     "scenario": (2821, 11),
