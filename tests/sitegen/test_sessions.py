@@ -23,7 +23,6 @@ PAGES = {
     "how-to/figures.md": [pytest.mark.slow],
     "how-to/faults.md": [pytest.mark.slow],
     "how-to/batches.md": [],
-    "contributing/agent.md": [],
 }
 NEEDS = {
     "tutorials/train.md": ("stable_baselines3", "train"),
