@@ -176,9 +176,8 @@ IGNORED_OPTIONS = ("options", "arm")
 def check_options(options: Iterable[str], known: Sequence[str]) -> None:
     """Refuse options of a reset that a backend does not know. Raises CoopenvError: there is one."""
     for key in options:
-        if key not in known and key not in IGNORED_OPTIONS:
-            names = ", ".join(known) or "none"
-            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), known)}; known: {names}")
+        if key not in IGNORED_OPTIONS:
+            check_one_of("unknown option", key, known)
 
 
 class TickGenerator(ABC):
@@ -200,9 +199,7 @@ class TickGenerator(ABC):
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
         """Begin an episode and return tick 0. Raises CoopenvError: an option is not known, or there is no tick."""
-        for key in options:
-            if key not in IGNORED_OPTIONS:
-                check_one_of("unknown option", key, self.options)
+        check_options(options, self.options)
         self.stop("reset")
         self._episode = self.episode(seed, options)
         first = next(self._episode, None)

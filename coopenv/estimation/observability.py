@@ -35,7 +35,6 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.base.files import replacing_file
 from coopenv.base.npz import read_npz

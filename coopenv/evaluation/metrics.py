@@ -6,6 +6,7 @@ Hinkley, Bootstrap Methods and their Application, 1997, 3.8 (resampling of clust
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np

@@ -115,8 +115,8 @@ class Drawn:
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.learning.PARAMETERS`
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, kw_only=True)
+class Recording(Measurements):
     """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks.
 
     Its arrays become read-only, because observers get views.

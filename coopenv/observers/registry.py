@@ -93,12 +93,6 @@ ZOO = {
         "robust.observer:ROBUST",
         on_a_plane=False,
     ),
-    "robust_joint": ZooEntry(
-        "robust.joint_fusion:robust_joint",
-        "The robust observer with larger, joint messages, for vehicles in space",
-        "robust.joint_fusion:ROBUST_JOINT",
-        on_a_plane=False,
-    ),
     "centralised": ZooEntry("centralised:Centralised", "One filter over all vehicles and all measurements"),
 }
 """By name."""

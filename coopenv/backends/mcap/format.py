@@ -18,9 +18,9 @@ from typing import Annotated, Any, NamedTuple, Self
 import numpy as np
 from pydantic import Field, create_model
 
-from coopenv.base.errors import DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
-from coopenv.base.installation import needing
+from coopenv.base.installation import message_types, needing, version
 from coopenv.base.sections import Section, validated
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
@@ -73,11 +73,8 @@ def codec() -> Any:
     """Return the store of message types, with ours in it. Raises CoopenvError: the extra is not installed."""
     with needing("MCAP files need an extra: pip install '.[log]'"):
         import mcap  # noqa: F401
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
-    return store
+
+        return message_types("ROS2_JAZZY")
 
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]

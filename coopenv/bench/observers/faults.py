@@ -8,7 +8,6 @@ The spelling is that of `coopenv.base.fault_text`; `/` joins several faults of o
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -248,11 +247,9 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
     """Read the faults of one variant, named as they are written or otherwise.
 
     Raises:
-        FaultError: one is not valid; a spelling of earlier versions is named with the present one.
+        FaultError: one is not valid.
     """
     text = text.strip()
-    if (now := present_spelling(text)) != text:
-        raise FaultError(f"fault {text}: @ and + are times now; write {now}")
     faults = tuple(parse_fault(word, FAULTS) for word in text.split("/")) if text else ()
     for fault in faults:
         if fault.word == "collude" and len(fault.vehicles) < 2:
@@ -264,32 +261,6 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
         if fault.name == "restart" and fault.start is None:
             raise FaultError(f"fault {fault.text}: expected restart@START")
     return FaultVariant(name or text, faults)
-
-
-_OLD = re.compile(r"@[A-Za-z_]|,from=|\+[A-Za-z_]+=|^(lying_neighbour|restart|landmarks_lost)=")
-
-
-def present_spelling(text: str) -> str:
-    """Return a variant in the present grammar, in which `@` and `+` are times; one that is in it stays."""
-    if not _OLD.search(text):
-        return text
-    made = []
-    for part in re.split(r"\+(?=[A-Za-z_])", text):
-        first, *options = part.split(",")
-        first, _, vehicles = first.partition("@")
-        name, _, value = first.partition("=")
-        start = next((f"@{option[5:]}" for option in options if option.startswith("from=")), "")
-        options = [option for option in options if not option.startswith("from=")]
-        if name == "lying_neighbour":
-            name, value = "lie", f"jump:{value}"
-            options += [] if any(option.startswith("std=") for option in options) else ["std=0.01"]
-        elif name == "restart":
-            start, value = f"@{value}", ""
-        elif name == "landmarks_lost":
-            start, value = f"{start or '@60%'}+{value}", ""
-        who = f"{vehicles.replace(':', ',')}:" if vehicles else ""
-        made.append(",".join([f"{who}{name}{f'={value}' if value else ''}{start}", *options]))
-    return "/".join(made)
 
 
 VARIANTS = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +22,6 @@ from coopenv.bench.observers.faults import (
     DIRECTION,
     FAULTS,
     VARIANTS,
-    present_spelling,
     usual_sender,
     variant_of,
 )
@@ -57,22 +55,18 @@ def test_how_a_fault_is_written() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "now"),
+    "old",
     [
-        ("lie=drift:0.05@vehicle_2,from=10", "vehicle_2:lie=drift:0.05@10"),
-        ("gyro_bias=0.1+odometry_scale=0.2", "gyro_bias=0.1/odometry_scale=0.2"),
-        ("lying_neighbour=2@vehicle_3,from=1,std=0.5", "vehicle_3:lie=jump:2@1,std=0.5"),
-        ("lying_neighbour=2", "lie=jump:2,std=0.01"),
-        ("restart=15@vehicle_3,spread=2", "vehicle_3:restart@15,spread=2"),
-        ("landmarks_lost=10,from=3", "landmarks_lost@3+10"),
-        ("landmarks_lost=10", "landmarks_lost@60%+10"),
-        ("lie=collude:4@vehicle_1:vehicle_2", "vehicle_1,vehicle_2:lie=collude:4"),
+        "lie=drift:0.05@vehicle_2,from=10",
+        "gyro_bias=0.1+odometry_scale=0.2",
+        "lying_neighbour=2",
+        "restart=15",
+        "landmarks_lost=10,from=3",
+        "lie=collude:4@vehicle_1:vehicle_2",
     ],
 )
-def test_an_earlier_spelling_is_refused_with_the_present_one(old: str, now: str) -> None:
-    assert present_spelling(old) == now == present_spelling(now)
-    assert variant_of(now).faults
-    with pytest.raises(CoopenvError, match=re.escape(f"write {now}")):
+def test_an_earlier_spelling_is_refused(old: str) -> None:
+    with pytest.raises(CoopenvError):
         variant_of(old)
 
 
