@@ -85,22 +85,22 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 
 LINES_AND_FILES = {
-    ".": (150, 2),
-    "api": (3915, 19),
-    "backends": (3260, 17),
-    "base": (1375, 9),
-    "bench": (4415, 17),
-    "cars": (7815, 35),
-    "cli": (2100, 7),
-    "estimation": (1706, 8),
+    ".": (130, 2),
+    "api": (3850, 19),
+    "backends": (3230, 17),
+    "base": (1390, 9),
+    "bench": (4190, 17),
+    "cars": (7090, 35),
+    "cli": (2050, 7),
+    "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (12138, 45),
-    "policies": (1280, 7),
-    "runs": (3150, 13),
-    "scenario": (2821, 11),
-    "training": (1205, 5),
-    "viz": (4490, 17),
-    "world": (4250, 17),
+    "observers": (10840, 43),
+    "policies": (1270, 7),
+    "runs": (3060, 13),
+    "scenario": (2840, 11),
+    "training": (1160, 5),
+    "viz": (4410, 17),
+    "world": (4140, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -1,11 +1,11 @@
 """What users give and read on the host: options of a reset, the results of a step, and a reward in Python."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import ActionError, CoopenvError, error_text, shown, suggest
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, error_text, shown, suggest
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import LEVELS, PARAMETERS
@@ -26,7 +26,7 @@ def checked_options(options: object, known: tuple[str, ...], ignored: tuple[str,
         raise CoopenvError(f"options must be a dict, got {type(options).__name__}")
     for key in options:
         if key not in ignored:
-            check_choice("option", key, known)
+            check_one_of("unknown option", key, known)
     return dict(options)
 
 
@@ -41,7 +41,7 @@ def world_parameters(options: Mapping[str, Any], worlds: int, scenario: Scenario
         raise CoopenvError(f"option 'parameters' must be a dict, got {type(factors).__name__}")
     found = {}
     for name, value in factors.items():
-        check_choice("parameter", name, PARAMETERS)
+        check_one_of("unknown parameter", name, PARAMETERS)
         _, low, high = PARAMETERS[name]
         if name == "traffic_pace" and not scenario.paced:
             high = 1.0  # motions are worked out for the horizon alone
@@ -52,7 +52,7 @@ def world_parameters(options: Mapping[str, Any], worlds: int, scenario: Scenario
         value = options["difficulty"]
         level = scenario.difficulty.number if value is None else value
         if isinstance(level, str):
-            check_choice("difficulty", level, LEVELS)
+            check_one_of("unknown difficulty", level, LEVELS)
             level = LEVELS[level]
         found["difficulty"] = _numbers("option 'difficulty'", level, worlds, 0.0, 1.0)
         if value is not None and not scenario.difficulty.matters:
@@ -72,13 +72,6 @@ def _numbers(what: str, value: object, worlds: int, low: float, high: float) -> 
     if not ((numbers >= low) & (numbers <= high)).all():
         raise CoopenvError(f"{what} must be from {low:g} to {high:g}, got {shown(value)}")
     return np.broadcast_to(numbers, (worlds,)).copy()
-
-
-def check_choice(what: str, value: Any, allowed: Collection[Any]) -> None:
-    """Make sure that an argument is one of those allowed. Raises CoopenvError: it is not."""
-    if value not in allowed:
-        names = [str(a) for a in allowed]
-        raise CoopenvError(f"unknown {what} {shown(value)}{suggest(str(value), names)}; known: {', '.join(names)}")
 
 
 def host_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -10,12 +10,12 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
-from coopenv.api.arguments import RewardFunction, check_choice
+from coopenv.api.arguments import RewardFunction
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
 from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation, simulation_of
-from coopenv.base.errors import CoopenvError, ScenarioError
+from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario, load_scenario
@@ -223,7 +223,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self._spec: EnvSpec | None = None
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names = self.world.possible_agents
-        check_choice("vehicle", vehicle, names)
+        check_one_of("unknown vehicle", vehicle, names)
         self.vehicle, self._others = vehicle, others
         self.render_mode = self.world.render_mode
         self.metadata = dict(self.world.metadata)

@@ -14,7 +14,6 @@ from coopenv.api.arguments import (
     SETTINGS,
     RewardFunction,
     Step,
-    check_choice,
     checked_options,
     outcome_words,
     world_parameters,
@@ -23,7 +22,7 @@ from coopenv.api.engine import Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
-from coopenv.base.errors import ActionError, CoopenvError, shown, suggest, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, shown, suggest, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.reset import ABSENT
 from coopenv.world.state import FAULTS, LASTING_ERRORS
@@ -72,7 +71,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     ) -> None:
         """Build the world; use `coopenv.parallel_env` to build one by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
-        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        check_one_of("unknown render_mode", render_mode, (None, *RENDER_MODES))
         backend = simulation_of(source) if isinstance(source, Scenario) else source
         self.scenario = scenario = backend.scenario
         self.render_mode = render_mode
@@ -112,12 +111,12 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's observation space, the same object at every call."""
-        check_choice("agent", agent, self._index)
+        check_one_of("unknown agent", agent, self._index)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's action space, the same object at every call."""
-        check_choice("agent", agent, self._index)
+        check_one_of("unknown agent", agent, self._index)
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:

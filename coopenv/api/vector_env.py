@@ -17,14 +17,13 @@ from gymnasium.vector.utils import batch_space
 from coopenv.api.arguments import (
     SETTINGS,
     RewardFunction,
-    check_choice,
     checked_options,
     host_actions,
     world_parameters,
 )
 from coopenv.api.engine import Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
-from coopenv.base.errors import ActionError, CoopenvError, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, world_keys
 from coopenv.scenario import Scenario
 
 ArrayKind = Literal["numpy", "torch"]
@@ -71,14 +70,14 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         """Build the worlds; use `coopenv.make_vec` to build them by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
-        check_choice("render_mode", render_mode, (None, "rgb_array"))
+        check_one_of("unknown render_mode", render_mode, (None, "rgb_array"))
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
         self.scenario = scenario = self.engine.backend.scenario
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
         modes = {word.lower(): mode for mode in AutoresetMode for word in (mode.name, mode.value)}
         word = str(getattr(autoreset, "name", autoreset)).lower().replace("-", "_")
-        check_choice("autoreset", word, modes)
+        check_one_of("unknown autoreset", word, modes)
         self.autoreset_mode = modes[word]
         self.render_mode = render_mode
         self.metadata = {
@@ -93,7 +92,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._on_cpu = self.engine.world.device == "cpu"
         self.arrays: ArrayKind = arrays if arrays is not None else ("numpy" if self._on_cpu else "torch")
         """What arrays are: fresh host arrays, or tensors on the device that share memory with the engine."""
-        check_choice("arrays", self.arrays, ("numpy", "torch"))
+        check_one_of("unknown arrays", self.arrays, ("numpy", "torch"))
         if self.arrays == "torch" and find_spec("torch") is None:
             raise CoopenvError("arrays='torch' needs torch: pip install '.[train]'")
         self._tensors: dict[str, Any] = {}

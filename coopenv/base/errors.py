@@ -138,10 +138,11 @@ def listed(names: Sequence[str], most: int = 12) -> str:
     return ", ".join(few)
 
 
-def check_one_of(what: str, name: object, valid: Iterable[str], error: type[ValueError] = CoopenvError) -> None:
+def check_one_of(what: str, name: object, valid: Iterable[object], error: type[ValueError] = CoopenvError) -> None:
     """Refuse a name that is not valid, with the nearest and all that are; `what` begins the error."""
-    names = [*valid]
-    if name not in names:
+    allowed = [*valid]
+    if name not in allowed:
+        names = [str(one) for one in allowed]
         raise error(f"{what} {shown(name)}{suggest(str(name), names)}; known: {listed(names) or 'none'}")
 
 

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.base.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.bench import cards
@@ -77,9 +77,7 @@ class Study:
         names = [set(column) for column in zip(*keys, strict=True)]
         known = set().union(*names)
         for word in words:
-            if word not in known:
-                known_names = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
-                raise CoopenvError(f"--only: the study has no '{word}'{known_names}")
+            check_one_of("--only: the study has no", word, sorted(known))
         chosen = [{*words} & column or column for column in names]
         fits = [all(word in column for word, column in zip(key, chosen, strict=True)) for key in keys]
         return Study(tuple(compress(self.plans, fits)))

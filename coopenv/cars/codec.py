@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import message_types
+from coopenv.base.installation import message_types, needing
 from coopenv.cars.profile import SVEA, CarProfile
 
 TICK = "coopenv_msgs/msg/Tick"
@@ -34,10 +34,8 @@ def ros1() -> Any:
 
 
 def _store(name: str) -> Any:
-    try:
+    with needing("messages of cars need an extra: pip install '.[svea]'"):
         return message_types(name)
-    except ImportError:
-        raise CoopenvError("messages of cars need an extra: pip install '.[svea]'") from None
 
 
 def make(kind: str, **fields: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.profile import (
     SVEA,
@@ -336,8 +336,7 @@ class Deployment(Section):
     def car(self, name: str) -> Car:
         """Return a car by name. Raises DeploymentError: there is none."""
         names = [car.name for car in self.cars]
-        if name not in names:
-            raise DeploymentError(f"unknown car {shown(name)}{suggest(name, names)}; known: {listed(names)}")
+        check_one_of("unknown car", name, names, DeploymentError)
         return self.cars[names.index(name)]
 
 

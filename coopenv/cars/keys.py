@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.files import replace_text, writing
+from coopenv.base.installation import needing
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -209,10 +210,8 @@ def check_known(verifier: Verifier, identity: str, path: str | Path) -> None:
 
 def library() -> Any:
     """Return the library's module of Ed25519. Raises CoopenvError: the extra is not installed."""
-    try:
+    with needing("signatures need an extra: pip install '.[svea]'"):
         from cryptography.hazmat.primitives.asymmetric import ed25519
-    except ImportError:
-        raise CoopenvError("signatures need an extra: pip install '.[svea]'") from None
     return ed25519
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed
 from coopenv.base.files import replacing_file, writing
 from coopenv.base.format import seconds
 from coopenv.base.installation import data_directory
@@ -159,9 +159,7 @@ class Demo:
         """Its deployment file. Raises CoopenvError: the environment has none."""
         if self.deployment is not None:
             return self.deployment
-        if self.environment not in FLEETS:
-            known = f"{suggest(self.environment, FLEETS)}; known: {listed(list(FLEETS))}"
-            raise CoopenvError(f"--environment {self.environment}: has no fleet of fakes{known}")
+        check_one_of("--environment: no fleet of fakes for", self.environment, FLEETS)
         return data_directory("examples/fleet") / FLEETS[self.environment]
 
     def run(self, port: int | None, log: Console, out: Console) -> bool:

@@ -14,9 +14,8 @@ from safetensors.numpy import save
 from torch import nn
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
-from coopenv.base.errors import CoopenvError
 from coopenv.base.files import writing
-from coopenv.base.installation import version, versions
+from coopenv.base.installation import needing, version, versions
 from coopenv.evaluation import Result
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import ENTRY, layout_hash, layout_tables
@@ -157,10 +156,8 @@ def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:
 
 def check_onnx() -> None:
     """Find out before any work whether ONNX models can be written. Raises CoopenvError: the package is missing."""
-    try:
+    with needing("--onnx needs the package onnx: pip install '.[onnx]'"):
         import_module("onnx")
-    except ImportError as error:
-        raise CoopenvError(f"--onnx needs the package onnx: pip install '.[onnx]' ({error})") from None
 
 
 def onnx_model(tensors: Mapping[str, np.ndarray], clip: float) -> bytes:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, model_validator
 
-from coopenv.base.errors import CoopenvError, OutputError, suggest
+from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
 from coopenv.base.installation import is_scene, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
@@ -155,9 +155,7 @@ def read_settings(
     table = f"environments.{environment}"
     arms_here = _tables(here.pop("arms", {}), f"{where}: {table}.arms")
     for name in (*arms_here, *([arm] if arm is not None else [])):
-        if name not in arms:
-            known = f"{suggest(name, arms)}; known: {', '.join(arms) or 'none'}"
-            raise CoopenvError(f"{where}: no arm '{name}'{known}")
+        check_one_of(f"{where}: no arm", name, arms)
     changed = {table: here}
     if arm is not None:
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}

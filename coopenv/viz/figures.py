@@ -21,7 +21,7 @@ from matplotlib.font_manager import fontManager
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from coopenv.base.errors import CoopenvError, suggest
+from coopenv.base.errors import check_one_of
 from coopenv.base.files import writing
 from coopenv.estimation.metrics import live_ticks, mean_targets_in_view
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
@@ -185,8 +185,7 @@ def column(name: str) -> Column:
     Raises:
         CoopenvError: there is none of that name.
     """
-    if name not in COLUMNS:
-        raise CoopenvError(f"unknown width '{name}'{suggest(name, COLUMNS)}; known: {', '.join(COLUMNS)}")
+    check_one_of("unknown width", name, COLUMNS)
     return COLUMNS[name]
 
 
@@ -334,8 +333,7 @@ def draw_figure(
         "consistency": lambda: consistency_figure(trajectory, ends, steady_from, inches, gain=gain),
         "observability": lambda: observability_figure(observability or analyse_observability(trajectory), ends, inches),
     }
-    if name not in drawings:
-        raise CoopenvError(f"unknown figure '{name}'{suggest(name, drawings)}; known: {', '.join(drawings)}")
+    check_one_of("unknown figure", name, drawings)
     figure = drawings[name]()
     sign(figure, note)
     return restyle(figure, width) if isinstance(width, str) else figure

@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.estimation.observability import Trajectory
 from coopenv.viz import FORMATS
@@ -74,8 +74,7 @@ def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, 
         CoopenvError: no such format, or the file cannot be written; an older one is untouched.
     """
     form = file_format or path.suffix.removeprefix(".")
-    if form not in FORMATS:
-        raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
+    check_one_of(f"{path}: unknown format of a figure", form, FORMATS)
     stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
     words = "; ".join(f"{name}: {value}" for name, value in (about or {}).items())
     told = {"Title": path.stem, {"png": "Description", "pdf": "Subject", "svg": "Description"}[form]: words}

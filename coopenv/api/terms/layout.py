@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopenv.api.arguments import check_choice
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
@@ -190,7 +189,7 @@ def observation_space(layout: Mapping[str, Field], kind: str = "flat") -> spaces
     """
     from gymnasium import spaces
 
-    check_choice("observation", kind, ("flat", "dict"))
+    check_one_of("unknown observation", kind, ("flat", "dict"))
     if kind == "flat":
         low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
         return spaces.Box(low, np.ones_like(low), dtype=np.float32)

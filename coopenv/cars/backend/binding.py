@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.backends.base import VehicleBroadcast, check_options
-from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make, pose
 from coopenv.cars.deployment import Car
@@ -99,15 +99,14 @@ def bind(
                 f"{where}: the camera of {vehicles[i]} has no calibration: [camera] of the environment needs "
                 'model = "pinhole", image_size, focal_length, principal_point and distortion'
             )
-    if only is not None and only not in chosen:
-        raise CoopenvError(f"{where}: unknown car '{only}'{suggest(only, chosen)}; known: {listed([*chosen])}")
+    if only is not None:
+        check_one_of(f"{where}: unknown car", only, chosen)
     local = tuple(range(len(vehicles))) if only is None else (chosen[only],)
     return Binding(scenario, chosen, led, targets, local, profile)
 
 
 def _index(known: Sequence[str], name: str, where: str) -> int:
-    if name not in known:
-        raise CoopenvError(f"{where}: unknown name '{name}'{suggest(name, known)}; known: {listed(known)}")
+    check_one_of(f"{where}: unknown name", name, known)
     return known.index(name)
 
 

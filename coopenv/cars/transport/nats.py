@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import needing
 from coopenv.cars.transport.base import (
     Arrival,
     Callback,
@@ -201,10 +201,8 @@ def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: 
         LinkError: no broker answers.
     """
     addresses = [address_of(endpoint) for endpoint in connect]
-    try:
+    with needing("NATS needs an extra: pip install '.[nats]'"):
         import nats
-    except ImportError:
-        raise CoopenvError("NATS needs an extra: pip install '.[nats]'") from None
 
     last: list[Exception] = []
 

@@ -13,7 +13,7 @@ from functools import cache
 from http.client import HTTPConnection
 from typing import Any
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import needing
 from coopenv.cars.codec import ros1
 from coopenv.cars.transport.base import (
     Address,
@@ -37,13 +37,11 @@ _master: str | None = None
 
 def rospy() -> Any:
     """Return the library. Raises CoopenvError: it is not installed for this interpreter."""
-    try:
+    with needing(
+        "ROS 1 needs rospy: install Debian's python3-rospy and python3-rosmaster, or ROS noetic, and use the "
+        "system's interpreter (/usr/bin/python3 -m venv --system-site-packages VENV)"
+    ):
         import rospy
-    except ImportError:
-        raise CoopenvError(
-            "ROS 1 needs rospy: install Debian's python3-rospy and python3-rosmaster, or ROS noetic, and use the "
-            "system's interpreter (/usr/bin/python3 -m venv --system-site-packages VENV)"
-        ) from None
     return rospy
 
 

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import needing
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport.base import (
     SECURE,
@@ -76,10 +77,8 @@ class Zenoh:
 
 def library() -> Any:
     """Return the library. Raises CoopenvError: the extra is not installed."""
-    try:
+    with needing("Zenoh needs an extra: pip install '.[svea]'"):
         import zenoh
-    except ImportError:
-        raise CoopenvError("Zenoh needs an extra: pip install '.[svea]'") from None
     return zenoh
 
 

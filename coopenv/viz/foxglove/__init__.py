@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import needing
 from coopenv.viz.style import vehicle_colour
 
 if TYPE_CHECKING:
@@ -24,10 +24,8 @@ def check_installed() -> None:
     Raises:
         CoopenvError: it is not.
     """
-    try:
+    with needing("scenes for Foxglove need an extra: pip install '.[log]', or --no-scene"):
         import foxglove.messages  # noqa: F401
-    except ImportError:
-        raise CoopenvError("scenes for Foxglove need an extra: pip install '.[log]', or --no-scene") from None
 
 
 def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = False) -> list[View]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
+from coopenv.base.installation import needing
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import Look
@@ -36,10 +37,8 @@ def viser_module() -> Any:
     Raises:
         CoopenvError: it is not installed.
     """
-    try:
+    with needing("pictures in the browser need an extra: pip install '.[view]'"):
         import viser
-    except ImportError:
-        raise CoopenvError("pictures in the browser need an extra: pip install '.[view]'") from None
     import rich
 
     rich.get_console().quiet = True  # it would write to standard output when it stops
