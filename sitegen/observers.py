@@ -15,7 +15,6 @@ TABLE = "docs/observers.md"
 MORE = {
     "riccati": "../../method.md",
     "robust": "../../robust.md",
-    "robust_joint": "../../robust.md#variants",
     "planar_robust": "../../planar_robust.md",
 }
 """Where the documents explain an observer."""
