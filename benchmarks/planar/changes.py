@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coopenv.backends.mrclam.dataset import Dataset, Robot, Truth
+from coopenv.backends.mrclam.dataset import Dataset, MotionCapture, Robot
 from coopenv.estimation.poses import Array
 
 LANDMARKS_FROM = 6  # subjects below that are robots
@@ -106,7 +106,7 @@ def _part(robot: Robot, start: float, end: float) -> Robot:
         robot,
         odometry=told,
         detections=_from(seen[(seen[:, 0] >= start) & (seen[:, 0] <= end)], start),
-        truth=Truth(truth.t[at] - start, truth.position[at], truth.heading[at]),
+        truth=MotionCapture(truth.t[at] - start, truth.position[at], truth.heading[at]),
     )
 
 

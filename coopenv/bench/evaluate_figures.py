@@ -24,7 +24,7 @@ from coopenv.runs.console import Progress
 from coopenv.runs.scenes import frame_stride, scene_of, video_path, write_page, write_pictures
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle
-from coopenv.viz.scene import Source
+from coopenv.viz.scene import Origin
 from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
 
@@ -207,7 +207,7 @@ def write_replays(evaluation: Evaluation, folder: Path, log: Console) -> None:
         files[entrant.name] = file if file not in files.values() else f"replay_{plain}_{number}.html"
     seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
     for entrant in sorted(entrants, key=lambda e: e is not shown):
-        source = Source.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
+        source = Origin.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
         with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
             record = scene_of(engine, source, entrant.policy, progress.update)
         if write_page(record, folder / files[entrant.name], log, files) is None:

@@ -26,7 +26,7 @@ from coopenv.evaluation import Difference, Episodes, Result, compare_paired, dri
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.runs.console import Progress, number_table
-from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
+from coopenv.training.settings import SETTINGS_FILE, TrainingPlan, read_settings
 
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
@@ -42,12 +42,12 @@ class StudyFile(Section):
     seeds: tuple[Seed, ...] = Field(min_length=1)
 
 
-def agent_of(plan: Plan) -> str:
+def agent_of(plan: TrainingPlan) -> str:
     """Return the name of the agent that comes of all trainings which differ in nothing but their seed."""
     return f"{plan.environment}_{plan.arm}"
 
 
-def place_of(plan: Plan) -> Path:
+def place_of(plan: TrainingPlan) -> Path:
     """Return where the agent of a training goes, in the study's folder."""
     return Path(agent_of(plan), f"seed_{plan.seed}")
 
@@ -56,13 +56,13 @@ def place_of(plan: Plan) -> Path:
 class Study:
     """What is to be trained."""
 
-    plans: tuple[Plan, ...]
+    plans: tuple[TrainingPlan, ...]
     """All trainings; every agent's first one before any agent's second."""
 
     @property
-    def agents(self) -> dict[str, list[Plan]]:
+    def agents(self) -> dict[str, list[TrainingPlan]]:
         """The trainings of every agent."""
-        found: dict[str, list[Plan]] = {}
+        found: dict[str, list[TrainingPlan]] = {}
         for plan in self.plans:
             found.setdefault(agent_of(plan), []).append(plan)
         return found
@@ -93,10 +93,10 @@ def read_study(path: Path) -> Study:
     groups = list(product(file.environments, file.arms))
     settings = [read_settings(path.parent / file.settings, arm, environment) for environment, arm in groups]
     pairs = list(zip(groups, settings, strict=True))
-    return Study(tuple(Plan(place, own, seed, arm) for seed in file.seeds for (place, arm), own in pairs))
+    return Study(tuple(TrainingPlan(place, own, seed, arm) for seed in file.seeds for (place, arm), own in pairs))
 
 
-def is_finished(plan: Plan, folder: Path) -> bool:
+def is_finished(plan: TrainingPlan, folder: Path) -> bool:
     """Return whether a training's agent is there, trained as in the present study and environment."""
     from coopenv.training.export import scenario_digest  # needs the extra `train`
 
@@ -112,7 +112,7 @@ def is_finished(plan: Plan, folder: Path) -> bool:
     return known == [plan.environment, plan.seed, plan.arm, scenario] and settings == plan.settings
 
 
-def unfinished(study: Study, folder: Path) -> list[Plan]:
+def unfinished(study: Study, folder: Path) -> list[TrainingPlan]:
     """Return the trainings of a study that are not finished.
 
     Raises:
@@ -129,7 +129,7 @@ def unfinished(study: Study, folder: Path) -> list[Plan]:
     return plans
 
 
-def perform(folder: Path, logs: Path, plan: Plan) -> None:
+def perform(folder: Path, logs: Path, plan: TrainingPlan) -> None:
     """Train on one core, going on from a checkpoint where there is one of the same training.
 
     An agent that is there has been trained with other settings, and is replaced.
@@ -214,7 +214,7 @@ BASE_ARM = "plain"
 """The arm that others are compared with."""
 
 
-def is_reported(agent: str, plans: Sequence[Plan], folder: Path) -> bool:
+def is_reported(agent: str, plans: Sequence[TrainingPlan], folder: Path) -> bool:
     """Return whether an agent has a card that tells of just these finished runs."""
     seeds = cards.read(folder / agent).get("study", {}).get("seeds", {})
     found = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
@@ -229,7 +229,7 @@ def _trained(place: Path) -> dict[str, Any]:
     return {"sha256": document["network"]["sha256"], **found}
 
 
-def write_card(finished: Sequence[Plan], folder: Path, judge: Judge) -> None:
+def write_card(finished: Sequence[TrainingPlan], folder: Path, judge: Judge) -> None:
     """Write an agent of which some runs are finished, and its card.
 
     Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
@@ -263,7 +263,7 @@ def write_card(finished: Sequence[Plan], folder: Path, judge: Judge) -> None:
     cards.save(place, description, card)
 
 
-def _write_agent(place: Path, best: str, finished: Sequence[Plan]) -> str:
+def _write_agent(place: Path, best: str, finished: Sequence[TrainingPlan]) -> str:
     """Write the agent that drives as one seed of it does, with its settings, and return its description."""
     document = tomlkit.parse((place / best / AGENT_FILE).read_text(encoding="utf-8"))
     environment, arm = finished[0].environment, finished[0].arm
@@ -276,7 +276,7 @@ def _write_agent(place: Path, best: str, finished: Sequence[Plan]) -> str:
     return description
 
 
-def write_overview(agents: Iterable[Plan], folder: Path, judge: Judge) -> None:
+def write_overview(agents: Iterable[TrainingPlan], folder: Path, judge: Judge) -> None:
     """Write the page of agents that have a card, of each a training; others are to be trained anew."""
     sections = {}
     for environment, plans in groupby(agents, lambda plan: plan.environment):

@@ -20,7 +20,7 @@ from coopenv.policies import agents_for
 from coopenv.runs.page import index_text, page_text
 from coopenv.runs.scenes import driver_of, scene_of, write_film
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import Source
+from coopenv.viz.scene import Origin
 from coopenv.viz.topview import TopView
 
 FPS, WIDTH = 6.0, 448
@@ -48,7 +48,7 @@ def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Ca
         path.unlink(missing_ok=True)
         return
     with closing(Engine(scenario)) as engine:
-        source = Source.of(name, scenario, policy=driver, seed=_SEED)
+        source = Origin.of(name, scenario, policy=driver, seed=_SEED)
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
     drawn = lambda share: on_progress(0.5 + share / 2)  # noqa: E731
     write_film(record, path, FPS, max(1.0, record.length / _LASTS), WIDTH, panel=False, on_progress=drawn)

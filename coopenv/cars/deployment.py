@@ -17,7 +17,7 @@ from coopenv.cars.profile import (
     Number,
     Point,
     Positive,
-    Pulses,
+    RemotePulses,
     is_simple,
     load_profile,
 )
@@ -114,7 +114,7 @@ class Remote(Section):
             raise ValueError("steering, throttle and mode_switch: two of them are on the same channel")
         return self
 
-    def fault(self, pulses: tuple[int, ...], usual: Pulses = SVEA.pulses) -> str:
+    def fault(self, pulses: tuple[int, ...], usual: RemotePulses = SVEA.pulses) -> str:
         """Return why pulses, us, one per channel, are no signal; empty where they are."""
         for name in ("steering", "throttle", "mode_switch"):
             channel = getattr(self, name)
@@ -124,14 +124,14 @@ class Remote(Section):
                 return "its remote control has no signal"
         return ""
 
-    def drives(self, pulses: tuple[int, ...], usual: Pulses = SVEA.pulses) -> bool:
+    def drives(self, pulses: tuple[int, ...], usual: RemotePulses = SVEA.pulses) -> bool:
         """Return whether a stick is moved; one without a signal is not."""
         used = [pulses[channel - 1] for channel in (self.steering, self.throttle) if channel <= len(pulses)]
         return any(
             usual.shortest <= pulse <= usual.longest and abs(pulse - usual.neutral) > usual.moved for pulse in used
         )
 
-    def switched(self, pulses: tuple[int, ...], before: tuple[int, ...], usual: Pulses = SVEA.pulses) -> bool:
+    def switched(self, pulses: tuple[int, ...], before: tuple[int, ...], usual: RemotePulses = SVEA.pulses) -> bool:
         """Return whether the switch is no longer where it was."""
         if not 0 < self.mode_switch <= min(len(pulses), len(before)):
             return False

@@ -152,14 +152,14 @@ def presence_of(name: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class MotionCommand:
     """Motion command of a car."""
 
     steering: float = 0.0  # rad, left is positive
     speed: float = 0.0  # m/s, forward is positive
 
 
-NEUTRAL = Drive()
+NEUTRAL = MotionCommand()
 
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -230,23 +230,23 @@ class CommandMessage(Section):
         """Return a steering angle or a speed as a share of full, cut off at `most`."""
         return min(max(value / channel.full, -self.most), self.most)
 
-    def values(self, drive: Drive) -> dict[str, float]:
+    def values(self, drive: MotionCommand) -> dict[str, float]:
         """Return the fields of a finite command by name."""
         found = {name: value for name, (_, value) in self.neutral.items()}
         for channel, value in ((self.steering, drive.steering), (self.speed, drive.speed)):
             found[channel.field] += channel.change * self.share(channel, value)
         return found
 
-    def drive(self, values: Mapping[str, float]) -> Drive:
+    def drive(self, values: Mapping[str, float]) -> MotionCommand:
         """Return the command of fields by name."""
         steering, speed = (
             (values[channel.field] - self.neutral[channel.field][1]) / channel.change * channel.full
             for channel in (self.steering, self.speed)
         )
-        return Drive(steering, speed)
+        return MotionCommand(steering, speed)
 
 
-class Pulses(Section):
+class RemotePulses(Section):
     """Pulses of the remote control, us."""
 
     neutral: int = 1500
@@ -272,7 +272,7 @@ class CarProfile(Section):
     """Smallest and largest number of a marker that the camera identifies."""
     conditions: tuple[Literal["state", "remote", "battery"], ...] = ("state", "remote", "battery")
     """Topics that a car must send before it is armed."""
-    pulses: Pulses = Pulses()
+    pulses: RemotePulses = RemotePulses()
     """Pulses of the remote control."""
 
     @model_validator(mode="after")

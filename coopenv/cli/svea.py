@@ -255,7 +255,7 @@ def router(
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
+class SveaRunOptions:
     """Options of `coopenv svea run`."""
 
     config: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="Which cars, and how they are reached.")]
@@ -287,7 +287,7 @@ class RunOptions:
 
 @svea.command()
 @options.command
-def run(given: RunOptions) -> None:
+def run(given: SveaRunOptions) -> None:
     """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
 
     Without --arm no command is sent: run it beside a car with another driver.

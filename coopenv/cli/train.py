@@ -49,11 +49,11 @@ class TrainOptions:
             CoopenvError: a setting is not valid, or an option stands beside --resume that the folder decides.
         """
         from coopenv.training.command import resumed_plan
-        from coopenv.training.settings import Plan
+        from coopenv.training.settings import TrainingPlan
 
         if not self.resume:
             changes = options.parse_overrides(self.overrides)
-            return Plan(self.environment, self._settings(), self.seed or 0, self.arm, changes)
+            return TrainingPlan(self.environment, self._settings(), self.seed or 0, self.arm, changes)
         decided = {"--set": self.overrides}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")

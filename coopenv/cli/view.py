@@ -261,7 +261,7 @@ def watch(
     if out is None:
         stage = live.watch(scenario, policy, seed, log, speed=speed)
     else:
-        stage = live.Stage(scenario, log)
+        stage = live.LiveWorld(scenario, log)
         with replacing_folder(out, VIDEO_FILES) as folder, Progress(log, f"filming {video_path(folder).name}"):
             fps = scenario.rates.camera / stage.stride
             write_pictures(video_path(folder), fps, stage.pictures(policy, seed))

@@ -113,7 +113,7 @@ def corrected(kind: int, R: Array, p: Array, dx: Array, P: Array) -> tuple[Array
     return R, p, congruent(recentring(kind, dx), P)
 
 
-class PoseEstimate(NamedTuple):
+class UncertainPose(NamedTuple):
     """A pose with the covariance of its error."""
 
     kind: int  # of the error: LEFT, RIGHT, or INVARIANT (xi, which is also the left error to first order)
@@ -255,7 +255,7 @@ def frame_of(tick: Tick, measured: BearingMeasurements) -> Frame:
     return np.asarray(tick.lever_arm, float), *measured[:3], tick.noise.bearing_std**2
 
 
-def linearised(pose: PoseEstimate, tick: Tick, measured: BearingMeasurements) -> LinearisedBearings:
+def linearised(pose: UncertainPose, tick: Tick, measured: BearingMeasurements) -> LinearisedBearings:
     """Linearise bearings at a pose; the points' covariances are noise, as if independent of the pose."""
     return LinearisedBearings(*linearise(pose.R, pose.p, pose.kind == RIGHT, *frame_of(tick, measured)))
 
@@ -290,7 +290,7 @@ def linearise(
     return residual, H, N, G
 
 
-def ahead(pose: PoseEstimate, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
+def ahead(pose: UncertainPose, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
     """Return (m,) whether the points are ahead along the bearings, and not behind."""
     of: NDArray[np.bool_] = _ahead(pose.R, pose.p, frame_of(tick, measured))
     return of

@@ -17,7 +17,7 @@ from coopenv.observers.bearing_measurements import (
     LEFT,
     BearingMeasurements,
     LinearisedBearings,
-    PoseEstimate,
+    UncertainPose,
     increment,
     linearised,
     transition,
@@ -66,7 +66,7 @@ class Centralised:
         bearings = [tick.bearings[tick.valid] for tick in ticks]
         self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
         return [
-            PoseEstimate(LEFT, R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
+            UncertainPose(LEFT, R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
             for i, (R, p) in enumerate(self.poses)
         ]
 
@@ -109,7 +109,7 @@ class Centralised:
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
         known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
-        own = linearised(PoseEstimate(LEFT, R, p, self.P), tick, known)
+        own = linearised(UncertainPose(LEFT, R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
         for n, target in enumerate(targets):

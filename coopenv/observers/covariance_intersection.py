@@ -34,7 +34,7 @@ from coopenv.observers.bearing_measurements import (
     BearingMeasurements,
     Frame,
     LinearisedBearings,
-    PoseEstimate,
+    UncertainPose,
     corrected,
     frame_of,
     linearised,
@@ -118,7 +118,7 @@ class CovarianceIntersection(Mekf):
         if w < 1.0:
             inflated = one._replace(covariances=one.covariances / (1.0 - w))
             *pose, _ = updated(*state[:3], state.P / w, frame_of(tick, inflated))
-            self.state = PoseEstimate(self.kind, *pose)
+            self.state = UncertainPose(self.kind, *pose)
 
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])
@@ -194,5 +194,5 @@ class SplitCovarianceIntersection(CovarianceIntersection):
     def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
         *pose, self.independent, nis = updated_parts(*self.state, self.independent, frame_of(tick, measured))
-        self.state = PoseEstimate(self.kind, *pose)
+        self.state = UncertainPose(self.kind, *pose)
         return float(nis)

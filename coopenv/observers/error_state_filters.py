@@ -17,7 +17,7 @@ from coopenv.observers.bearing_measurements import (
     BearingMeasurements,
     Frame,
     LinearisedBearings,
-    PoseEstimate,
+    UncertainPose,
     across,
     ahead,
     dense,
@@ -43,7 +43,7 @@ class PoseObserver:
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        self.state = PoseEstimate.start(self.kind, *initial_pose, initial_covariance)
+        self.state = UncertainPose.start(self.kind, *initial_pose, initial_covariance)
 
     def message(self) -> Message:
         """Return the marker's position, and its covariance if this observer sends it."""
@@ -113,7 +113,7 @@ class Mekf(PoseObserver):
     def fuse(self, tick: Tick, measured: BearingMeasurements) -> float:
         """Correct by bearings; return their normalised innovation squared."""
         *pose, nis = updated(*self.state, frame_of(tick, measured))
-        self.state = PoseEstimate(self.kind, *pose)
+        self.state = UncertainPose(self.kind, *pose)
         return float(nis)
 
 

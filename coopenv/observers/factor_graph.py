@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from coopenv.estimation.poses import Array, adjoint
-from coopenv.observers.bearing_measurements import LEFT, PoseEstimate, ahead, linearised, usable_bearings
+from coopenv.observers.bearing_measurements import LEFT, UncertainPose, ahead, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
 from coopenv.observers.error_state_filters import PoseObserver
@@ -72,7 +72,7 @@ class FactorGraph(PoseObserver):
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.stamps: dict[int, float] = {}
         self.key_time = self.time
-        self.increment = PoseEstimate(LEFT, np.eye(3), np.zeros(3), np.zeros((6, 6)))
+        self.increment = UncertainPose(LEFT, np.eye(3), np.zeros(3), np.zeros((6, 6)))
         self.residuals: dict[int, Residuals] = {}
 
     def camera(self) -> gtsam.Pose3:
@@ -124,7 +124,7 @@ class FactorGraph(PoseObserver):
             self.restart()
             return
         R, P = pose.rotation().matrix(), self.to_body @ covariance @ self.to_body.T
-        self.state = PoseEstimate(LEFT, R, pose.translation() - R @ self.lever_arm, (P + P.T) / 2)
+        self.state = UncertainPose(LEFT, R, pose.translation() - R @ self.lever_arm, (P + P.T) / 2)
         self.clear()
 
     def add_odometry(self) -> None:

@@ -33,7 +33,7 @@ from coopenv.observers.bearing_measurements import (
     BearingMeasurements,
     Frame,
     LinearisedBearings,
-    PoseEstimate,
+    UncertainPose,
     corrected,
     frame_of,
     increment,
@@ -145,7 +145,7 @@ class ConsiderFilter(Mekf):
         turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
         exact = frame_of(tick, measured._replace(covariances=np.zeros((len(targets), 3, 3))))
         R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
-        self.state = PoseEstimate(LEFT, R, p, P)
+        self.state = UncertainPose(LEFT, R, p, P)
         self.propagate_cross_covariances(carried, [t for t in self.neighbours if t not in seen])
         for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = ConsideredNeighbour(was.number, was.R, was.P, cross)

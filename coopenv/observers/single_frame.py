@@ -17,7 +17,7 @@ from coopenv.estimation.poses import Array, solve
 from coopenv.observers.bearing_measurements import (
     LEFT,
     BearingMeasurements,
-    PoseEstimate,
+    UncertainPose,
     ahead,
     linearised,
     normalised,
@@ -75,13 +75,13 @@ class PerspectivePoints(PoseObserver):
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: BearingMeasurements) -> PoseEstimate | None:
+    def chosen(self, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
         """Return the candidate that agrees with most bearings, then the one nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
         triples = np.array(list(combinations(range(len(data.bearings)), 3))[:MOST_TRIPLES])
         turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
-            start = PoseEstimate(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
+            start = UncertainPose(LEFT, R, camera - R @ tick.lever_arm, self.state.P)
             agrees = misfits(start, tick, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue
@@ -91,7 +91,7 @@ class PerspectivePoints(PoseObserver):
         return best
 
 
-def misfits(pose: PoseEstimate, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
+def misfits(pose: UncertainPose, tick: Tick, data: BearingMeasurements, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
@@ -102,7 +102,7 @@ def misfits(pose: PoseEstimate, tick: Tick, data: BearingMeasurements, P: Array 
     return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
 
 
-def refined(start: PoseEstimate, tick: Tick, data: BearingMeasurements) -> PoseEstimate | None:
+def refined(start: UncertainPose, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
@@ -126,7 +126,7 @@ def refined(start: PoseEstimate, tick: Tick, data: BearingMeasurements) -> PoseE
     return None
 
 
-def distance(pose: PoseEstimate, predicted: PoseEstimate) -> float:
+def distance(pose: UncertainPose, predicted: UncertainPose) -> float:
     """Return the squared Mahalanobis distance of two poses whose errors are independent.
 
     The rotation counts by twice the vector part of its quaternion.

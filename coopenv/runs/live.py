@@ -18,8 +18,8 @@ from coopenv.policies import Policy, restart
 from coopenv.runs.console import compile_notice
 from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import Frame, SceneRecord, Source
-from coopenv.viz.topview import TopView, Window
+from coopenv.viz.scene import Frame, Origin, SceneRecord
+from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.web.panel import Abilities
 
 LEAVE, AGAIN = {"escape", "q"}, {"r"}
@@ -82,7 +82,7 @@ class Keyboard:
         return actions
 
 
-class Stage:
+class LiveWorld:
     """One world, drawn as it runs."""
 
     def __init__(self, scenario: Scenario, log: Console) -> None:
@@ -100,20 +100,20 @@ class Stage:
                 yield self._view.draw(self.engine)
         yield self._view.draw(self.engine)
 
-    def window(self, seed: int, window: Window | None, instead: str = "") -> Window:
+    def window(self, seed: int, window: PictureWindow | None, instead: str = "") -> PictureWindow:
         """Return a window that shows the start of an episode; `instead` names what works without a display.
 
         Raises:
             CoopenvError: there is no display.
         """
         self.engine.reset([seed])
-        window = window or Window(self.scenario.title)
+        window = window or PictureWindow(self.scenario.title)
         window.show(self._view.draw(self.engine))
         if not window.is_open:
             raise CoopenvError(f"there is no display to open a window on{instead}")
         return window
 
-    def run(self, policy: Policy, seed: int, window: Window, speed: float, going: Callable[[], bool]) -> None:
+    def run(self, policy: Policy, seed: int, window: PictureWindow, speed: float, going: Callable[[], bool]) -> None:
         """Show an episode at a multiple of real time while `going` returns True."""
         begin, period = time.monotonic(), self.stride / self.scenario.rates.camera / speed
         for number, picture in enumerate(self.pictures(policy, seed), start=1):
@@ -133,14 +133,14 @@ class Stage:
 
 
 def watch(
-    scenario: Scenario, policy: Policy, seed: int, log: Console, window: Window | None = None, speed: float = 1.0
-) -> Stage:
+    scenario: Scenario, policy: Policy, seed: int, log: Console, window: PictureWindow | None = None, speed: float = 1.0
+) -> LiveWorld:
     """Show an episode in a window until it ends or the window is closed, at a multiple of real time.
 
     Raises:
         CoopenvError: there is no display.
     """
-    stage = Stage(scenario, log)
+    stage = LiveWorld(scenario, log)
     shown = stage.window(seed, window, "; --out DIR writes a film instead")
     stage.run(policy, seed, shown, speed, lambda: shown.is_open)
     return stage
@@ -152,15 +152,15 @@ def drive_by_hand(
     others: Policy,
     seed: int,
     log: Console,
-    window: Window | None = None,
+    window: PictureWindow | None = None,
     speed: float = 1.0,
-) -> Stage:
+) -> LiveWorld:
     """Let the user drive a vehicle by the arrow keys, as often as wanted.
 
     Raises:
         CoopenvError: there is no display.
     """
-    stage = Stage(scenario, log)
+    stage = LiveWorld(scenario, log)
     shown = stage.window(seed, window)
     log.print(HELP)
     keys = Keys(shown.canvas)
@@ -198,7 +198,7 @@ class Reel:
     """Frames, one after the other; those that have been are kept. Nothing can be changed in those of a kept scene."""
 
     def __init__(
-        self, scenario: Scenario, source: Source, length: float, coming: Iterable[Frame], abilities: Abilities
+        self, scenario: Scenario, source: Origin, length: float, coming: Iterable[Frame], abilities: Abilities
     ) -> None:
         """Begin with none; `length` is that of the episode, s, and `abilities` are what one can do."""
         self.scenario, self.source, self.length, self._coming = scenario, source, length, iter(coming)

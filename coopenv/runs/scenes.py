@@ -29,7 +29,7 @@ from coopenv.observers.registry import find, named, states_covariance
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.scenario import Scenario
-from coopenv.viz.scene import SCENE_FILE, Frame, SceneRecord, Source
+from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"
 MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
@@ -41,17 +41,17 @@ def frame_stride(scenario: Scenario) -> int:
     return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
 
 
-def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Source:
+def source_of(engine: Engine, name: str, seed: int | None, policy: str) -> Origin:
     """Return the heading of a scene; a recording has no seed and no driver, a prescribed motion no driver."""
     scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
     driver = policy if scenario.driven and not recorded else ""
-    return Source.of(name, scenario, policy=driver, seed=None if recorded else seed)
+    return Origin.of(name, scenario, policy=driver, seed=None if recorded else seed)
 
 
 class Keeper:
     """Keeps the frames of an episode that pictures are made of, at most `MAX_FPS` a second."""
 
-    def __init__(self, engine: Engine, source: Source) -> None:
+    def __init__(self, engine: Engine, source: Origin) -> None:
         """Begin with none."""
         self.engine, self._source = engine, source
         self._stride = frame_stride(engine.backend.scenario)
@@ -73,7 +73,7 @@ class Keeper:
 
 def scene_of(
     engine: Engine,
-    source: Source,
+    source: Origin,
     policy: Policy | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
     longest: float = np.inf,

@@ -15,7 +15,7 @@ TARGETS = 3
 """Bearings with which a pose is observable; a vehicle with fewer neighbours measures landmarks besides."""
 
 
-class Placed(NamedTuple):
+class PlacedVehicle(NamedTuple):
     """One vehicle."""
 
     position: tuple[float, float, float]
@@ -36,29 +36,29 @@ def _filled(vehicles: Sequence[int], first: int = 0) -> tuple[str, ...]:
     return (*sorted(some), *(f"vehicle_{i}" for i in vehicles))
 
 
-def lane(vehicles: int, seen: int) -> Iterator[Placed]:
+def lane(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
     """Yield a lane: 3 m from one to the next, all at one speed."""
     for k in range(vehicles):
         side, up = (0.5 * (-1) ** k, 0.3 * (k % 3)) if k else (0.0, 0.0)
         leaders = [i for i in range(k - seen + 1, k + 1) if i >= 1]
-        yield Placed((-2.0 + side, -10.0 - 3.0 * k, 2.5 + up), 0.0, (0.0, 0.5), 0.0, _filled(leaders))
+        yield PlacedVehicle((-2.0 + side, -10.0 - 3.0 * k, 2.5 + up), 0.0, (0.0, 0.5), 0.0, _filled(leaders))
 
 
-def roots(vehicles: int) -> Iterator[Placed]:
+def roots(vehicles: int) -> Iterator[PlacedVehicle]:
     """Yield two streets that cross, odd numbers on that to the north; speeds differ a little."""
-    yield Placed((-2.0, -16.0, 2.5), 0.0, (0.0, 0.6), 0.0, tuple(LANDMARKS))
-    yield Placed((-17.0, 2.0, 3.0), 0.0, (0.6, 0.0), 0.0, tuple(LANDMARKS))
+    yield PlacedVehicle((-2.0, -16.0, 2.5), 0.0, (0.0, 0.6), 0.0, tuple(LANDMARKS))
+    yield PlacedVehicle((-17.0, 2.0, 3.0), 0.0, (0.6, 0.0), 0.0, tuple(LANDMARKS))
     for n in range(3, vehicles + 1):
         back, aside = -19.0 - 3.0 * ((n - 3) // 2), 0.3 * (-1) ** (n // 2)
         speed, z = 0.5 + 0.02 * ((n - 3) % 8), 2.0 + 0.5 * (n % 4)
         neighbours = _filled({3: (1, 2), 4: (1, 3)}.get(n, (n - 4, n - 3, n - 2)), n - 2)
         if n % 2 == 1:
-            yield Placed((-2.0 + aside, back, z), 0.0, (0.0, speed), 0.0, neighbours)
+            yield PlacedVehicle((-2.0 + aside, back, z), 0.0, (0.0, speed), 0.0, neighbours)
         else:
-            yield Placed((back, 2.0 + aside, z), 0.0, (speed, 0.0), 0.0, neighbours)
+            yield PlacedVehicle((back, 2.0 + aside, z), 0.0, (speed, 0.0), 0.0, neighbours)
 
 
-def tree(vehicles: int, seen: int) -> Iterator[Placed]:
+def tree(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
     """Yield a binary tree, a level of it on a circle each, whose vehicles go round on small circles of their own."""
     for i in range(1, vehicles + 1):
         level = i.bit_length() - 1
@@ -66,10 +66,10 @@ def tree(vehicles: int, seen: int) -> Iterator[Placed]:
         angle = 2.0 * math.pi * (i - 2**level + 0.5) / 2**level
         reach = 9.0 * level + (6.0 if level == 0 else 0.0)
         position = (reach * math.cos(angle), reach * math.sin(angle), 2.0 + 0.5 * (i % 4))
-        yield Placed(position, angle, (0.5, 0.0), 0.5 / (2.0 + i % 3) * (-1) ** i, _filled(leaders, i))
+        yield PlacedVehicle(position, angle, (0.5, 0.0), 0.5 / (2.0 + i % 3) * (-1) ** i, _filled(leaders, i))
 
 
-def random_graph(vehicles: int, seen: int, seed: int) -> Iterator[Placed]:
+def random_graph(vehicles: int, seen: int, seed: int) -> Iterator[PlacedVehicle]:
     """Yield vehicles in random places of a square, on circles of 3 to 8 m, each measuring random ones before it."""
     random, half = np.random.default_rng(seed), 3.0 * math.sqrt(vehicles) + 5.0
     places: list[np.ndarray] = []
@@ -83,17 +83,17 @@ def random_graph(vehicles: int, seen: int, seed: int) -> Iterator[Placed]:
         speed, radius, side = random.uniform(0.4, 0.7), random.uniform(3.0, 8.0), random.choice([-1.0, 1.0])
         z, yaw = random.uniform(1.5, 4.0), random.uniform(-math.pi, math.pi)
         names = tuple(pool[n] for n in sorted(drawn.tolist()))
-        yield Placed((x, y, z), yaw, (round(speed, 3), 0.0), round(side * speed / radius, 5), names)
+        yield PlacedVehicle((x, y, z), yaw, (round(speed, 3), 0.0), round(side * speed / radius, 5), names)
 
 
-def ring(vehicles: int, seen: int) -> Iterator[Placed]:
+def ring(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
     """Yield vehicles that follow one another on a circle, each with landmarks besides."""
     radius = max(8.0, 3.0 * vehicles / (2.0 * math.pi))
     for i in range(vehicles):
         angle = 2.0 * math.pi * i / vehicles
         leaders = sorted((i + n) % vehicles + 1 for n in range(1, seen + 1))
         position = (radius * math.cos(angle), radius * math.sin(angle), 2.0 + 0.5 * (i % 3))
-        yield Placed(position, angle + math.pi / 2, (0.5, 0.0), 0.5 / radius, _filled(leaders, i))
+        yield PlacedVehicle(position, angle + math.pi / 2, (0.5, 0.0), 0.5 / radius, _filled(leaders, i))
 
 
 MOST_VEHICLES = 64
@@ -112,7 +112,7 @@ class Scene(NamedTuple):
     """A kind of scene."""
 
     about: str
-    build: Callable[..., Iterator[Placed]]
+    build: Callable[..., Iterator[PlacedVehicle]]
     """Takes the options by name."""
     options: Mapping[str, Option]
 
@@ -246,7 +246,7 @@ def scene_text(name: str) -> str:
     return head + landmarks + DEFAULTS + "".join(map(_vehicle, placed))
 
 
-def _vehicle(placed: Placed) -> str:
+def _vehicle(placed: PlacedVehicle) -> str:
     names = ", ".join(f'"{name}"' for name in placed.neighbours)
     yaw = f"initial_pose.yaw = {placed.yaw:.6g}\n" if placed.yaw else ""
     vx, vy = placed.velocity

@@ -16,7 +16,7 @@ from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlai
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
-from coopenv.scenario.sensing import Camera, Faults, Noise, Observer, Rates, Topology, V2x
+from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x
 
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 
@@ -112,7 +112,7 @@ class Scenario(Section):
     between; `blind`: nothing is ever measured; `sensed`: by `topology.mode`."""
     v2x: V2x = V2x()
     faults: Faults = Faults()
-    observer: Observer = Observer()
+    observer: ObserverSettings = ObserverSettings()
     dynamics: Dynamics = Dynamics()
     randomisation: Randomisation = Randomisation()
     difficulty: Difficulty = Difficulty()

@@ -198,7 +198,7 @@ class V2x(Section):
     """Messages older than this are not used, s (none: used for ever)."""
 
 
-class Observer(Section):
+class ObserverSettings(Section):
     """The estimator that every vehicle runs, and its gains."""
 
     name: str = Field(default="riccati", max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_.-]*$")

@@ -155,7 +155,7 @@ Per = Literal["vehicle", "target", "neighbour", "landmark"]
 of each of the landmarks that are nearest by the vehicle's own estimate."""
 
 
-class Row(Section):
+class TermRow(Section):
     """Entries of every term; a text alone is its function."""
 
     function: str | SkipJsonSchema[Callable[..., Any]]
@@ -186,7 +186,7 @@ class Row(Section):
         return function
 
 
-class Term(Row):
+class Term(TermRow):
     """A term of the reward, or a condition that ends a vehicle's episode."""
 
     privileged: bool = False
@@ -199,7 +199,7 @@ class Term(Row):
         return f"{self.meaning}{unit}{' (privileged)' if self.privileged else ''}"
 
 
-class ObservationField(Row):
+class ObservationField(TermRow):
     """A field of the observation; every entry is (value - center) / scale, clipped to [low, 1]."""
 
     group: Text = ""
@@ -215,7 +215,7 @@ class ObservationField(Row):
     """Entries of a value that `observation.planar` keeps (none: all); an empty list drops the field."""
 
 
-R = TypeVar("R", bound=Row)
+R = TypeVar("R", bound=TermRow)
 
 
 class Registry(Generic[R]):

@@ -31,7 +31,7 @@ from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.training.export import EXPORTED, check_onnx, export
-from coopenv.training.settings import Plan, check_settings, environment_file
+from coopenv.training.settings import TrainingPlan, check_settings, environment_file
 from coopenv.training.trainer import DivergedError, Status, Trainer
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
@@ -58,7 +58,7 @@ class Reports:
     """Before the first update, where another driver is cloned: a line on the progress."""
 
 
-def resumed_plan(out: Path) -> Plan:
+def resumed_plan(out: Path) -> TrainingPlan:
     """Return the plan of the unfinished training in a folder.
 
     Raises:
@@ -69,7 +69,7 @@ def resumed_plan(out: Path) -> Plan:
     return read(out / CHECKPOINT_FILE).plan
 
 
-def possible(plan: Plan) -> Scenario:
+def possible(plan: TrainingPlan) -> Scenario:
     """Return the scenario of a training, before anything is made.
 
     Raises:
@@ -84,7 +84,7 @@ def possible(plan: Plan) -> Scenario:
 
 
 def train(
-    plan: Plan,
+    plan: TrainingPlan,
     out: Path,
     *,
     resume: bool = False,
@@ -188,7 +188,7 @@ class Checkpoint(BaseModel):
     """What a file holds."""
 
     path: Path
-    plan: Plan
+    plan: TrainingPlan
     scenario: str
     """JSON of the scenario, to find out whether it is still the same."""
     progress: dict[str, int | float]
@@ -212,7 +212,7 @@ def save(
     """
     header = {
         "format": FORMAT,
-        "plan": TypeAdapter(Plan).dump_python(trainer.plan, mode="json"),
+        "plan": TypeAdapter(TrainingPlan).dump_python(trainer.plan, mode="json"),
         "scenario": trainer.scenario.model_dump_json(),
         "progress": {
             "steps": trainer.model.num_timesteps,

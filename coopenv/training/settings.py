@@ -83,7 +83,7 @@ class Clone(Section):
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
 
 
-class Evaluation(Section):
+class EvaluationSettings(Section):
     """Judging the mean action on held-out maps."""
 
     every: Count = 250_000
@@ -104,7 +104,7 @@ class Settings(Section):
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--set`."""
     ppo: Ppo = Ppo()
-    evaluation: Evaluation = Evaluation()
+    evaluation: EvaluationSettings = EvaluationSettings()
     clone: Clone | None = None
 
     @property
@@ -116,7 +116,7 @@ class Settings(Section):
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """What is to be trained; two runs of one plan and one version on one machine give the same policy."""
 
     environment: str
@@ -226,7 +226,7 @@ def _movable(text: str, folder: Path) -> str:
     return tomlkit.dumps(document)
 
 
-def settings_text(plan: Plan) -> str:
+def settings_text(plan: TrainingPlan) -> str:
     """Return the settings of a training, defaults and overrides among them, as TOML."""
     import tomlkit  # of the extra `train`
 
@@ -234,12 +234,12 @@ def settings_text(plan: Plan) -> str:
     return tomlkit.dumps({**values, "scenario": plan.all_overrides})
 
 
-def settings_digest(plan: Plan) -> str:
+def settings_digest(plan: TrainingPlan) -> str:
     """Return the SHA-256 of `settings_text`, by which a later training knows the file for the agent's."""
     return sha256(settings_text(plan).encode()).hexdigest()
 
 
-def check_settings(folder: Path, plan: Plan, environment: EnvironmentFile) -> None:
+def check_settings(folder: Path, plan: TrainingPlan, environment: EnvironmentFile) -> None:
     """Find out before any work whether `write_settings` can be done.
 
     Raises:
@@ -252,7 +252,7 @@ def check_settings(folder: Path, plan: Plan, environment: EnvironmentFile) -> No
         )
 
 
-def write_settings(folder: Path, old: Path, plan: Plan, environment: EnvironmentFile) -> None:
+def write_settings(folder: Path, old: Path, plan: TrainingPlan, environment: EnvironmentFile) -> None:
     """Write the settings of a training to the new folder of its agent; a file that says the same goes along as it is.
 
     Args:
@@ -273,7 +273,7 @@ def write_settings(folder: Path, old: Path, plan: Plan, environment: Environment
             new.write_text(settings_text(plan), encoding="utf-8", newline="\n")
 
 
-def _says(path: Path, plan: Plan, environment: EnvironmentFile) -> bool:
+def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
     """Return whether `coopenv train` with a file and no other option has the settings of a plan."""
     try:
         settings = read_settings(path, None, Path(environment.name).stem)

@@ -24,7 +24,7 @@ from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
-from coopenv.training.settings import Clone, Plan
+from coopenv.training.settings import Clone, TrainingPlan
 
 EPISODES = 200
 """Last episodes of vehicles over which is averaged."""
@@ -195,7 +195,7 @@ class DivergedError(CoopenvError):
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
-    def __init__(self, plan: Plan, scenario: Scenario, threads: int | None = None) -> None:
+    def __init__(self, plan: TrainingPlan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
 
         Args:

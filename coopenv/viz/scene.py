@@ -152,7 +152,7 @@ SCENE_FILE = "scene.npz"
 _HEADER = "header"
 
 
-class Source(Section):
+class Origin(Section):
     """Environment, observer, driver and seed of a scene, for its heading."""
 
     name: str
@@ -182,11 +182,11 @@ class Source(Section):
         return ", ".join([*parts, *([f"seed {self.seed}"] if self.seed is not None else [])])
 
 
-class Header(Section):
+class SceneHeader(Section):
     """What the file of a scene says of its arrays."""
 
     frames: int = Field(ge=1)
-    source: Source
+    source: Origin
     scenario: dict[str, Any]
 
 
@@ -195,7 +195,7 @@ class SceneRecord:
     """K frames of an episode."""
 
     scenario: Scenario
-    source: Source
+    source: Origin
     fields: dict[str, np.ndarray]
     """By name of a frame's field, (K, ...)."""
 
@@ -218,7 +218,7 @@ class SceneRecord:
         return float(self.time[-1] - self.time[0])
 
     @classmethod
-    def of_frames(cls, scenario: Scenario, source: Source, frames: Sequence[Frame]) -> Self:
+    def of_frames(cls, scenario: Scenario, source: Origin, frames: Sequence[Frame]) -> Self:
         """Return the record of at least one frame."""
         return cls(scenario, source, {name: np.stack([getattr(frame, name) for frame in frames]) for name in FIELDS})
 
@@ -251,7 +251,8 @@ class SceneRecord:
         Raises:
             DataError: there is no such file, or it is no scene.
         """
-        header = validated(Header, read_npz(path, "scene", {_HEADER: "u B"})[_HEADER].tobytes(), f"{path}", DataError)
+        content = read_npz(path, "scene", {_HEADER: "u B"})[_HEADER].tobytes()
+        header = validated(SceneHeader, content, f"{path}", DataError)
         count, source, scenario = header.frames, header.source, parse_scenario(header.scenario, str(path))
         n = len(scenario.vehicles)
         lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}

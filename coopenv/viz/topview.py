@@ -20,7 +20,7 @@ from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_ground import Goals, Layers
 
 
-class Window:
+class PictureWindow:
     """One window, opened by the first picture and reused by the next ones."""
 
     def __init__(self, title: str) -> None:
@@ -113,7 +113,7 @@ class TopView:
         self._prepare_shapes()
         self._prepare_artists()
         self._prepare_table()
-        self._window = Window(scenario.title)
+        self._window = PictureWindow(scenario.title)
 
     def draw(self, engine: FrameSource) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of world 0, as wide as the map if that is all."""

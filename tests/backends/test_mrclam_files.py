@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coopenv.backends.mrclam import VARIANTS, load_dataset
-from coopenv.backends.mrclam.dataset import MAX_HOLD_S, HeldCommands, Truth, find_folder
+from coopenv.backends.mrclam.dataset import MAX_HOLD_S, HeldCommands, MotionCapture, find_folder
 from coopenv.backends.mrclam.recording import check_variant, counted
 from coopenv.base.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
@@ -195,14 +195,14 @@ def test_clock_and_frames(dataset):
 
 
 def test_truth_crosses_pi_the_short_way():
-    truth = Truth(np.array([0.0, 0.4]), np.zeros((2, 2)), np.unwrap([math.pi - 0.1, -math.pi + 0.1]))
+    truth = MotionCapture(np.array([0.0, 0.4]), np.zeros((2, 2)), np.unwrap([math.pi - 0.1, -math.pi + 0.1]))
     _, heading, valid, _ = truth.at(np.array([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(heading, [math.pi - 0.05, -math.pi, -math.pi + 0.05], atol=1e-12)
     assert valid.all()
 
 
 def test_truth_is_invalid_in_gaps_outside_and_where_corrupt():
-    truth = Truth(np.array([0.0, 0.2, 5.0, 5.2]), np.zeros((4, 2)), np.zeros(4), ((5.05, 5.15),))
+    truth = MotionCapture(np.array([0.0, 0.2, 5.0, 5.2]), np.zeros((4, 2)), np.zeros(4), ((5.05, 5.15),))
     _, _, valid, heading = truth.at(np.array([-0.1, 0.0, 0.1, 0.2, 1.0, 5.0, 5.1, 5.2, 5.3]))
     assert valid.tolist() == [False, True, True, True, False, True, True, True, False]
     assert heading.tolist() == [False, True, True, True, False, True, False, True, False]

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mrclam import load_dataset
-from coopenv.backends.mrclam.dataset import Truth
+from coopenv.backends.mrclam.dataset import MotionCapture
 from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, recording_of
 from coopenv.base.errors import DataError
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
@@ -92,7 +92,7 @@ def with_truth(dataset, n, t, corrupt=()):
     t = np.asarray(t, float)
     x, y, heading = pose(n + 1, ORIGIN_S + t).T
     robots = list(dataset.robots)
-    robots[n] = replace(robots[n], truth=Truth(t, np.stack([x, y], -1), np.unwrap(heading), corrupt))
+    robots[n] = replace(robots[n], truth=MotionCapture(t, np.stack([x, y], -1), np.unwrap(heading), corrupt))
     return replace(dataset, robots=tuple(robots))
 
 

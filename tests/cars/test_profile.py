@@ -17,7 +17,7 @@ from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
 from coopenv.cars.gate.process import GateConnection
-from coopenv.cars.profile import FOLDER, USUAL, CarProfile, Drive, Role, load_profile
+from coopenv.cars.profile import FOLDER, USUAL, CarProfile, MotionCommand, Role, load_profile
 from coopenv.cars.transport.base import Arrival
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
 from tests.helpers.hub import Hub
@@ -71,9 +71,9 @@ def test_its_gate_sends_its_own_command_message(rover: CarProfile) -> None:
     gates = Gates(hub.connect(), ("svea7",), USUAL, None, None, rover)
     link.publish_status()
     assert gates.states["svea7"].state == "disarmed"
-    values = rover.command.values(Drive(0.1, 0.5))
+    values = rover.command.values(MotionCommand(0.1, 0.5))
     assert values["steering_angle"] == pytest.approx(-5.7295780) and values["speed"] == 0.5
-    assert read_drive(sent[0].payload, rover.command) == Drive()
+    assert read_drive(sent[0].payload, rover.command) == MotionCommand()
 
 
 def test_a_deployment_and_a_bag_name_it(tmp_path: Path, rover: CarProfile) -> None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.backends.mrclam import Dataset, recording_of
-from coopenv.backends.mrclam.dataset import Robot, Truth
+from coopenv.backends.mrclam.dataset import MotionCapture, Robot
 from coopenv.observers.recording import PER_TICK, Recording
 
 DT = 0.025
@@ -98,7 +98,7 @@ def _robot(
                 who = subject if rng.random() > MISREAD else int(rng.integers(6, 21))
                 seen.append((k * DT, who, math.hypot(dx, dy), bearing + bias + 0.013 * rng.standard_normal()))
     t = np.asarray(DT * np.arange(poses.shape[1]), dtype=np.float64)
-    truth = Truth(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
+    truth = MotionCapture(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
     return Robot(n + 1, odometry, np.array(seen).reshape(-1, 4), truth, 0)
 
 

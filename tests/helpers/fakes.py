@@ -10,7 +10,7 @@ from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake
 from coopenv.cars.gate.core import GateClock, write_drive
-from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Drive, Role
+from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.hub import Hub
@@ -61,7 +61,7 @@ class Stage:
 
     def command(self, car: str, speed: float, steering: float = 0.0) -> None:
         """Send what a gate would."""
-        payload = write_drive(self.wall + self.now, self.fleet.profile.command, Drive(steering, speed))
+        payload = write_drive(self.wall + self.now, self.fleet.profile.command, MotionCommand(steering, speed))
         self.network.publish(self.fleet.profile.topic_of(car, Role.MANUAL), payload)
 
     def drive(self, car: str, speed: float, steering: float, seconds: float) -> None:

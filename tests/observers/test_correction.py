@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.poses import right_jacobian
 from coopenv.observers import Coordinates
-from coopenv.observers.bearing_measurements import INVARIANT, LEFT, RIGHT, PoseEstimate, recentring
+from coopenv.observers.bearing_measurements import INVARIANT, LEFT, RIGHT, UncertainPose, recentring
 from coopenv.observers.correction import iterated
 from tests.observers.test_filters import derivative, kalman, pose, spd
 
@@ -24,7 +24,7 @@ def test_right_jacobian_is_the_derivative_of_the_exponential(angle: float) -> No
 
 @pytest.mark.parametrize("kind", [LEFT, RIGHT])
 def test_recentring_is_the_derivative_of_the_error_that_is_left(kind: int) -> None:
-    start = PoseEstimate(kind, *pose(4), np.eye(6))
+    start = UncertainPose(kind, *pose(4), np.eye(6))
     dx = np.array([0.3, -0.2, 0.4, 1.0, -0.5, 2.0])
     moved = start.moved(dx, start.P)
     coordinates = Coordinates.LEFT if kind == LEFT else Coordinates.RIGHT
@@ -37,7 +37,7 @@ def test_recentring_is_the_derivative_of_the_error_that_is_left(kind: int) -> No
 
 
 def test_recentring_of_the_invariant_error() -> None:
-    start = PoseEstimate(INVARIANT, *pose(4), np.eye(6))
+    start = UncertainPose(INVARIANT, *pose(4), np.eye(6))
     dx = np.array([0.1, -0.2, 0.1, 1.0, -0.5, 2.0])
     G, d = recentring(INVARIANT, dx), 1e-6 * np.arange(1.0, 7.0)
     one, other = start.moved(dx + d, start.P), start.moved(dx, start.P)

@@ -16,7 +16,7 @@ from coopenv.observers.bearing_measurements import (
     LEFT,
     RIGHT,
     BearingMeasurements,
-    PoseEstimate,
+    UncertainPose,
     from_left,
     linearise,
 )
@@ -75,7 +75,7 @@ def derivative(f, n: int = 6, h: float = 1e-6) -> np.ndarray:
 
 @pytest.mark.parametrize("coordinates", STATES)
 def test_moving_by_an_error_makes_that_error(coordinates: Coordinates) -> None:
-    state = PoseEstimate(STATES[coordinates], *pose(0), np.eye(6))
+    state = UncertainPose(STATES[coordinates], *pose(0), np.eye(6))
     e = np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0])
     moved = state.moved(e, state.P)
     assert_allclose(coordinates.error(moved.R, moved.p, state.R, state.p), e, atol=1e-12)
@@ -84,7 +84,7 @@ def test_moving_by_an_error_makes_that_error(coordinates: Coordinates) -> None:
 @pytest.mark.parametrize("coordinates", STATES)
 def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates: Coordinates) -> None:
     """The residual falls by H dx when the estimate moves by dx, to first order at a noise-free bearing."""
-    state, c = PoseEstimate(STATES[coordinates], *pose(1), np.eye(6)), np.array([0.2, 0.1, -0.3])
+    state, c = UncertainPose(STATES[coordinates], *pose(1), np.eye(6)), np.array([0.2, 0.1, -0.3])
     z = np.random.default_rng(2).uniform(-8, 8, (4, 3))
     d = (z - state.p) @ state.R - c
     bearings = d / np.linalg.norm(d, axis=1, keepdims=True)
@@ -103,7 +103,7 @@ def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates
 @pytest.mark.parametrize("coordinates", STATES)
 def test_prediction_carries_the_covariance_by_numerical_derivatives(coordinates: Coordinates) -> None:
     P, t = spd(np.random.default_rng(3), 6), tick(4, QUIET)
-    state = PoseEstimate(STATES[coordinates], *pose(5), P)
+    state = UncertainPose(STATES[coordinates], *pose(5), P)
     after = state.predicted(t)
 
     def error(dx: np.ndarray) -> np.ndarray:
@@ -118,8 +118,8 @@ def test_prediction_carries_the_covariance_by_numerical_derivatives(coordinates:
 def test_odometry_noise_is_the_same_in_both_coordinates() -> None:
     """From P = 0, the right covariance is the left one carried over by the numerical derivative between the errors."""
     t = tick(6, SensorNoise(0.3, 0.2, 0.1, 0.0))
-    left = PoseEstimate(LEFT, *pose(7), np.zeros((6, 6))).predicted(t)
-    right = PoseEstimate(RIGHT, *pose(7), np.zeros((6, 6))).predicted(t)
+    left = UncertainPose(LEFT, *pose(7), np.zeros((6, 6))).predicted(t)
+    right = UncertainPose(RIGHT, *pose(7), np.zeros((6, 6))).predicted(t)
 
     def convert(dx: np.ndarray) -> np.ndarray:
         moved = left.moved(dx, left.P)
@@ -128,14 +128,14 @@ def test_odometry_noise_is_the_same_in_both_coordinates() -> None:
     T = derivative(convert)
     assert_allclose(np.diag(left.P), np.repeat([(0.2 * 0.1) ** 2, (0.3 * 0.1) ** 2], 3), rtol=1e-12)
     assert_allclose(right.P, T @ left.P @ T.T, atol=1e-9)
-    started = PoseEstimate.start(RIGHT, left.R, left.p, spd(np.random.default_rng(0), 6))
+    started = UncertainPose.start(RIGHT, left.R, left.p, spd(np.random.default_rng(0), 6))
     assert_allclose(started.P, T @ spd(np.random.default_rng(0), 6) @ T.T, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("coordinates", STATES)
 def test_covariance_of_the_marker(coordinates: Coordinates) -> None:
     P, m = spd(np.random.default_rng(8), 6), np.array([0.3, -0.4, 0.8])
-    state = PoseEstimate(STATES[coordinates], *pose(9), P)
+    state = UncertainPose(STATES[coordinates], *pose(9), P)
     J = derivative(lambda dx: (lambda s: s.p + s.R @ m)(state.moved(dx, P)))
     assert_allclose(state.point_covariance(m), J @ P @ J.T, atol=1e-7)
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import logm
 
 from coopenv.observers import Coordinates, Estimate, SensorNoise, run
-from coopenv.observers.bearing_measurements import INVARIANT, PoseEstimate
+from coopenv.observers.bearing_measurements import INVARIANT, UncertainPose
 from coopenv.observers.error_state_filters import SPREAD, LeftInvariant, Mekf, Ukf, sigma_points
 from tests.observers.test_filters import QUIET, pose, spd, tick
 from tests.oracles.batch import assert_same_covariance, small_record
@@ -18,25 +18,25 @@ from tests.oracles.batch import assert_same_covariance, small_record
 LARGE = np.array([1.1, -0.7, 0.9, 3.0, -2.0, 5.0])
 
 
-def matrix(state: PoseEstimate) -> np.ndarray:
+def matrix(state: UncertainPose) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = state.R, state.p
     return T
 
 
-def invariant_error(truth: PoseEstimate, estimate: PoseEstimate) -> np.ndarray:
+def invariant_error(truth: UncertainPose, estimate: UncertainPose) -> np.ndarray:
     X = logm(np.linalg.inv(matrix(estimate)) @ matrix(truth)).real
     return np.array([X[2, 1], X[0, 2], X[1, 0], *X[:3, 3]])
 
 
 def test_moving_by_an_error_of_any_size_makes_that_error() -> None:
-    state = PoseEstimate(INVARIANT, *pose(0), np.eye(6))
+    state = UncertainPose(INVARIANT, *pose(0), np.eye(6))
     assert_allclose(invariant_error(state.moved(LARGE, state.P), state), LARGE, atol=1e-9)
 
 
 def test_prediction_of_a_large_error_is_linear() -> None:
     """Group affinity: the outer product of one error is carried exactly, which first order would miss by metres."""
-    state, t = PoseEstimate(INVARIANT, *pose(1), np.outer(LARGE, LARGE)), tick(2, QUIET)
+    state, t = UncertainPose(INVARIANT, *pose(1), np.outer(LARGE, LARGE)), tick(2, QUIET)
     after = state.predicted(t)
     error = invariant_error(state.moved(LARGE, state.P).predicted(t), after)
     assert_allclose(after.P, np.outer(error, error), atol=1e-8)
@@ -66,7 +66,7 @@ def test_sigma_points_have_the_moments() -> None:
 def test_sigma_points_count_the_curvature_that_a_derivative_misses() -> None:
     """After one frame at 60 degrees and 3 m, the filter of derivatives is far surer of the position."""
     made = small_record(1)
-    truth = PoseEstimate(INVARIANT, made.truth.rotation[1, 0], made.truth.position[1, 0], np.eye(6))
+    truth = UncertainPose(INVARIANT, made.truth.rotation[1, 0], made.truth.position[1, 0], np.eye(6))
     start = truth.moved(np.array([0.0, 0.0, 1.05, 3.0, 0.0, 0.0]), truth.P)
     noise = SensorNoise(0.0, 0.0, made.dt, 0.02)
     still = replace(made.tick(1, 0, {}), rotation=np.eye(3), translation=np.zeros(3), noise=noise)

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Message, Received, Tick, run
-from coopenv.observers.bearing_measurements import LEFT, PoseEstimate
+from coopenv.observers.bearing_measurements import LEFT, UncertainPose
 from coopenv.observers.single_frame import PerspectivePoints
 from tests.observers.test_filters import QUIET, tick
 from tests.oracles.batch import small_record
@@ -84,7 +84,7 @@ def test_one_wrong_bearing_of_five_is_left_out() -> None:
 
 def test_two_bearings_leave_odometry_alone() -> None:
     estimate = started(R_TRUE, P_TRUE + 1.0).update(frame(2))
-    expected = PoseEstimate(LEFT, R_TRUE, P_TRUE + 1.0, 10.0 * np.eye(6)).predicted(frame(2))
+    expected = UncertainPose(LEFT, R_TRUE, P_TRUE + 1.0, 10.0 * np.eye(6)).predicted(frame(2))
     assert_allclose(estimate.position, expected.p)
     assert_allclose(estimate.covariance, expected.P)
 

@@ -16,7 +16,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.runs.scenes import frame_stride, frames_at, scene_of, write_film, write_pictures
-from coopenv.viz.scene import SceneRecord, Source
+from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.topview import TopView
 from tests.helpers.processes import small_disk
 
@@ -24,7 +24,7 @@ from tests.helpers.processes import small_disk
 @pytest.fixture(scope="module")
 def record() -> SceneRecord:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 3.0})
-    return scene_of(Engine(scenario), Source.of("overtaking", scenario, seed=0))
+    return scene_of(Engine(scenario), Origin.of("overtaking", scenario, seed=0))
 
 
 def test_a_film_shows_the_frame_that_is_there() -> None:

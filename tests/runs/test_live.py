@@ -19,14 +19,14 @@ from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs.live import Keyboard, Keys, drive_by_hand, watch
-from coopenv.viz.topview import Window
+from coopenv.viz.topview import PictureWindow
 from tests.helpers.four_way import FOUR_WAY
 
 AT_ONCE = np.inf
 SHORT = {"horizon": 3.0}
 
 
-class Unseen(Window):
+class Unseen(PictureWindow):
     """A window without a display that plays a script: what happens at each picture."""
 
     def __init__(self, script: Callable[[Unseen, int], None] = lambda window, number: None) -> None:

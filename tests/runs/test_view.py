@@ -22,7 +22,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.runs.live import FAULTS, EngineReel, Reel, vehicle_index
 from coopenv.runs.scenes import driver_of, open_source, scene_of
 from coopenv.runs.view import Viewer
-from coopenv.viz.scene import Source
+from coopenv.viz.scene import Origin
 from coopenv.viz.web.page import free_port, guarded_server
 from tests.helpers.fleet import Fleet
 
@@ -295,7 +295,7 @@ def test_when_cars_end_the_view_stays_and_waits() -> None:
 
 def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
-    record = scene_of(Engine(scenario), Source.of("overtaking", scenario, seed=0))
+    record = scene_of(Engine(scenario), Origin.of("overtaking", scenario, seed=0))
     reel = Reel.of(record)
     with guarded_server("127.0.0.1") as (server, _):
         shown = Viewer(server, reel)

@@ -16,12 +16,12 @@ from coopenv.api.engine import Engine
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import Policy, load_agent
-from coopenv.policies.network import Network
+from coopenv.policies.network import PolicyNetwork
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
 from coopenv.training.export import export, network_of, onnx_model
-from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings, environment_file
+from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, environment_file
 from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer
 from tests.helpers.four_way import FOUR_WAY
 
@@ -31,7 +31,7 @@ SMALL = Ppo(vehicles=16, decisions=32, epochs=1)
 
 
 def trainer_of(**settings: object) -> Trainer:
-    plan = Plan(FOUR_WAY, Settings(ppo=SMALL, **settings), seed=0)
+    plan = TrainingPlan(FOUR_WAY, Settings(ppo=SMALL, **settings), seed=0)
     return Trainer(plan, coopenv.load_scenario(FOUR_WAY), threads=1)
 
 
@@ -48,7 +48,7 @@ def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> No
     observations = np.random.default_rng(0).uniform(-1, 1, (100, 132)).astype(np.float32)
     expected = trained.model.predict(trained.env.normalise(observations), deterministic=True)[0]
     agent = load_agent(tmp_path, trained.scenario)
-    assert isinstance(agent, Network)
+    assert isinstance(agent, PolicyNetwork)
     assert agent(observations) == pytest.approx(expected, abs=1e-5)
     reference = pytest.importorskip("onnx.reference", reason="needs the extra 'onnx'")
     data = onnx_model(network_of(trained), trained.plan.settings.ppo.observation_clip)
@@ -137,8 +137,8 @@ def test_learns_to_drive_faster_where_nothing_else_counts(tmp_path: Path) -> Non
         "termination": {"collision": False, "arrival": False},
     }
     ppo = Ppo(vehicles=64, decisions=16, gamma=0.9, learning_rate=3e-3)
-    settings = Settings(steps=40_000, scenario=overrides, ppo=ppo, evaluation=Evaluation(final_worlds=8))
-    results = train(Plan(FOUR_WAY, settings, seed=2), tmp_path / "agent", threads=1)
+    settings = Settings(steps=40_000, scenario=overrides, ppo=ppo, evaluation=EvaluationSettings(final_worlds=8))
+    results = train(TrainingPlan(FOUR_WAY, settings, seed=2), tmp_path / "agent", threads=1)
     figures = {result.metric: result for result in results}
     scenario = coopenv.load_scenario(FOUR_WAY, overrides)
     half_speed = figures_of(lambda observations: np.zeros((len(observations), 2)), scenario)

@@ -14,7 +14,7 @@ from coopenv.base.errors import OutputError
 from coopenv.base.installation import data_directory
 from coopenv.policies import find_agent
 from coopenv.training.settings import (
-    Plan,
+    TrainingPlan,
     check_settings,
     environment_file,
     read_settings,
@@ -82,14 +82,14 @@ def test_an_environment_goes_before_all_and_an_arm_before_it(path: Path) -> None
 
 def test_the_command_line_goes_before_the_file(path: Path) -> None:
     assert read_settings(path, steps=7).budget == (7, None)
-    plan = Plan("urban_crossing", read_settings(path), 3, None, {"rates.decision": 10.0})
+    plan = TrainingPlan("urban_crossing", read_settings(path), 3, None, {"rates.decision": 10.0})
     assert plan.all_overrides["rates.decision"] == 10.0
 
 
 def test_a_plan_survives_as_plain_data(path: Path) -> None:
-    plan = Plan("urban_crossing", read_settings(path, "blind"), 3, "blind", {"horizon": 9.0})
-    plain = TypeAdapter(Plan).dump_python(plan, mode="json")
-    assert TypeAdapter(Plan).validate_python(json.loads(json.dumps(plain))) == plan
+    plan = TrainingPlan("urban_crossing", read_settings(path, "blind"), 3, "blind", {"horizon": 9.0})
+    plain = TypeAdapter(TrainingPlan).dump_python(plan, mode="json")
+    assert TypeAdapter(TrainingPlan).validate_python(json.loads(json.dumps(plain))) == plan
 
 
 @pytest.mark.parametrize(
@@ -153,11 +153,13 @@ def new(tmp_path: Path) -> Path:
     return tmp_path / "new"
 
 
-def plan_of(folder: Path, arm: str | None = None, **changes: int) -> Plan:
-    return Plan("urban_crossing", read_settings(folder / "train.toml", arm, "urban_crossing", **changes), 5, arm, {})
+def plan_of(folder: Path, arm: str | None = None, **changes: int) -> TrainingPlan:
+    return TrainingPlan(
+        "urban_crossing", read_settings(folder / "train.toml", arm, "urban_crossing", **changes), 5, arm, {}
+    )
 
 
-def finish(folder: Path, plan: Plan) -> None:
+def finish(folder: Path, plan: TrainingPlan) -> None:
     """Leave in a folder what a training writes of its settings there."""
     write_settings(folder, folder / "nothing", plan, HERE)
     (folder / "agent.toml").write_text(f'[training]\nsettings = "{settings_digest(plan)}"\n')
@@ -177,7 +179,7 @@ def test_with_other_options_it_is_refused(arm: str | None, changes: dict[str, in
 
 
 def test_overrides_are_among_the_settings_and_what_cannot_be_read_is_the_users(old: Path) -> None:
-    plan = Plan("urban_crossing", read_settings(old / "train.toml"), 5, None, {"horizon": 6.0})
+    plan = TrainingPlan("urban_crossing", read_settings(old / "train.toml"), 5, None, {"horizon": 6.0})
     check_settings(old, plan, HERE)
     with pytest.raises(OutputError, match=REFUSED):
         check_settings(old, replace(plan, overrides={"horizon": 7.0}), HERE)

@@ -24,7 +24,7 @@ from coopenv.cli import main
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
 from coopenv.training.command import train
-from coopenv.training.settings import Plan, read_settings
+from coopenv.training.settings import TrainingPlan, read_settings
 from tests.helpers.processes import COOPENV, start, wait_until
 
 pytestmark = pytest.mark.train
@@ -300,7 +300,7 @@ def test_a_training_that_cannot_begin_leaves_nothing(
     (here / "a_file").write_text("")
     (here / "bad.toml").write_text(f"[ppo]\n{extra}\n")
     before = {path.name for path in here.iterdir()}
-    plan = Plan("urban_crossing", read_settings(here / "bad.toml"), 0, None, {})
+    plan = TrainingPlan("urban_crossing", read_settings(here / "bad.toml"), 0, None, {})
     with pytest.raises(CoopenvError, match=message):
         train(plan, Path("new", "agent"), threads=threads, logs=None if logs is None else Path(logs))
     assert {path.name for path in here.iterdir()} == before
@@ -348,5 +348,5 @@ def test_settings_in_the_agents_folder_stay_as_the_user_wrote_them(
 def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(CoopenvError, match="--onnx needs the package onnx"):
-        train(Plan("urban_crossing", read_settings(here / "train.toml"), 0), Path("agent"), onnx=True)
+        train(TrainingPlan("urban_crossing", read_settings(here / "train.toml"), 0), Path("agent"), onnx=True)
     assert not (here / "agent").exists()

@@ -16,7 +16,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.policies import decide, load_policy
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.camera_image import Lens
-from coopenv.viz.scene import Frame, SceneRecord, Source
+from coopenv.viz.scene import Frame, Origin, SceneRecord
 from coopenv.viz.stage import Stage, entries
 from coopenv.viz.topview import TopView
 from coopenv.viz.web.picture import stopped
@@ -35,7 +35,7 @@ def played(name: str, overrides: dict[str, Any], decisions: int, seed: int = 1) 
 @pytest.fixture(scope="module")
 def urban() -> SceneRecord:
     scenario = coopenv.load_scenario("urban_crossing", {"horizon": 3.0})
-    return scene_of(Engine(scenario), Source.of("urban_crossing", scenario, seed=1, policy="zero"))
+    return scene_of(Engine(scenario), Origin.of("urban_crossing", scenario, seed=1, policy="zero"))
 
 
 def test_a_frame_is_what_the_engine_says() -> None:
@@ -126,7 +126,7 @@ def test_who_is_hidden_is_hidden_by_somebody(name: str) -> None:
     changes = {"noise.enabled": False, "horizon": 12.0, **(wall if name == "urban_crossing" else {})}
     scenario = coopenv.load_scenario(name, changes)
     engine, policy = Engine(scenario, dtype="float64"), load_policy("route_follower", scenario, 0)
-    record = scene_of(engine, Source.of(name, scenario, seed=3), policy)
+    record = scene_of(engine, Origin.of(name, scenario, seed=3), policy)
     stage, hidden = Stage(scenario), 0
     for k in range(0, len(record), 3):
         frame = record.frame(k)

@@ -16,7 +16,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
-from coopenv.viz.scene import SceneRecord, Source
+from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import linear, placed, spacing_of
 from coopenv.viz.web.page import viser_module, write_replay
@@ -29,7 +29,7 @@ zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
 
 def scene(name: str, **overrides: Any) -> SceneRecord:
     scenario = coopenv.load_scenario(name, {"horizon": 4.0, **overrides})
-    return scene_of(Engine(scenario), Source.of(name, scenario, seed=1))
+    return scene_of(Engine(scenario), Origin.of(name, scenario, seed=1))
 
 
 def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
@@ -115,7 +115,7 @@ def test_the_first_camera_has_the_whole_map_in_sight(aspect: float) -> None:
 
 def test_small_ellipsoids_are_magnified() -> None:
     stage = Stage(coopenv.load_scenario("urban_crossing"))
-    source = Source(name="", observer="robust")
+    source = Origin(name="", observer="robust")
     for share, factor in ((0.02, 1.0), (0.002, 10.0), (0.0002, 100.0), (np.nan, 1.0)):
         assert first_look(np.array([share * stage.side, np.nan]), stage, source).magnification == factor
     assert first_look(np.array([2e-4]), stage, source.model_copy(update={"honest": False})).magnification == 1.0

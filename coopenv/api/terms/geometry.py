@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth, log10, mat66
+from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord, log10, mat66
 from coopenv.world.camera import (
     VISIBLE,
     behind_building,
@@ -182,7 +182,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
         ego.arrived = state.arrivals[world, vehicle] - results.last_arrivals[world, vehicle]
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
 
-    truth = Truth()
+    truth = TruthRecord()
     agent = model.landmarks + vehicle
     truth.position = wp.vec3(state.position[world, agent])
     truth.rotation = wp.mat33(state.rotation[world, agent])

@@ -15,14 +15,14 @@ import warp as wp
 
 from coopenv.api.arguments import check_finite
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
-from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth
+from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord
 from coopenv.api.terms.results import Records, write_records
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count
-from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, Row
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, TermRow
 from coopenv.world import launch
 from coopenv.world.dynamics import UNDER_WAY
 from coopenv.world.launch import PerWorld, compiler_options
@@ -177,7 +177,7 @@ def reward_kernel(term: OwnTerm) -> wp.Kernel:
 
     def apply(
         ego: wp.array2d(dtype=Ego),
-        truth: wp.array2d(dtype=Truth),
+        truth: wp.array2d(dtype=TruthRecord),
         alive: wp.array2d(dtype=wp.bool),
         terms: wp.array3d(dtype=wp.float32),
         reward: wp.array2d(dtype=wp.float32),
@@ -207,7 +207,7 @@ def condition_kernel(term: OwnTerm) -> wp.Kernel:
 
     def apply(
         ego: wp.array2d(dtype=Ego),
-        truth: wp.array2d(dtype=Truth),
+        truth: wp.array2d(dtype=TruthRecord),
         ticks: wp.array(dtype=wp.int32),
         ended: wp.array2d(dtype=wp.int32),
         ticks_per_decision: int,
@@ -252,7 +252,9 @@ def _own_terms(scenario: Scenario, layout: Layout) -> Iterator[OwnTerm]:
         yield OwnTerm(*bound, condition_kernel, place, "true or false")
 
 
-def _bound(kind: Registry[Any], name: str, row: Row | None, records: tuple[int, ...]) -> tuple[str, wp.Function, bool]:
+def _bound(
+    kind: Registry[Any], name: str, row: TermRow | None, records: tuple[int, ...]
+) -> tuple[str, wp.Function, bool]:
     """Return title and function of a term, and whether it takes a second record."""
     title = f"{kind.kind} '{name}'"
     if row is None:

@@ -2,7 +2,7 @@
 
 Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
 `MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
-terminations may take `Truth`, and are then privileged. Observations therefore cannot leak truth.
+terminations may take `TruthRecord`, and are then privileged. Observations therefore cannot leak truth.
 
 Values stand in the order of their rows in `coopenv.scenario.terms`, and in their units; the results kernel scales and
 clips them, or weighs them.
@@ -70,7 +70,7 @@ class Ego:
 
 
 @wp.struct
-class Truth:
+class TruthRecord:
     """The true state; NaN (numbers: 0) in a recording without it."""
 
     position: wp.vec3  # m, map
@@ -264,7 +264,7 @@ def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
 
 
 @wp.func
-def reward_values(ego: Ego, truth: Truth) -> RewardValues:
+def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
     """Return the values of the reward terms, without weights."""
     threshold, cap = ego.uncertainty_threshold, ego.uncertainty_cap
     shortfall = ego.observability_level - ego.soft_observability

@@ -26,7 +26,7 @@ from coopenv.api.terms.records import (
     MapLandmark,
     Neighbour,
     Target,
-    Truth,
+    TruthRecord,
     landmark_values,
     neighbour_values,
     reward_values,
@@ -102,7 +102,7 @@ class Records:
     """The records that user terms read; without such terms the arrays are empty."""
 
     ego: array("WN", Ego)
-    truth: array("WN", Truth)
+    truth: array("WN", TruthRecord)
     target: array("WNT", Target)
     neighbour: array("WNM", Neighbour)
     landmark: array("WNL", MapLandmark)
@@ -120,7 +120,7 @@ class Entry:
 
 
 @wp.struct
-class Table:
+class TermTable:
     """The built-in terms of a scenario; user terms need records only."""
 
     vehicle: wp.array(dtype=Entry)
@@ -153,7 +153,7 @@ def results_table(scenario: Scenario, layout: Layout, device: str) -> Any:
         ]
     weights = scenario.reward.by_name
     own = own or bool(scenario.termination.own) or len(weights) > len(REWARD_TERMS.built_in)
-    table = Table()
+    table = TermTable()
     for per, rows in entries.items():
         setattr(table, per, wp.array(np.array(rows, dtype=Entry.numpy_dtype()), dtype=Entry, device=device))
     built_in = [weights[name] for name in REWARD_TERMS.built_in]
@@ -220,7 +220,7 @@ def write_entries(
 def step_results(
     model: Any,
     state: Any,
-    table: Table,
+    table: TermTable,
     records: Records,
     results: Any,
     fresh: wp.array(dtype=wp.int32),

@@ -104,7 +104,7 @@ SetupHeader = _section_of(
 )
 
 
-class Header(Section):
+class RecordingHeader(Section):
     """Everything of a `Recording` that does not change from tick to tick; `check_recording` knows what makes sense."""
 
     ticks: int = Field(ge=1)
@@ -143,7 +143,7 @@ class Header(Section):
 
 def header_of(recording: Recording) -> bytes:
     """Return the header of a recording as JSON."""
-    values = jsonable({name: getattr(recording, name) for name in Header.model_fields})
+    values = jsonable({name: getattr(recording, name) for name in RecordingHeader.model_fields})
     if values["scenario"] is not None:
         values["scenario"] = without_own_terms(values["scenario"])
     return json.dumps(values, separators=(",", ":")).encode()

@@ -16,7 +16,7 @@ from coopenv.backends.mcap.format import (
     FORMAT,
     LANDMARKS,
     LANDMARKS_TYPE,
-    Header,
+    RecordingHeader,
     codec,
     exact_topics,
     reading,
@@ -143,7 +143,7 @@ def _read(container: Container, where: str) -> Recording:
         raise DataError(f"{where}: {error}") from None
 
 
-def _header(container: Container, where: str) -> Header:
+def _header(container: Container, where: str) -> RecordingHeader:
     metadata, attachments = container.extras()
     found = metadata.get("coopenv")
     if found is None:
@@ -154,4 +154,4 @@ def _header(container: Container, where: str) -> Header:
         raise DataError(f"{where}: attachment '{ATTACHMENT}' is missing")
     if hashlib.sha256(attachments[ATTACHMENT]).hexdigest() != found.get("sha256"):
         raise DataError(f"{where}: {ATTACHMENT} is damaged, its check sum differs")
-    return Header.read(attachments[ATTACHMENT], f"{where}: {ATTACHMENT}")
+    return RecordingHeader.read(attachments[ATTACHMENT], f"{where}: {ATTACHMENT}")

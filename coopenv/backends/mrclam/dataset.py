@@ -49,7 +49,7 @@ def find_folder(name: str, data: str | Path | None = None) -> Path:
     raise DataError(f"{name}: neither {wanted} nor Barcodes.dat in {root}")
 
 
-class Table:
+class Rows:
     """A file's rows of finite numbers, which know their lines."""
 
     unknown = 0  # rows left out because a value in them is not known
@@ -130,13 +130,13 @@ class Table:
         return [int(value) for value in values]
 
 
-def timed(path: Path, columns: int, least: int) -> Table:
+def timed(path: Path, columns: int, least: int) -> Rows:
     """Return a table whose first column is the time, s, which does not run ahead by hours.
 
     Rows that stand up to a second too late are put in order, and rows with NaN are left out; the table counts both. A
     DataError names a row that is later.
     """
-    table = Table(path, columns, least, gaps=True)
+    table = Rows(path, columns, least, gaps=True)
     t = table.values[:, 0]
     behind = np.maximum.accumulate(t) - t
     for row in np.flatnonzero(behind >= MAX_DISORDER_S).tolist():
@@ -160,7 +160,7 @@ CORRUPT_HEADING = {("mrclam_9", 3): ((757.0, 1100.0),)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class MotionCapture:
     """Motion capture of one robot."""
 
     t: Array  # (N,) s since the time origin
@@ -195,7 +195,7 @@ class Robot:
     detections: Array
     """(n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from the heading;
     those of one time are one camera frame."""
-    truth: Truth  # for judging, and for starting where an observer is given its start
+    truth: MotionCapture  # for judging, and for starting where an observer is given its start
     skipped: int  # detections left out because no robot carries their barcode (misread by the camera)
 
 
@@ -220,8 +220,8 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
         DataError: a folder, file or line does not have the format; the message names file and line.
     """
     folder = find_folder(name, data)
-    barcodes = _barcodes(Table(folder / "Barcodes.dat", 2, least=len(ROBOTS) + 1))
-    landmarks = _landmarks(Table(folder / "Landmark_Groundtruth.dat", 5, least=1), set(barcodes.values()))
+    barcodes = _barcodes(Rows(folder / "Barcodes.dat", 2, least=len(ROBOTS) + 1))
+    landmarks = _landmarks(Rows(folder / "Landmark_Groundtruth.dat", 5, least=1), set(barcodes.values()))
     known = {barcode: subject for barcode, subject in barcodes.items() if subject in (*ROBOTS, *landmarks)}
     tables = [_tables(folder, robot) for robot in ROBOTS]
     starts = [float(odometry.values[0, 0]) for _, odometry, _ in tables]
@@ -236,7 +236,7 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
     return dataset
 
 
-def _remarks_on(dataset: Dataset, tables: list[Table]) -> list[str]:
+def _remarks_on(dataset: Dataset, tables: list[Rows]) -> list[str]:
     """Return which robots saw nothing, and what of the files was left out or put in order."""
     skipped = sum(robot.skipped for robot in dataset.robots)
     used = sum(len(robot.detections) for robot in dataset.robots)
@@ -250,7 +250,7 @@ def _remarks_on(dataset: Dataset, tables: list[Table]) -> list[str]:
     return remarks
 
 
-def _barcodes(table: Table) -> dict[int, int]:
+def _barcodes(table: Rows) -> dict[int, int]:
     """Return barcode -> subject."""
     result: dict[int, int] = {}
     for row, (subject, barcode) in enumerate(zip(table.whole(0), table.whole(1), strict=True)):
@@ -264,7 +264,7 @@ def _barcodes(table: Table) -> dict[int, int]:
     return result
 
 
-def _landmarks(table: Table, with_barcode: set[int]) -> dict[int, Array]:
+def _landmarks(table: Rows, with_barcode: set[int]) -> dict[int, Array]:
     result: dict[int, Array] = {}
     for row, subject in enumerate(table.whole(0)):
         if not 6 <= subject <= 20:
@@ -277,7 +277,7 @@ def _landmarks(table: Table, with_barcode: set[int]) -> dict[int, Array]:
     return dict(sorted(result.items()))
 
 
-def _tables(folder: Path, robot: int) -> tuple[Table, Table, Table]:
+def _tables(folder: Path, robot: int) -> tuple[Rows, Rows, Rows]:
     """Return a robot's truth, odometry and detections."""
     truth = timed(folder / f"Robot{robot}_Groundtruth.dat", 4, least=2)
     odometry = timed(folder / f"Robot{robot}_Odometry.dat", 3, least=2)
@@ -288,7 +288,7 @@ def _tables(folder: Path, robot: int) -> tuple[Table, Table, Table]:
 
 
 def _robot(
-    name: str, subject: int, origin: float, barcodes: dict[int, int], truth: Table, odometry: Table, seen: Table
+    name: str, subject: int, origin: float, barcodes: dict[int, int], truth: Rows, odometry: Rows, seen: Rows
 ) -> Robot:
     subjects = np.array([barcodes.get(barcode, 0) for barcode in seen.whole(1)], dtype=np.float64)
     clock = np.array([origin, 0.0, 0.0, 0.0])
@@ -302,7 +302,7 @@ def _robot(
         subject,
         odometry.values - clock[:3],
         detections[known],
-        Truth(rows[:, 0], rows[:, 1:3], np.unwrap(rows[:, 3]), corrupt),
+        MotionCapture(rows[:, 0], rows[:, 1:3], np.unwrap(rows[:, 3]), corrupt),
         int(np.count_nonzero(~known)),
     )
 

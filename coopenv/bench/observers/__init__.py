@@ -7,15 +7,15 @@ from coopenv.base import lazy_names
 if TYPE_CHECKING:
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.bench.observers.rows import Row
-    from coopenv.bench.observers.sources import Source, find_source
+    from coopenv.bench.observers.sources import RecordSource, find_source
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
             "coopenv.bench.observers.comparison": ["Comparison", "compare"],
             "coopenv.bench.observers.rows": ["Row"],
-            "coopenv.bench.observers.sources": ["Source", "find_source"],
+            "coopenv.bench.observers.sources": ["RecordSource", "find_source"],
         },
     )
 
-__all__ = ["Comparison", "Row", "Source", "compare", "find_source"]
+__all__ = ["Comparison", "RecordSource", "Row", "compare", "find_source"]

@@ -19,7 +19,7 @@ from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.rows import EDGES, Leaderboard, Row, WindowRow, checked_edges
-from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
+from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
 from coopenv.runs.console import Progress
@@ -186,7 +186,7 @@ def compare(
 class Plan:
     """What is compared: names and numbers that are known to exist."""
 
-    source: Source
+    source: RecordSource
     observers: tuple[str, ...]
     variants: tuple[str, ...]
     seeds: tuple[int, ...]
@@ -201,7 +201,7 @@ class Plan:
     def of(
         cls,
         observers: Iterable[str | Factory] | None,
-        source: Source,
+        source: RecordSource,
         seeds: int | Iterable[int],
         variants: str | Sequence[str] | None = None,
         steady_from: float | None = None,
@@ -245,7 +245,7 @@ class Plan:
         return Comparison(self.source.name, self.observers, summaries, used, samples)
 
 
-def _observers(observers: Iterable[str | Factory] | None, source: Source) -> tuple[str, ...]:
+def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) -> tuple[str, ...]:
     """Return the names of observers, each once; None: of all that are meant for the vehicles of a source."""
     if observers is None:
         return tuple(available_names(source.planar))

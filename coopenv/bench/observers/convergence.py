@@ -17,7 +17,7 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
-from coopenv.bench.observers.sources import Source
+from coopenv.bench.observers.sources import RecordSource
 from coopenv.estimation.metrics import CONVERGED, SETTLED, Interval, settling_time, wilson_interval
 from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.evaluation.episodes import Views, play
@@ -90,7 +90,7 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
     )
 
 
-def draw_starts(source: Source, observers: Mapping[str, str | Factory], draw: int) -> list[Draw]:
+def draw_starts(source: RecordSource, observers: Mapping[str, str | Factory], draw: int) -> list[Draw]:
     """Run every observer from one draw of the initial estimates."""
     started, found = random_start(source.recording(source.usual[0], 0), draw), []
     for name, factory in observers.items():
@@ -108,14 +108,14 @@ def draw_starts(source: Source, observers: Mapping[str, str | Factory], draw: in
     return found
 
 
-def check_source(source: Source) -> None:
+def check_source(source: RecordSource) -> None:
     """Refuse a source on which basins cannot be studied."""
     if not source.seeded:
         raise CoopenvError(f"--basin: {source.name} is recorded; basins are studied in simulated environments")
 
 
 def study_basin(
-    source: Source,
+    source: RecordSource,
     observers: Sequence[str],
     draws: int,
     executor: Executor,

@@ -23,7 +23,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from coopenv.base.format import jsonable, number
 from coopenv.bench.observers.convergence import ANGLE_BINS, RADIUS, Draw, by_angle
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import Sample
+from coopenv.bench.observers.judge import JudgedRun
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard
 from coopenv.bench.observers.tables import FAILED, mean_of, short_name
 from coopenv.estimation.metrics import mean_bounds, wilson_interval
@@ -53,14 +53,14 @@ _FRAME = 1.15  # inches above and below the panels
 _DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
 
 
-def _curves(samples: Sequence[Sample]) -> dict[str, Array]:
+def _curves(samples: Sequence[JudgedRun]) -> dict[str, Array]:
     """Return (S, N) medians over the seeds of errors and claims, m, and the mean NEES over its dimension."""
     error, std, nees = (np.array(values) for values in zip(*(sample.series for sample in samples), strict=True))
     mean = np.mean(nees, axis=0) / samples[0].nees_dof
     return {"error": np.median(error, axis=0), "std": 3.0 * np.median(std, axis=0), "nees": mean}
 
 
-def _bound(samples: Sequence[Sample]) -> Array:
+def _bound(samples: Sequence[JudgedRun]) -> Array:
     """Return (S, N) the joint bound over the seeds, m."""
     return np.asarray(np.sqrt(np.mean([sample.scene.bound**2 for sample in samples], axis=0)))
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.bench.observers.sources import Source
+from coopenv.bench.observers.sources import RecordSource
 from coopenv.estimation.metrics import (
     CONVERGED,
     SETTLED,
@@ -32,7 +32,7 @@ from coopenv.observers.runner import Run, run
 STEADY = "steady"
 
 
-class Window(NamedTuple):
+class TimeWindow(NamedTuple):
     """A stretch of a run, its start left out and its end included, s."""
 
     start: float
@@ -49,10 +49,10 @@ class Window(NamedTuple):
         return np.asarray((t > self.start) & (t <= self.end))
 
 
-def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[Window, ...]:
+def windows_of(edges: Iterable[float], steady_from: float, end: float) -> tuple[TimeWindow, ...]:
     """Return the windows between edges, s, as far as a run goes, and the steady state."""
-    between = [Window(start, min(stop, end)) for start, stop in pairwise(edges) if start < end]
-    return (*between, Window(steady_from, end, steady=True))
+    between = [TimeWindow(start, min(stop, end)) for start, stop in pairwise(edges) if start < end]
+    return (*between, TimeWindow(steady_from, end, steady=True))
 
 
 BOUNDS = ("joint", "ancestors", "alone")
@@ -60,11 +60,11 @@ BOUNDS = ("joint", "ancestors", "alone")
 
 
 @dataclass(frozen=True)
-class Scene:
+class RecordProperties:
     """Properties of the record, the same for all observers; NaN where unknown."""
 
     vehicles: tuple[str, ...]
-    windows: tuple[Window, ...]
+    windows: tuple[TimeWindow, ...]
     """W stretches that are judged one by one, the steady state last."""
     bounds: Array
     """(3, N, W) m^2, those of `BOUNDS` in each window."""
@@ -92,12 +92,12 @@ class Series(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sample:
+class JudgedRun:
     """One observer on one record."""
 
     variant: str
     observer: str
-    scene: Scene
+    scene: RecordProperties
     measures: Mapping[str, Array]
     """Arrays (N,) by name, those of `IN_WINDOWS` (N, W), see `_measures`; costs alone where it failed."""
     nees_dof: int
@@ -119,7 +119,7 @@ MOST_KEPT = 2  # bounds of records; those of many vehicles take minutes, and oft
 _kept: dict[bytes, list[Bound]] = {}
 
 
-def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = ()) -> Scene:
+def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = ()) -> RecordProperties:
     """Return the bounds and the observability of a record, `edges` being those of the windows to judge it in, s.
 
     The noise of recorded robots is not known, and so neither is their bound.
@@ -139,7 +139,7 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    return Scene(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
+    return RecordProperties(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
 
 
 def _geometry(recording: Recording) -> RecordedGeometry:
@@ -181,7 +181,7 @@ RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory
 class Task:
     """One record and its observers; small, so that it travels to a worker."""
 
-    source: Source
+    source: RecordSource
     variant: str
     seed: int
     observers: Mapping[str, str | Factory]
@@ -191,7 +191,7 @@ class Task:
     """s, of the windows that are judged one by one."""
 
 
-def judge(task: Task) -> list[Sample]:
+def judge(task: Task) -> list[JudgedRun]:
     """Make the record and run every observer of a task on it."""
     recording = task.source.recording(task.variant, task.seed)
     steady_from = task.source.steady_from(task.steady_from, recording)
@@ -202,7 +202,7 @@ def judge(task: Task) -> list[Sample]:
     ]
 
 
-def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
+def sample_of(variant: str, observer: str, scene: RecordProperties, recording: Recording, result: Run) -> JudgedRun:
     """Judge one run. Where it failed, everything but its costs is NaN."""
     series = Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
     measures = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
@@ -211,10 +211,10 @@ def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, r
         std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
         measures |= _measures(scene, recording, result)
         series = Series(result.position_error[kept], std, result.nees[kept])
-    return Sample(variant, observer, scene, measures, result.nees_dof, result.failure, series)
+    return JudgedRun(variant, observer, scene, measures, result.nees_dof, result.failure, series)
 
 
-def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Array]:
+def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dict[str, Array]:
     """Return the figures of a run that did not fail; m and deg and their squares, s, 1/s; NIS summed over time."""
     windows = [window.ticks(result.t) for window in scene.windows]
     dof = np.where(windows[-1][:, None], result.nis_dof, 0)

@@ -16,7 +16,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.bench.observers.convergence import Basin, Draw, basins_of
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample, Window
+from coopenv.bench.observers.judge import RELATIVE_DELTA, JudgedRun, TimeWindow
 from coopenv.estimation.metrics import (
     CONVERGED,
     DIVERGED_ORIENTATION,
@@ -82,7 +82,7 @@ class Total(NamedTuple):
     """`rmse` over that of the nominal variant; NaN without one."""
 
 
-def total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: Any = slice(None), w: int = -1) -> Total:
+def total(own: Sequence[JudgedRun], nominal: Sequence[JudgedRun], vehicles: Any = slice(None), w: int = -1) -> Total:
     """Sum up samples of the same seeds over vehicles, in the window `w`; without samples `nominal` nothing degrades."""
     squares, reference = (np.array([s.measured("position_mse")[vehicles, w] for s in some]) for some in (own, nominal))
     return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
@@ -164,7 +164,7 @@ BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", 
 """Column to its line in tables."""
 
 
-def row_of(environment: str, own: Sequence[Sample], nominal: Sequence[Sample], i: int, w: int = -1) -> Row:
+def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedRun], i: int, w: int = -1) -> Row:
     """Sum up samples of one observer in one variant over seeds, of vehicle `i` in window `w` (-1: the steady state).
 
     Columns that no `WindowRow` has are of the steady state or the whole run in any window.
@@ -249,7 +249,7 @@ class WindowRow:
     anees_se: float
 
 
-def window_row_of(environment: str, own: Sequence[Sample], i: int, w: int) -> WindowRow:
+def window_row_of(environment: str, own: Sequence[JudgedRun], i: int, w: int) -> WindowRow:
     """Sum up samples of one observer in one variant over seeds: vehicle `i` in window `w`."""
     window = own[0].scene.windows[w]
     known = vars(row_of(environment, own, (), i, w)) | {
@@ -291,13 +291,13 @@ class Leaderboard:
     variants: Mapping[str, str]
     """Those that were run, each with what it is."""
     seeds: tuple[int, ...]
-    samples: Sequence[Sample] = field(repr=False)
+    samples: Sequence[JudgedRun] = field(repr=False)
     """One observer on one record each, by variant, observer, seed."""
     draws: Sequence[Draw] = field(default=(), repr=False)
     """Of initial estimates, by observer, where basins were studied."""
 
     @cached_property
-    def groups(self) -> dict[tuple[str, str], list[Sample]]:
+    def groups(self) -> dict[tuple[str, str], list[JudgedRun]]:
         """The samples of all seeds, by variant and observer."""
         return {key: list(own) for key, own in groupby(self.samples, lambda sample: (sample.variant, sample.observer))}
 
@@ -355,11 +355,11 @@ class Leaderboard:
         return self.samples[0].scene.vehicles
 
     @property
-    def windows(self) -> tuple[Window, ...]:
+    def windows(self) -> tuple[TimeWindow, ...]:
         """The stretches of the run that are judged one by one, the steady state last."""
         return self.samples[0].scene.windows
 
-    def windows_in(self, variant: str, observer: str, window: Window) -> list[WindowRow]:
+    def windows_in(self, variant: str, observer: str, window: TimeWindow) -> list[WindowRow]:
         """Return the rows of one observer in one variant and window, a vehicle each."""
         wanted = (variant, observer, window.name)
         return [row for row in self.window_rows if (row.variant, row.observer, row.window) == wanted]
@@ -370,7 +370,7 @@ class Leaderboard:
         found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
         return {column: values for column, values in found.items() if np.isfinite(values).all()}
 
-    def samples_in(self, variant: str) -> dict[str, list[Sample]]:
+    def samples_in(self, variant: str) -> dict[str, list[JudgedRun]]:
         """Return the samples of one variant of every observer that did not fail, the best first."""
         own = {name: self.groups[variant, name] for name in self.ranked}
         return {name: samples for name, samples in own.items() if not any(sample.failure for sample in samples)}

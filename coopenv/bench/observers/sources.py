@@ -41,7 +41,7 @@ def _is_planar(recording: Recording) -> bool:
 
 
 @dataclass(frozen=True)
-class Source(ABC):
+class RecordSource(ABC):
     """Records of one environment in several variants; by default with faults, and of vehicles in space.
 
     Whatever looks at recorded data raises a `CoopenvError` where they are not there or not well-formed.
@@ -110,7 +110,7 @@ class Source(ABC):
 
 
 @dataclass(frozen=True)
-class Simulated(Source):
+class SimulatedRecords(RecordSource):
     """A scenario, once per seed, as it is and with faults."""
 
     scenario: Scenario
@@ -136,7 +136,7 @@ class Simulated(Source):
 
 
 @dataclass(frozen=True)
-class Robots(Source):
+class Robots(RecordSource):
     """A sub-dataset of MR.CLAM."""
 
     data: Path | None
@@ -165,7 +165,7 @@ class Robots(Source):
 
 
 @dataclass(frozen=True)
-class LogFile(Source):
+class LogFile(RecordSource):
     """A record in a file, as it is and with faults."""
 
     path: Path
@@ -185,7 +185,7 @@ class LogFile(Source):
 
 
 @dataclass(frozen=True)
-class Bags(Source):
+class Bags(RecordSource):
     """A ROS bag, with faults; what its environment draws follows from the seed."""
 
     path: Path
@@ -216,7 +216,7 @@ def find_source(
     topics: str | Path | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
-) -> Source:
+) -> RecordSource:
     """Return the source of an environment's name, a scenario file, a sub-dataset's name, a log file or a ROS bag.
 
     Args:
@@ -242,7 +242,7 @@ def find_source(
             if not scenario.driven:
                 raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
             load_policy(policy, scenario, 0)
-        return Simulated(path.stem, scenario, policy or "zero", added=worlds)
+        return SimulatedRecords(path.stem, scenario, policy or "zero", added=worlds)
     robots = sort is SourceKind.DATASET
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
@@ -265,7 +265,7 @@ def find_source(
     return Robots(str(text), folder) if robots else LogFile(path.stem, path, added=added)
 
 
-def variants_of(source: Source, asked: str | Iterable[str] | None) -> tuple[str, ...]:
+def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tuple[str, ...]:
     """Return the variants to run: names (a text has commas between), `all` that there can be, or None for the usual.
 
     Raises:

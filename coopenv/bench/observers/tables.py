@@ -13,7 +13,7 @@ from rich.table import Table
 from coopenv.base.format import in_parentheses, jsonable, number, with_error
 from coopenv.bench.observers.convergence import Draw, basin_failures, basin_table
 from coopenv.bench.observers.faults import NOMINAL, VARIANTS
-from coopenv.bench.observers.judge import Window
+from coopenv.bench.observers.judge import TimeWindow
 from coopenv.bench.observers.rows import (
     BOUNDS,
     ERRORS,
@@ -147,7 +147,7 @@ def _add_observers(
     board: Leaderboard,
     variant: str,
     cells: Callable[[list[Any]], list[str]],
-    windows: Sequence[Window | None] = (None,),
+    windows: Sequence[TimeWindow | None] = (None,),
 ) -> Table:
     """Add a line per observer, the best first, and window (None: the rows of the leaderboard), and return the table."""
     for name in board.ranked:

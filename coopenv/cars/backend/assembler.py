@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding, NeighbourInbox
-from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
+from coopenv.cars.backend.tracks import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import VELOCITY, Role
@@ -34,7 +34,7 @@ class _Car:
     """The samples of one car."""
 
     def __init__(self, refused: Counter[str]) -> None:
-        self.odometer, self.frames, self.track = Odometer(), Frames(refused), PoseTrack()
+        self.odometer, self.frames, self.track = Odometer(), FrameQueue(refused), PoseTrack()
         self.moment = 0
         self.lag = 0  # ns by which the last frame was behind its tick
         self.exposed = 0  # when the last frame was; the begin of the episode before there is one

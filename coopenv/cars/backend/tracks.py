@@ -128,7 +128,7 @@ MOST_WAITING = 2
 then two come within a tick. More mean that the computer lags behind, and the oldest are left out."""
 
 
-class Frames:
+class FrameQueue:
     """The queue of one car; times in ns on one clock."""
 
     def __init__(self, refused: Counter[str]) -> None:

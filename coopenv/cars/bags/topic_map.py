@@ -108,7 +108,7 @@ class MapFrame(Section):
     """Rotation of the frame to the left, rad."""
 
 
-class Frames(Section):
+class PositionFrames(Section):
     """Frames of the bag's positions."""
 
     map: MapFrame = MapFrame()
@@ -142,7 +142,7 @@ class TopicMap(Section):
     duration: Positive | None = None
     """Time used after that, s (default: all)."""
     clocks: ClockSettings = ClockSettings()
-    frames: Frames = Frames()
+    frames: PositionFrames = PositionFrames()
     path: Path = Field(default=Path("topics.toml"), exclude=True)
     """The file; set by `load_map`."""
 

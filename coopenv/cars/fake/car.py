@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, warm_up
-from coopenv.cars.fake.faults import Faults, Wire, end_process, fake_fault, fault_topic
+from coopenv.cars.fake.faults import CarFaults, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
@@ -84,7 +84,7 @@ class Fake:
             gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
             clock: wall and steady; the wall clock is that of motion capture.
         """
-        self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, Faults()
+        self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
         self.world = CarWorld(
             scenario, len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]

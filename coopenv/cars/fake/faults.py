@@ -46,7 +46,7 @@ def end_process() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Faults:
+class CarFaults:
     """The faults of a car; times in ns on one clock."""
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Faults:
 class Wire:
     """A transport on which messages get lost, come late, or stop, both ways; its owner calls `flush`."""
 
-    def __init__(self, transport: Transport, faults: Faults, steady: Callable[[], int], seed: int) -> None:
+    def __init__(self, transport: Transport, faults: CarFaults, steady: Callable[[], int], seed: int) -> None:
         """Lay it.
 
         Args:

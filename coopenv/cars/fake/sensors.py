@@ -10,7 +10,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.fake.faults import Faults
+from coopenv.cars.fake.faults import CarFaults
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import Calibration
@@ -148,7 +148,7 @@ class Pixy:
     """The camera of one car."""
 
     def __init__(
-        self, world: CarWorld, binding: Binding, others: Neighbours, faults: Faults, publisher: SensorPublisher
+        self, world: CarWorld, binding: Binding, others: Neighbours, faults: CarFaults, publisher: SensorPublisher
     ) -> None:
         """Put it on the car.
 

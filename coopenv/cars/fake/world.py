@@ -11,7 +11,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode
-from coopenv.cars.profile import NEUTRAL, Drive, Role
+from coopenv.cars.profile import NEUTRAL, MotionCommand, Role
 from coopenv.cars.readings import CarPose, read
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.estimation.outcomes import Sight
@@ -172,7 +172,7 @@ class Actuators:
     def __init__(self, latency: float, timeout: float) -> None:
         """Build them for a dead time, and a time without a command after which they go to neutral; both in s."""
         self._latency, self._timeout = round(latency * 1e9), round(timeout * 1e9)
-        self._waiting: deque[tuple[int, Drive]] = deque()  # from when on; the last one is the time-out
+        self._waiting: deque[tuple[int, MotionCommand]] = deque()  # from when on; the last one is the time-out
         self._now = NEUTRAL
 
     def clear(self) -> None:
@@ -180,14 +180,14 @@ class Actuators:
         self._waiting.clear()
         self._now = NEUTRAL
 
-    def receive(self, drive: Drive, at: int) -> None:
+    def receive(self, drive: MotionCommand, at: int) -> None:
         """Take a command that has come."""
         begin = at + self._latency
         if self._waiting and self._waiting[-1][0] > begin:
             self._waiting.pop()  # the command before it does not time out
         self._waiting.extend([(begin, drive), (begin + self._timeout, NEUTRAL)])
 
-    def pieces(self, begin: int, end: int) -> Iterator[tuple[float, Drive]]:
+    def pieces(self, begin: int, end: int) -> Iterator[tuple[float, MotionCommand]]:
         """Yield (how long in s, what is followed) from a time to a later one; each stretch is asked for once."""
         now = begin
         while now < end:

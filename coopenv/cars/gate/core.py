@@ -23,7 +23,7 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.keys import Verifier, is_identity
-from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Drive, Limits, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, CommandMessage, Limits, MotionCommand, Role
 
 ENCAPSULATION = b"\0\1\0\0"
 LONGEST_PADDING = 3  # bytes after the last field, which some writers add
@@ -104,14 +104,14 @@ ARM = (STAMP, TEXT, TEXT, TEXT, "?")
 BOOL = ("?",)
 
 
-def write_drive(stamp: int, message: CommandMessage, drive: Drive) -> bytes:
+def write_drive(stamp: int, message: CommandMessage, drive: MotionCommand) -> bytes:
     """Return the message from the gate to the car for a finite command, with a stamp in ns."""
     kinds, values = [kind for kind, _ in message.neutral.values()], message.values(drive).values()
     numbers = [v if kind.startswith("float") else int(v) for kind, v in zip(kinds, values, strict=True)]
     return write((STAMP, TEXT, *(KINDS[kind] for kind in kinds)), stamp, "", *numbers)
 
 
-def read_drive(payload: bytes, message: CommandMessage) -> Drive:
+def read_drive(payload: bytes, message: CommandMessage) -> MotionCommand:
     """Return the command in a message from a gate to its car. Raises Malformed: the bytes are none."""
     kinds = [KINDS[kind] for kind, _ in message.neutral.values()]
     _, _, *values = read(payload, (STAMP, TEXT, *kinds))
@@ -201,7 +201,7 @@ class Gate:
         self.nonce = secrets.token_hex(8)
         """What the next arming has to name."""
         self._session, self._sequence, self._accepted = "", -1, 0
-        self._wanted: Drive | None = None  # by the last valid command, while it counts
+        self._wanted: MotionCommand | None = None  # by the last valid command, while it counts
         self.commanded = self._ticked = clock.steady()
         """When the last valid command came, steady clock, ns."""
         self._output = NEUTRAL
@@ -238,7 +238,7 @@ class Gate:
             speed, steering = self._limits.approach(
                 (before.speed, before.steering), (wanted.speed, wanted.steering), dt
             )
-            self._output = Drive(steering, speed)
+            self._output = MotionCommand(steering, speed)
         self._ticked = now
         return write_drive(self._clock.wall(), self.profile.command, self._output)
 
@@ -273,7 +273,7 @@ class Gate:
         if not self._limits.permit(speed, steering):
             raise Rejected(Reason.LIMITS)
         self._sequence, self._accepted = int(digits), self._accepted + 1
-        self._wanted, self.commanded = Drive(steering, speed), self._clock.steady()
+        self._wanted, self.commanded = MotionCommand(steering, speed), self._clock.steady()
         self._state = GateMode.ARMED
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:

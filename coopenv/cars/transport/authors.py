@@ -15,7 +15,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import cdr_of, decode, encode, make, ros1, ros1_of
 from coopenv.cars.deployment import Car, DeploymentError
 from coopenv.cars.gate.core import read_drive
-from coopenv.cars.profile import AUTHORS, SVEA, CarProfile, CommandMessage, Drive, Role
+from coopenv.cars.profile import AUTHORS, SVEA, CarProfile, CommandMessage, MotionCommand, Role
 from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
 
 PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
@@ -23,7 +23,7 @@ DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wh
 LOW_GEAR = 0b111000  # bits 0-2: high gear, front and rear differential locked; 3-5: which of them to change
 
 
-def low_level(drive: Drive, command: CommandMessage) -> Any:
+def low_level(drive: MotionCommand, command: CommandMessage) -> Any:
     """Return the lli_ctrl (Teensy) of a finite command, with the dead band of the speed controller leapt over.
 
     Steering to the left is positive. Speeds are cut to whole per cent, as the car's own interface does.
@@ -49,7 +49,7 @@ LOSSY = {Role.ESTIMATE: SVEA.topics[Role.POINT].type, Role.MANUAL: "svea_msgs/ms
 
 
 @dataclass(frozen=True)
-class Route:
+class TopicRoute:
     """A topic of one car and the authors' topic with its content."""
 
     role: Role
@@ -74,14 +74,14 @@ class Route:
         return ros1_of(payload, self.theirs)
 
 
-def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[Route, ...]:
+def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[TopicRoute, ...]:
     """Return those of a car. Raises DeploymentError: it has no number."""
     agent = car.agent_number
     if agent is None:
         raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
     names = {"agent": f"agent{agent}", "body": car.name}
     return tuple(
-        Route(
+        TopicRoute(
             *(role, profile.topic_of(car.name, role), profile.topics[role].type),
             *(name.format(**names), LOSSY.get(role, SVEA.topics[role].type), profile.command),
         )
@@ -96,7 +96,7 @@ class Authors:
     they were, and otherwise with the message under our own name.
     """
 
-    def __init__(self, wire: Transport, routes: Iterable[Route]) -> None:
+    def __init__(self, wire: Transport, routes: Iterable[TopicRoute]) -> None:
         """Take a network with the authors' messages, which is closed with this, and what is translated."""
         self._wire = wire
         self.announce, self.watch, self.close = wire.announce, wire.watch, wire.close
@@ -135,7 +135,7 @@ class Authors:
         self._wire.subscribe(pattern, pass_on)
 
 
-def _translate(route: Route, callback: Callback, arrival: Arrival) -> None:
+def _translate(route: TopicRoute, callback: Callback, arrival: Arrival) -> None:
     """Pass on what came under an authors' name; bytes of another type go no further."""
     try:
         payload = cdr_of(arrival.payload, route.theirs)

@@ -200,7 +200,7 @@ def show_kernel(model: Any, truth: Any, state: Any, t: wp.float64):
 
 
 @dataclass(frozen=True)
-class Rollout:
+class DifferentiableRollout:
     """Result of `DifferentiableWorld.rollout`."""
 
     uncertainty: float  # sum over worlds and vehicles of trace P at the end (rad^2 + m^2)
@@ -225,7 +225,7 @@ class DifferentiableWorld:
         self._latency = round(scenario.limits[0].latency * scenario.rates.camera)  # ticks
         self._order = processing_order(scenario, neighbour_sets(scenario))
 
-    def rollout(self, actions: np.ndarray, seed: int = 0) -> Rollout:
+    def rollout(self, actions: np.ndarray, seed: int = 0) -> DifferentiableRollout:
         """Drive by actions (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
 
         Raises:
@@ -263,7 +263,7 @@ class DifferentiableWorld:
                 stacklevel=2,
             )
         believed = belief.numpy()
-        return Rollout(
+        return DifferentiableRollout(
             float(total.numpy()[0]),
             np.stack([action.grad.numpy() for action in decisions]),
             believed["covariance"],

@@ -107,7 +107,7 @@ def _quad(corners: np.ndarray, z: float) -> Mesh:
     return points.astype(np.float32), np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 
 
-class Placed(NamedTuple):
+class Copies(NamedTuple):
     """Where copies are; those that are not there have size zero."""
 
     wxyzs: np.ndarray  # (N, 4)
@@ -115,7 +115,7 @@ class Placed(NamedTuple):
     scales: np.ndarray  # (N, 3) m
 
 
-def placed(rotation: np.ndarray | None, position: np.ndarray, scale: np.ndarray, turn: float = 2.0**-11) -> Placed:
+def placed(rotation: np.ndarray | None, position: np.ndarray, scale: np.ndarray, turn: float = 2.0**-11) -> Copies:
     """Return copies at positions (N, 3) with rotations (N, 3, 3; None: upright) and sizes (N, 3), NaN: not there.
 
     Quaternions are given in steps of `turn`.
@@ -124,7 +124,7 @@ def placed(rotation: np.ndarray | None, position: np.ndarray, scale: np.ndarray,
     there = np.isfinite(np.concatenate([position, scale, R.reshape(-1, 9)], axis=1)).all(axis=1)[:, None]
     whole = Rotation.from_matrix(np.where(there[..., None], R, np.eye(3)))
     turned = fine(whole.as_quat(canonical=True, scalar_first=True), turn)
-    return Placed(turned, *(np.where(there, part, 0.0).astype(np.float32) for part in (position, scale)))
+    return Copies(turned, *(np.where(there, part, 0.0).astype(np.float32) for part in (position, scale)))
 
 
 def fine(values: np.ndarray, step: float) -> np.ndarray:
@@ -152,7 +152,7 @@ class Batch:
                 **{**_FLAT, **look},
             )
 
-    def put(self, places: Placed, shown: bool = True) -> None:
+    def put(self, places: Copies, shown: bool = True) -> None:
         """Put the copies to their places."""
         if self.handle is not None:
             wxyzs, positions, scales = places

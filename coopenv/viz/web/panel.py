@@ -12,7 +12,7 @@ from coopenv.base.errors import shown
 from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
-from coopenv.viz.scene import Frame, Source, semi_axes
+from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
@@ -33,7 +33,7 @@ _LOOK: dict[str, Any] = {
 class Plots:
     """Charts in viser's panel."""
 
-    def __init__(self, gui: Any, source: Source) -> None:
+    def __init__(self, gui: Any, source: Origin) -> None:
         """Add them, empty."""
         named = list(zip(source.terms, VEHICLE_COLOURS[:_MOST_TERMS], strict=False))
         self._terms = len(named)
@@ -127,7 +127,7 @@ _SWITCHES = {
 class Panel:
     """viser's panel; what the user does comes out of `wishes` as (name, value), in the thread that asks."""
 
-    def __init__(self, gui: Any, stage: Stage, source: Source, look: Look, abilities: Abilities, length: float) -> None:
+    def __init__(self, gui: Any, stage: Stage, source: Origin, look: Look, abilities: Abilities, length: float) -> None:
         """Add everything; `length` is that of the episode, s."""
         self.wishes: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._gui, self._stage, self._source, self._look = gui, stage, source, look
@@ -206,7 +206,7 @@ class Panel:
             meant = [meaning for value, meaning in offered.items() if value == given]
         self.wishes.put((name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered"))
 
-    def set_source(self, source: Source) -> None:
+    def set_source(self, source: Origin) -> None:
         """Set the heading and the legend."""
         self._source = source
         title = self._stage.scenario.title
@@ -268,7 +268,7 @@ _DRAWINGS = {
 }
 
 
-def legend_html(stage: Stage, source: Source, magnification: float) -> str:
+def legend_html(stage: Stage, source: Origin, magnification: float) -> str:
     """Return the legend of the marks that can occur as HTML."""
     s = stage.scenario
     sensed = s.topology.mode == "sensed"
@@ -306,7 +306,7 @@ def swatch(colour: str) -> str:
     return f'<span style="display:inline-block;{look}"></span>'
 
 
-def table_html(stage: Stage, source: Source, frame: Frame) -> str:
+def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
     """Return the table of errors as HTML."""
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
     heads = ("error [m]", "[deg]", sigma, "sees")

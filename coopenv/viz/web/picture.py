@@ -7,7 +7,7 @@ import numpy as np
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
-from coopenv.viz.scene import Frame, Source, semi_axes
+from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Box, Stage, entries
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
@@ -38,7 +38,7 @@ _FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn th
 class Actors:
     """Everything that moves but lines."""
 
-    def __init__(self, scene: Any, stage: Stage, source: Source, floor: Ground, colours: np.ndarray) -> None:
+    def __init__(self, scene: Any, stage: Stage, source: Origin, floor: Ground, colours: np.ndarray) -> None:
         """Add the nodes."""
         self._scene, self._stage, self._floor = scene, stage, floor
         self._size, self._center = stage.bodies
@@ -57,7 +57,7 @@ class Actors:
         self._marks = np.zeros((0, 3))
         self._traffic: Batch | None = None
 
-    def set_source(self, source: Source) -> None:
+    def set_source(self, source: Origin) -> None:
         """Set the source: ellipsoids of a gain matrix are paler than those of a covariance."""
         self._ellipsoids.handle.opacity = _HONEST if source.honest else _GAIN
 
@@ -192,7 +192,7 @@ FLIGHT, PAUSE = 0.5, 1.0
 _SIZE = 0.006  # of the scene's side
 
 
-class Pulses:
+class MessageBeads:
     """Beads on the links between vehicles."""
 
     def __init__(self, scene: Any, stage: Stage, floor: Ground, colours: np.ndarray) -> None:
@@ -310,7 +310,7 @@ _VIEW_RAYS = 4  # every so many of a field of view are drawn
 class Picture:
     """Draws frames of one stage into viser's scene."""
 
-    def __init__(self, scene: Any, stage: Stage, source: Source, look: Look) -> None:
+    def __init__(self, scene: Any, stage: Stage, source: Origin, look: Look) -> None:
         """Draw the static part, and add the moving parts."""
         self.stage, self.look = stage, look
         self._scene = scene
@@ -318,7 +318,7 @@ class Picture:
         self.ground = Ground(scene, stage)
         self.actors = Actors(scene, stage, source, self.ground, self._colours)
         self._labels = Labels(scene, stage)
-        self._pulses = Pulses(scene, stage, self.ground, self._colours)
+        self._pulses = MessageBeads(scene, stage, self.ground, self._colours)
         self._trails = Trails()
         self._lines = {
             name: Segments(scene, f"{ROOT}/{name}", thickness, self.ground.step)
@@ -381,7 +381,7 @@ def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndar
     return stage.middle + distance * direction / np.linalg.norm(direction), stage.middle
 
 
-def first_look(three_sigma: np.ndarray, stage: Stage, source: Source) -> Look:
+def first_look(three_sigma: np.ndarray, stage: Stage, source: Origin) -> Look:
     """Return the look with a magnification of 1, 10 or 100 at which ellipsoids of semi-axes (N,), m, can be seen.
 
     Those of a gain matrix are not magnified.

@@ -14,7 +14,7 @@ import pytest
 import warp as wp
 
 import coopenv
-from coopenv.api.terms.records import Ego, Target, Truth
+from coopenv.api.terms.records import Ego, Target, TruthRecord
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.base.installation import scenario_path
 from coopenv.cli import main
@@ -55,7 +55,7 @@ def second_decision(ego: Any) -> Any:
 
 
 @wp.func
-def far_off(ego: Ego, truth: Truth):
+def far_off(ego: Ego, truth: TruthRecord):
     return truth.position_error > 1.0e6
 
 

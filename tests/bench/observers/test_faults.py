@@ -25,7 +25,7 @@ from coopenv.bench.observers.faults import (
     usual_sender,
     variant_of,
 )
-from coopenv.bench.observers.sources import Simulated, find_source, variants_of
+from coopenv.bench.observers.sources import SimulatedRecords, find_source, variants_of
 from coopenv.cli import main
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import Message, Recording, run
@@ -39,9 +39,9 @@ from tests.helpers.commands import refused
 ENV = "busy_intersection_tracking"
 
 
-def source(*faults: str, env: str = ENV, **overrides: Any) -> Simulated:
+def source(*faults: str, env: str = ENV, **overrides: Any) -> SimulatedRecords:
     made = find_source(env, {"horizon": 0.5, **overrides}, faults=faults)
-    assert isinstance(made, Simulated)
+    assert isinstance(made, SimulatedRecords)
     return made
 
 

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, judge
-from coopenv.bench.observers.judge import Window, windows_of
+from coopenv.bench.observers.judge import TimeWindow, windows_of
 from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edges, mean_root, ratio, spread
 from coopenv.cli import main
 from coopenv.observers import run
@@ -59,9 +59,13 @@ def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None
 
 
 def test_windows_end_with_the_run() -> None:
-    assert windows_of(EDGES, 20.0, 15.0) == (Window(5.0, 10.0), Window(10.0, 15.0), Window(20.0, 15.0, steady=True))
-    assert windows_of((), 0.0, 5.0) == (Window(0.0, 5.0, steady=True),)
-    assert not Window(1.0, 2.0).ticks(np.array([1.0])).any() and Window(1.0, 2.0).ticks(np.array([2.0])).all()
+    assert windows_of(EDGES, 20.0, 15.0) == (
+        TimeWindow(5.0, 10.0),
+        TimeWindow(10.0, 15.0),
+        TimeWindow(20.0, 15.0, steady=True),
+    )
+    assert windows_of((), 0.0, 5.0) == (TimeWindow(0.0, 5.0, steady=True),)
+    assert not TimeWindow(1.0, 2.0).ticks(np.array([1.0])).any() and TimeWindow(1.0, 2.0).ticks(np.array([2.0])).all()
 
 
 @pytest.mark.parametrize("given", ["5", "5,4", "a,b", "-1,3", "1,inf", "1,1", ",".join(map(str, range(30)))])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from coopenv.base.fault_text import FaultError
 from coopenv.cars.codec import encode, make, stamp_of
 from coopenv.cars.fake import car
-from coopenv.cars.fake.faults import FAKE_FAULTS, Faults, fake_fault, fault_topic
+from coopenv.cars.fake.faults import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
@@ -49,7 +49,7 @@ def test_what_is_no_fault_is_one_line(text: str, said: str) -> None:
 
 
 def test_a_fault_begins_and_ends() -> None:
-    faults = Faults()
+    faults = CarFaults()
     faults.add(fake_fault("delay=0.2@1+2"), 10**9)
     faults.add(fake_fault("delay=0.5@2+0.5"), 10**9)
     times = [1.9, 2.0, 2.9, 3.1, 3.6, 3.9, 4.1]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, ros2
 from coopenv.cars.gate.core import read_drive, write_drive
-from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Limits, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role
 from coopenv.cars.transport.authors import low_level
 
 STEERING = st.floats(-math.radians(36.0), math.radians(36.0))
@@ -29,10 +29,10 @@ COMMAND = SVEA.command
     ],
 )
 def test_manual_control_has_the_values_of_the_cars_interface(steering: float, speed: float, y: float, z: float) -> None:
-    fields = COMMAND.values(Drive(steering, speed))
+    fields = COMMAND.values(MotionCommand(steering, speed))
     assert (fields["y"], fields["z"]) == pytest.approx((y, z), abs=0.005)
     back = COMMAND.drive({"y": y, "z": z})
-    cut = Drive(min(max(steering, -0.2 * math.pi), 0.2 * math.pi), min(max(speed, -1.53), 1.53))
+    cut = MotionCommand(min(max(steering, -0.2 * math.pi), 0.2 * math.pi), min(max(speed, -1.53), 1.53))
     assert (back.steering, back.speed) == pytest.approx((cut.steering, cut.speed), abs=2e-5)
 
 
@@ -47,7 +47,7 @@ def test_manual_control_names_its_extensions() -> None:
 
 @given(STEERING, SPEED)
 def test_manual_control_comes_back(steering: float, speed: float) -> None:
-    payload = write_drive(0, COMMAND, Drive(steering, speed))
+    payload = write_drive(0, COMMAND, MotionCommand(steering, speed))
     fields = decode(payload, SVEA.topics[Role.MANUAL].type)
     assert abs(fields.y) <= 900.001 and 49.999 <= fields.z <= 950.001
     back = read_drive(payload, COMMAND)
@@ -56,19 +56,19 @@ def test_manual_control_comes_back(steering: float, speed: float) -> None:
 
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
 def test_no_command_goes_beyond_ninety_per_cent(steering: float, speed: float) -> None:
-    fields, low = COMMAND.values(Drive(steering, speed)), low_level(Drive(steering, speed), COMMAND)
+    fields, low = COMMAND.values(MotionCommand(steering, speed)), low_level(MotionCommand(steering, speed), COMMAND)
     assert abs(fields["y"]) <= 900.0 and 50.0 <= fields["z"] <= 950.0
     assert abs(low.steering) <= 114 and abs(low.velocity) <= 116
 
 
 def test_low_level_has_the_values_of_the_cars_interface() -> None:
-    fields = low_level(Drive(0.2, 0.8), COMMAND)
+    fields = low_level(MotionCommand(0.2, 0.8), COMMAND)
     assert (fields.steering, fields.velocity) == (36, 70)
     still = low_level(NEUTRAL, COMMAND)
     assert (still.steering, still.velocity, still.trans_diff, still.ctrl) == (0, 0, 0b111000, 0)
-    least = low_level(Drive(speed=0.018), COMMAND).velocity  # 1 %
-    assert least == round(1.27 * 15.85) == -low_level(Drive(speed=-0.018), COMMAND).velocity
-    assert low_level(Drive(speed=0.0169), COMMAND).velocity == 0
+    least = low_level(MotionCommand(speed=0.018), COMMAND).velocity  # 1 %
+    assert least == round(1.27 * 15.85) == -low_level(MotionCommand(speed=-0.018), COMMAND).velocity
+    assert low_level(MotionCommand(speed=0.0169), COMMAND).velocity == 0
 
 
 @given(st.tuples(SPEED, STEERING), st.tuples(SPEED, STEERING), st.floats(0.0, 1.0))

@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, Reason, read_drive
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import SVEA, Drive, Limits, Role
+from coopenv.cars.profile import SVEA, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages
 
 CAR = "svea7"
@@ -63,16 +63,16 @@ class Bench:
     def status(self) -> Any:
         return decode(self.gate.status(), SVEA.topics[Role.GATE].type)
 
-    def tick(self) -> Drive:
+    def tick(self) -> MotionCommand:
         """Return what the car is told after one more period."""
         self.wait(PERIOD)
         payload = self.gate.tick()
         assert stamp_of(decode(payload, SVEA.topics[Role.MANUAL].type)) == self.wall
         return read_drive(payload, SVEA.command)
 
-    def drive(self, ticks: int, **fields: Any) -> Drive:
+    def drive(self, ticks: int, **fields: Any) -> MotionCommand:
         """Return what the car is told after some commands, one per tick."""
-        told = Drive()
+        told = MotionCommand()
         for _ in range(ticks):
             assert self.command(**fields) is None
             told = self.tick()

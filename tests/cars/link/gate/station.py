@@ -13,7 +13,7 @@ from typing import Any
 from coopenv.cars.codec import decode
 from coopenv.cars.gate.core import read_drive
 from coopenv.cars.keys import Signer
-from coopenv.cars.profile import SVEA, Drive, Role, presence_of
+from coopenv.cars.profile import SVEA, MotionCommand, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
@@ -43,7 +43,7 @@ class Station:
         self._transport, self._signer = transport, signer
         self._lock = threading.Lock()
         self.status: Any = None
-        self.statuses, self.outputs, self.stops = 0, deque[tuple[float, Drive]](maxlen=1000), 0
+        self.statuses, self.outputs, self.stops = 0, deque[tuple[float, MotionCommand]](maxlen=1000), 0
         self.present = False
         self.session, self.sequence = "", 0
         transport.subscribe(SVEA.topic_of(CAR, Role.GATE), self._hear)
@@ -66,7 +66,7 @@ class Station:
         if name == presence_of(CAR):
             self.present = there
 
-    def since(self, when: float) -> list[Drive]:
+    def since(self, when: float) -> list[MotionCommand]:
         """Return what the car has been told since an instant of the monotonic clock."""
         with self._lock:
             return [drive for at, drive in self.outputs if at >= when]

@@ -21,7 +21,7 @@ from coopenv.cars.gate.core import (
     write_drive,
     write_status,
 )
-from coopenv.cars.profile import SVEA, Drive, Role
+from coopenv.cars.profile import SVEA, MotionCommand, Role
 from tests.cars.link.gate.messages import arm, framed_command, stop
 
 TEXT = st.text(st.characters(codec="utf-8"), max_size=12)
@@ -59,7 +59,7 @@ def test_stops_are_those_of_rosbags(value: bool) -> None:
 def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], buttons: int, extensions: int) -> None:
     given = iter([*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:]])
     neutral = {name: (kind, next(given)) for name, (kind, _) in SVEA.command.neutral.items()}
-    message, drive = SVEA.command.model_copy(update={"neutral": neutral}), Drive(0.1, -0.2)
+    message, drive = SVEA.command.model_copy(update={"neutral": neutral}), MotionCommand(0.1, -0.2)
     fields = message.values(drive)
     payload = write_drive(stamp, message, drive)
     assert payload == encode(make(SVEA.topics[Role.MANUAL].type, header=header(stamp), **fields))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.cars.gate.core import MOST_AHEAD, TIMEOUT, GateMode, Reason
-from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Limits, Role
+from coopenv.cars.profile import NEUTRAL, SVEA, Limits, MotionCommand, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 
@@ -297,4 +297,4 @@ def test_a_gate_that_closes_is_neutral_for_good() -> None:
     bench.drive(10)
     bench.gate.neutral()
     assert bench.command() is Reason.NOT_ARMED
-    assert bench.tick() == Drive()
+    assert bench.tick() == MotionCommand()
