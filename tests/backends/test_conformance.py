@@ -23,7 +23,7 @@ from coopenv.cars.codec import decode
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
-from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, write_fleet
+from tests.helpers.cars import LAB, LAB_CARS, OVERTAKING, PATIENT, cars, fakes, write_fleet
 from tests.helpers.processes import COOPENV, start
 from tests.helpers.wire import free_port
 
@@ -33,21 +33,7 @@ Make = Callable[..., Env]
 GROUPS = ["estimate", "quality", "bearings", "odometry", "messages", "goal", "self"]
 OVERRIDES: dict[str, Any] = {"observation.include": GROUPS}
 AHEAD = np.array([0.2, 0.0], dtype=np.float32)
-TOPICS_OF_A_LAB = """
-environment = "svea_overtaking"
-markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
-
-[overrides]
-"observation.include" = INCLUDE
-
-[[cars]]
-name = "svea7"
-marker = 7
-
-[[cars]]
-name = "svea1"
-marker = 6
-"""
+TOPICS_OF_A_LAB = f'{LAB}\n[overrides]\n"observation.include" = INCLUDE\n{LAB_CARS}'
 
 
 def simulated(**options: Any) -> Env:

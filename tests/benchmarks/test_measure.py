@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 from rich.table import Table
@@ -18,7 +17,7 @@ import coopenv
 from benchmarks.speed.cases import Case
 from benchmarks.speed.coopenv_cases import own_cases
 from benchmarks.speed.figures import draw_growth, draw_speed
-from benchmarks.speed.growth import WORLDS, Growth, PowerLaw, Sweep, fit_power_law, growth_scenario, summarise, sweeps
+from benchmarks.speed.growth import Growth, PowerLaw, Sweep, fit_power_law, growth_scenario, summarise, sweeps
 from benchmarks.speed.measure import Result, measure, units_of_work
 from benchmarks.speed.peer_cases import peer_cases
 from benchmarks.speed.startup import Startup
@@ -107,14 +106,6 @@ def test_the_exponent_of_a_power_law_is_found(exponent: float) -> None:
     assert law.factor == pytest.approx(3e-4)
 
 
-def test_noise_moves_the_exponent_little() -> None:
-    sizes = [2**i for i in range(1, 9)]
-    noise = np.exp(np.random.default_rng(0).normal(0, 0.05, len(sizes)))
-    assert fit_power_law(sizes, [n**1.5 * e for n, e in zip(sizes, noise, strict=True)]).exponent == pytest.approx(
-        1.5, abs=0.05
-    )
-
-
 def costs(sweep: Sweep, *seconds: float | None) -> list[Result]:
     return [
         Result(case, problem="failed")
@@ -151,15 +142,6 @@ def test_scenarios_of_any_size_are_possible(vehicles: int, landmarks: int) -> No
     assert [len(targets) for targets in neighbour_sets(sensed)] == [landmarks + i for i in range(vehicles)]
 
 
-def test_sweeps_hold_everything_but_one_quantity() -> None:
-    by_quantity = {(s.quantity, s.sensed): s.cases() for s in sweeps()}
-    assert [c.vehicles for c in by_quantity["vehicles", True]] == [2, 4, 8, 16, 32, 64]
-    assert {c.worlds for c in by_quantity["vehicles", True]} == {WORLDS}
-    assert {c.vehicles for c in by_quantity["landmarks", True]} == {5}
-    assert [c.options["growth"]["landmarks"] for c in by_quantity["landmarks", True]] == [3, 6, 12, 24, 48, 64]
-    assert by_quantity["worlds", True][-1].worlds == 65536
-
-
 WIDTH = 80
 
 
@@ -180,25 +162,6 @@ def measured(case: Case, rate: float = 123456.0) -> Result:
 def results() -> list[Result]:
     cases = own_cases("busy_intersection", coopenv.load_scenario("busy_intersection"))
     return [measured(c, 9.994e6) for c in cases] + [measured(c, 0.01) for c in peer_cases()]
-
-
-def test_cases_cover_what_is_promised() -> None:
-    cases = own_cases("busy_intersection", coopenv.load_scenario("busy_intersection"))
-    batches = [c for c in cases if c.name == "make_vec"]
-    assert {c.worlds for c in batches} == {1, 32, 1024, 8192}
-    assert {c.dtype for c in batches if c.worlds == 1024 and c.threads == 1} == {"float32", "float64"}
-    assert all(c.options["overrides"] == {"topology.mode": "sensed"} for c in batches)
-    given = own_cases("busy_intersection", coopenv.load_scenario("busy_intersection"), {"topology.mode": "fixed"})
-    robust = [c for c in given if c.name == "make_vec, robust"]
-    assert {c.threads for c in robust} == {1, max(c.threads for c in batches)}
-    assert all(c.options["overrides"] == {"topology.mode": "fixed", "observer.name": "robust"} for c in robust)
-    assert all(c.options["overrides"] == {"topology.mode": "fixed"} for c in given if c not in robust)
-    assert [(c.name, c.worlds) for c in peer_cases()] == [
-        ("highway-env intersection", 1),
-        *(("VMAS navigation", n) for n in (1, 32, 1024)),
-        *(("VMAS road_traffic", n) for n in (1, 32, 1024)),
-        ("mpe2 simple_spread", 1),
-    ]
 
 
 def test_every_table_fits(results: list[Result]) -> None:

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.speed import peer_cases, run
 from benchmarks.speed.__main__ import command, main, parser
 from benchmarks.speed.report import BUSY
+from tests.helpers.commands import refused
 from tests.helpers.fake_library import FAKE, SHARE, fake_case
 
 KEYS = {
@@ -54,15 +55,10 @@ def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         ("--set noise.enabld=false", "did you mean 'enabled'"),
     ],
 )
-def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_end_with_one_line_and_status_2(line: str, message: str) -> None:
     Path("occupied").write_text("")
     Path("taken/speed.json").mkdir(parents=True)
-    assert main(line.split()) == 2
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1
-    assert message in captured.err
+    assert message in refused(*line.split(), command=main)
 
 
 @pytest.mark.parametrize("option", ["--repeats 0", "--seconds 0", "--seconds nan", "--seconds soon"])
@@ -70,12 +66,6 @@ def test_numbers_are_positive(option: str, capsys: pytest.CaptureFixture[str]) -
     with pytest.raises(SystemExit, match="2"):
         main(option.split())
     assert option.split()[0] in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_a_peer_that_is_not_installed_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peer_cases, "find_spec", lambda name: None)
-    assert not any(peer_cases.installed(peer) for peer in peer_cases.PEERS)
-    assert peer_cases.install_hint(peer_cases.MPE2) == "not installed: pip install mpe2"
 
 
 def test_the_command_is_written_as_it_can_be_typed() -> None:

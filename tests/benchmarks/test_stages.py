@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks.stages.__main__ import main
 from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_settings
 from benchmarks.stages.against import HERE
-from benchmarks.stages.rounds import alternate, ratio
+from benchmarks.stages.rounds import alternate
 
 
 def test_rounds_alternate() -> None:
@@ -23,12 +22,6 @@ def test_rounds_alternate() -> None:
 
     times = alternate([partial(step, "a"), partial(step, "b")], 3)
     assert told == ["a", "b"] * 3 and times.tolist() == [[1, 2], [3, 4], [5, 6]]
-
-
-def test_one_bad_round_moves_no_ratio() -> None:
-    below = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
-    above = np.array([2.0, 4.0, 90.0, 2.0, 2.0])
-    assert ratio(above, below) == (2.0, 2.0, 2.0)
 
 
 def test_each_stage_is_switched_off_on_top_of_those_before() -> None:

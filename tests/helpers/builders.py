@@ -92,6 +92,16 @@ def errors(world: World, state: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
     return position, continuous.angle_between_deg(state["estimate_rotation"], state["rotation"][:, first:])
 
 
+State = dict[str, np.ndarray]
+
+
+def assert_same(a: State, b: State, rows_a: object = slice(None), rows_b: object = slice(None)) -> None:
+    """Compare two saved states, or rows of them, bit for bit."""
+    assert a.keys() == b.keys()
+    for name in a:
+        assert same_bits(a[name][rows_a], b[name][rows_b]), name
+
+
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 

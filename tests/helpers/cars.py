@@ -23,11 +23,8 @@ missed_deadlines = 60
 max_clock_offset = 0.5
 """
 
-OVERTAKING = """
-environment = "svea_overtaking"
-fakes = true
-markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
-
+LAB = 'environment = "svea_overtaking"\nmarkers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }\n'
+LAB_CARS = """
 [[cars]]
 name = "svea7"
 marker = 7
@@ -36,6 +33,7 @@ marker = 7
 name = "svea1"
 marker = 6
 """
+OVERTAKING = f"{LAB}fakes = true\n{LAB_CARS}"
 
 
 def write_fleet(folder: Path, text: str = OVERTAKING, safety: str = PATIENT) -> Path:

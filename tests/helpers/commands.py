@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from typing import Any
@@ -11,10 +12,10 @@ from rich.console import Console
 from coopenv.cli import main
 
 
-def refused(*arguments: str) -> str:
+def refused(*arguments: str, command: Callable[[Sequence[str]], int] = main) -> str:
     """Run a command that refuses its input, and return the one line that it prints."""
     with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
-        assert main(arguments) == 2
+        assert command(arguments) == 2
     error = err.getvalue()
     assert out.getvalue() == "" and error.startswith("error: ") and error.count("\n") == 1, error
     return error

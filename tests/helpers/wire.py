@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from coopenv.cars.transport.base import Arrival, Transport
 from tests.helpers.processes import start
@@ -43,9 +44,9 @@ def seen_by(receiver: Transport) -> list[tuple[str, bool]]:
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Run an end until the block is left; it has said that it is ready."""
-    process = start((sys.executable, "-m", "tests.helpers.wire", *arguments), Path.cwd())
+def ready(command: tuple[str, ...], **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """Run a command that prints `ready` at first, until the block is left."""
+    process = start(command, Path.cwd(), **options)
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n", process.communicate(timeout=10)[1]
@@ -53,6 +54,13 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.kill()
         process.communicate()
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run an end until the block is left; it has said that it is ready."""
+    with ready((sys.executable, "-m", "tests.helpers.wire", *arguments)) as process:
+        yield process
 
 
 def listening(pid: int) -> list[str]:

@@ -8,10 +8,19 @@ import pytest
 from coopenv.base.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.helpers.builders import command, constant, reset, same_bits, scenario, simulate, start, vehicle
+from tests.helpers.builders import (
+    State,
+    assert_same,
+    command,
+    constant,
+    reset,
+    same_bits,
+    scenario,
+    simulate,
+    start,
+    vehicle,
+)
 from tests.helpers.warp_calls import DTYPES, WIDE
-
-State = dict[str, np.ndarray]
 
 
 def noisy() -> Scenario:
@@ -30,12 +39,6 @@ def noisy() -> Scenario:
         camera={"miss_probability": 0.2, "position": [0.2, 0.0, 0.1]},
         v2x={"delay": 2, "loss": 0.3},
     )
-
-
-def assert_same(a: State, b: State, rows_a: object = slice(None), rows_b: object = slice(None)) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        assert same_bits(a[name][rows_a], b[name][rows_b]), name
 
 
 def played(world: World, ticks: int = 300) -> State:

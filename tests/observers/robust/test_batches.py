@@ -7,10 +7,9 @@ import pytest
 
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.helpers.builders import constant, reset, same_bits, scenario, simulate, start, vehicle
+from tests.helpers.builders import State, assert_same, constant, reset, scenario, simulate, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 
-State = dict[str, np.ndarray]
 LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 SURE = {"position_radius": 0.1, "orientation_angle": 0.02}
 
@@ -38,12 +37,6 @@ def noisy(horizon: float = 5.0, observer: str = "robust", **errors: float) -> Sc
         v2x={"delay": 2, "loss": 0.3},
         observer={"name": observer},
     )
-
-
-def assert_same(a: State, b: State, rows_a: object = slice(None), rows_b: object = slice(None)) -> None:
-    assert a.keys() == b.keys() and any(name.startswith("observer_") for name in a)
-    for name in a:
-        assert same_bits(a[name][rows_a], b[name][rows_b]), name
 
 
 def played(world: World, ticks: int = 150) -> State:

@@ -26,8 +26,8 @@ from coopenv.cars.transport.base import Address, LinkError
 from coopenv.cars.transport.ros1 import ENVELOPE, open_ros1, opened, sealed
 from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.brokers import ros_master
-from tests.helpers.processes import start, wait_until
-from tests.helpers.wire import free_port, heard_by, listening
+from tests.helpers.processes import wait_until
+from tests.helpers.wire import free_port, heard_by, listening, ready
 
 TYPES = dict.fromkeys(("agent7/riccatiPoint", "agent8/riccatiPoint"), "geometry_msgs/msg/PointStamped")
 
@@ -50,14 +50,8 @@ sys.stdin.read()
 @contextmanager
 def authors(endpoint: str) -> Iterator[subprocess.Popen[str]]:
     uri = endpoint.replace("tcp/", "http://")
-    process = start((sys.executable, "-c", AUTHORS, uri), Path.cwd(), stdin=subprocess.PIPE)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n", process.communicate(timeout=10)[1]
+    with ready((sys.executable, "-c", AUTHORS, uri), stdin=subprocess.PIPE) as process:
         yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def point(x: float) -> bytes:
