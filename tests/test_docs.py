@@ -26,10 +26,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli import app
-from coopenv.observers import registry
-from coopenv.observers import run as run_observer
 from coopenv.policies import load_agent
-from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.training.settings import Clone, read_settings
 from tests.helpers import bags, mrclam_files
@@ -38,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
 RUN = {"README.md", "agents.md", "backends.md", "bags.md", "cars.md", "data.md", "draws.md", "highway.md"}
-RUN |= {"observers.md", "replay.md", "terms.md", "trainers.md", "view.md"}
+RUN |= {"replay.md", "terms.md", "trainers.md", "view.md"}
 """Pages whose programs are run below."""
 
 
@@ -78,17 +75,6 @@ def test_the_page_on_backends(capsys: pytest.CaptureFixture[str]) -> None:
     assert "missing=24" in capsys.readouterr().out
     estimates = [info["estimate"]["position"] for info in program["infos"].values()]
     assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
-
-
-def test_the_tutorials_observer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_registered", {})
-    assert run(DOCS / "observers.md")
-    recording = record(load_scenario("busy_intersection_tracking", {"horizon": 5.0}), 0)
-    result = run_observer(registry.find("mine"), recording)
-    assert not result.failure
-    # vehicles 1 to 3 see two landmarks and more, and turn towards them
-    assert (result.orientation_error[-1, :3] < result.orientation_error[0, :3]).all()
-    assert np.isfinite(result.position_error).all()
 
 
 def test_the_page_on_terms_lists_every_entry_of_a_step() -> None:

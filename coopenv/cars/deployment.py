@@ -58,7 +58,7 @@ def refuse_foreign(kind: str, endpoints: tuple[str, ...], field: str) -> None:
             raise ValueError(f"{field}: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
 
 
-class Network(Section):
+class NetworkSettings(Section):
     """How the cars are reached."""
 
     kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
@@ -278,7 +278,7 @@ class Deployment(Section):
     """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
     """Numbers of the markers of landmarks, by name."""
-    network: Network = Network()
+    network: NetworkSettings = NetworkSettings()
     gate: GateLink = Field(default=GateLink(), exclude=True)  # matters on the car alone, and to no record of a drive
     sensors: Sensors = Sensors()
     safety: Safety = Safety()

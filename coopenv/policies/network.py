@@ -45,7 +45,7 @@ def layout_hash(
     return sha256(json.dumps([*tables, dict(settings)]).encode()).hexdigest()[:16]
 
 
-class PolicyNetwork:
+class Network:
     """The mean action of a network that `coopenv train` exported; agrees with torch's to rounding.
 
     It finds the fields that it was trained with by their names, so that it drives in environments that show more.

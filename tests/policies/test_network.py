@@ -15,7 +15,7 @@ import coopenv
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import NetworkCard
-from coopenv.policies.network import PolicyNetwork, layout_hash, layout_tables
+from coopenv.policies.network import Network, layout_hash, layout_tables
 from tests.helpers.four_way import FOUR_WAY
 
 ENV = FOUR_WAY
@@ -47,7 +47,7 @@ def write(folder: Path, tensors: Tensors, overrides: dict[str, Any] | None = Non
 
 def test_is_a_multilayer_perceptron_of_normalised_observations(tmp_path: Path) -> None:
     scenario, tensors = coopenv.load_scenario(ENV), tensors_for(132)
-    policy = PolicyNetwork(scenario, folder=tmp_path, network=write(tmp_path, tensors))
+    policy = Network(scenario, folder=tmp_path, network=write(tmp_path, tensors))
     observations = np.random.default_rng(1).uniform(-1, 1, (7, 132)).astype(np.float32)
     t = {name: values.astype(np.float64) for name, values in tensors.items()}
     for observation, action in zip(observations, policy(observations), strict=True):
@@ -63,7 +63,7 @@ def test_drives_where_there_is_more_to_see(tmp_path: Path) -> None:
     few = {"observation.include": ["goal", "odometry"]}
     small, large = coopenv.load_scenario(ENV, few), coopenv.load_scenario(ENV)
     card = write(tmp_path, tensors_for(observation_layout(small).size), few)
-    narrow, wide = (PolicyNetwork(scenario, folder=tmp_path, network=card) for scenario in (small, large))
+    narrow, wide = (Network(scenario, folder=tmp_path, network=card) for scenario in (small, large))
     shown = coopenv.parallel_env(ENV).reset(seed=0)[0]
     hidden = coopenv.parallel_env(ENV, overrides=few).reset(seed=0)[0]
     assert np.array_equal(wide(np.stack(list(shown.values()))), narrow(np.stack(list(hidden.values()))))
@@ -103,16 +103,16 @@ def test_what_gives_entries_another_meaning_is_refused_with_both_values(
     """The size of the observation may be the same: without this an agent would drive by what it misreads."""
     scenario = coopenv.load_scenario(ENV, common)
     card = write(tmp_path, tensors_for(observation_layout(scenario).size), common)
-    PolicyNetwork(scenario, folder=tmp_path, network=card)
+    Network(scenario, folder=tmp_path, network=card)
     with pytest.raises(coopenv.CoopenvError, match=message):
-        PolicyNetwork(coopenv.load_scenario(ENV, {**common, **overrides}), folder=tmp_path, network=card)
+        Network(coopenv.load_scenario(ENV, {**common, **overrides}), folder=tmp_path, network=card)
 
 
 def test_settings_of_fields_that_it_does_not_read_may_differ(tmp_path: Path) -> None:
     few = {"observation.include": ["goal", "odometry"]}
     card = write(tmp_path, tensors_for(observation_layout(coopenv.load_scenario(ENV, few)).size), few)
     other = {"observation.include": ["goal", "odometry", "route"], "observation.route_step": 1.0}
-    PolicyNetwork(coopenv.load_scenario(ENV, other), folder=tmp_path, network=card)
+    Network(coopenv.load_scenario(ENV, other), folder=tmp_path, network=card)
 
 
 def without(tensors: Tensors, name: str) -> Tensors:
@@ -132,7 +132,7 @@ def without(tensors: Tensors, name: str) -> Tensors:
 def test_bad_weights_are_refused(tensors: Tensors, message: str, tmp_path: Path) -> None:
     card = write(tmp_path, tensors)
     with pytest.raises(coopenv.CoopenvError, match=message):
-        PolicyNetwork(coopenv.load_scenario(ENV), folder=tmp_path, network=card)
+        Network(coopenv.load_scenario(ENV), folder=tmp_path, network=card)
 
 
 def test_damaged_foreign_and_missing_files(tmp_path: Path) -> None:
@@ -142,16 +142,16 @@ def test_damaged_foreign_and_missing_files(tmp_path: Path) -> None:
     for damaged in (data[:1000], b"", b"\x00" * 64, data[:-4]):
         path.write_bytes(damaged)
         with pytest.raises(coopenv.CoopenvError, match=r"weights\.safetensors: damaged, or no weights"):
-            PolicyNetwork(scenario, folder=tmp_path, network=card)
+            Network(scenario, folder=tmp_path, network=card)
     path.write_bytes(data[:-4] + b"\x00\x00\x00\x01")
     with pytest.raises(coopenv.CoopenvError, match=r"not the weights that agent\.toml was written with"):
-        PolicyNetwork(scenario, folder=tmp_path, network=card)
+        Network(scenario, folder=tmp_path, network=card)
     path.unlink()
     with pytest.raises(coopenv.CoopenvError, match=r"weights\.safetensors: cannot be read: No such file"):
-        PolicyNetwork(scenario, folder=tmp_path, network=card)
+        Network(scenario, folder=tmp_path, network=card)
     write(tmp_path, tensors_for(132))
     with pytest.raises(coopenv.CoopenvError, match="layout is not the hash of its tables"):
-        PolicyNetwork(scenario, folder=tmp_path, network=card.model_copy(update={"layout": "0" * 16}))
+        Network(scenario, folder=tmp_path, network=card.model_copy(update={"layout": "0" * 16}))
 
 
 def test_an_incomplete_card_names_the_field(tmp_path: Path) -> None:

@@ -156,7 +156,7 @@ def test_without_true_poses_the_drive_is_kept_and_the_topics_are_told(
 
 
 def test_other_environments_have_no_demo() -> None:
-    with pytest.raises(CoopenvError, match=r"svea_overtaken: has no fleet.*did you mean 'svea_overtaking'"):
+    with pytest.raises(CoopenvError, match=r"no fleet of fakes for 'svea_overtaken' .*did you mean 'svea_overtaking'"):
         _ = Demo("svea_overtaken", Path("out")).fleet
     assert CliRunner().invoke(app, ["svea", "demo", "--environment", "facade"]).exit_code != 0
 

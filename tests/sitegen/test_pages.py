@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.installation import list_agents, list_envs
-from coopenv.cars.deployment import Car, Deployment, GateLink, Network, Remote, Safety, Security, Sensors, Tls
+from coopenv.cars.deployment import Car, Deployment, GateLink, NetworkSettings, Remote, Safety, Security, Sensors, Tls
 from coopenv.cars.profile import SVEA
 from coopenv.observers.registry import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
@@ -80,7 +80,7 @@ def test_the_page_on_deployment_files_has_every_key() -> None:
     page = reference.TABLES["deployment"]()
     rows = [line for line in page.splitlines() if line.startswith("| `")]
     found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:5]] for row in rows}
-    parts = {"": Deployment, "cars.": Car, "network.": Network, "network.tls.": Tls}
+    parts = {"": Deployment, "cars.": Car, "network.": NetworkSettings, "network.tls.": Tls}
     parts |= {"gate.": GateLink, "sensors.": Sensors, "safety.": Safety, "remote.": Remote, "security.": Security}
     sections = {part.partition(".")[0] for part in parts if part} - {"cars"}
     wanted = {f"{prefix}{name}" for prefix, part in parts.items() for name in part.model_fields} - sections - {"file"}

@@ -16,7 +16,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import Policy, load_agent
-from coopenv.policies.network import PolicyNetwork
+from coopenv.policies.network import Network
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
@@ -48,7 +48,7 @@ def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> No
     observations = np.random.default_rng(0).uniform(-1, 1, (100, 132)).astype(np.float32)
     expected = trained.model.predict(trained.env.normalise(observations), deterministic=True)[0]
     agent = load_agent(tmp_path, trained.scenario)
-    assert isinstance(agent, PolicyNetwork)
+    assert isinstance(agent, Network)
     assert agent(observations) == pytest.approx(expected, abs=1e-5)
     reference = pytest.importorskip("onnx.reference", reason="needs the extra 'onnx'")
     data = onnx_model(network_of(trained), trained.plan.settings.ppo.observation_clip)

@@ -208,7 +208,7 @@ def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:
     for options, message in (
         ({"kind": "error"}, "did you mean 'errors'"),
         ({"variant": "v2x_delay"}, "was not run; there are nominal, v2x_loss"),
-        ({"path": tmp_path / "figure.gif"}, "unknown format 'gif'"),
+        ({"path": tmp_path / "figure.gif"}, "unknown format of a figure 'gif'"),
         ({"width": 0.1}, "expected 2 to 50 inches"),
     ):
         with pytest.raises(CoopenvError, match=message):

@@ -7,7 +7,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.convergence import random_start
-from coopenv.bench.observers.faults import VARIANTS, changed, usual_sender
+from coopenv.bench.observers.faults import VARIANTS, usual_sender
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.kernel_observer import KernelObserver
@@ -76,7 +76,7 @@ def test_wrong_associations_mislead_in_the_first_frames_only():
     assert sum(misled(record) for record in wrong) <= 1
     right = small_errors(12.0)
     first = (right.t < 0.1)[:, None, None, None]
-    assert not misled(changed(right, bearings=np.where(first, right.bearings, wrong[0].bearings)))
+    assert not misled(replace(right, bearings=np.where(first, right.bearings, wrong[0].bearings)))
 
 
 def test_a_liar_is_found_out_and_tracked_all_the_same():
