@@ -154,9 +154,12 @@ def most_of_actions(scenario: Scenario) -> tuple[float, float]:
 
 def _like(value: Any, default: Any) -> bool:
     """Return whether a value is of the kind of highway-env's default; where that is None anything may be meant."""
-    kinds = (bool, int | float, str, list | tuple)
-    given, expected = (next((kind for kind in kinds if isinstance(x, kind)), type(x)) for x in (value, default))
-    return default is None or given == expected
+    return default is None or _kind(value) == _kind(default)
+
+
+def _kind(value: Any) -> Any:
+    """Return the kind of a setting; numbers are of one kind, and so are lists and tuples."""
+    return next((kind for kind in (bool, int | float, str, list | tuple) if isinstance(value, kind)), type(value))
 
 
 HEIGHT = 1.5  # m, of the traffic's boxes: highway-env is flat

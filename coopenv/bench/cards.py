@@ -218,7 +218,7 @@ def signed(text: str) -> str:
 
 
 CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}
-"""Metrics of which cards tell changes, and what they call them."""
+"""Metrics whose changes stand on cards, and their names there."""
 
 
 JSON_FILE, TEXT_FILE = CARD_FILES

@@ -215,7 +215,7 @@ BASE_ARM = "plain"
 
 
 def is_reported(agent: str, plans: Sequence[TrainingPlan], folder: Path) -> bool:
-    """Return whether an agent has a card that tells of just these finished runs."""
+    """Return whether an agent has a card of exactly these finished runs."""
     seeds = cards.read(folder / agent).get("study", {}).get("seeds", {})
     found = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
     return found == {plan.seed: _trained(folder / place_of(plan))["sha256"] for plan in plans}
@@ -301,7 +301,7 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
     Whatever ends it, going on is the same command: finished runs stay, others go on from their checkpoints.
 
     Args:
-        study: what cards tell of.
+        study: the trainings that cards compare.
         part: what is to be trained now.
         folder: for the agents.
         logs: for TensorBoard's files.

@@ -147,7 +147,7 @@ def play(
 
 
 def estimated_here(engine: Engine) -> tuple[int, ...]:
-    """Return which vehicles are estimated here, not elsewhere and heard by radio."""
+    """Return which vehicles are estimated here, not elsewhere and received by radio."""
     here = engine.backend.capabilities.estimated
     return tuple(range(engine.world.model.vehicles)) if here is None else here
 

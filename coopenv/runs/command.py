@@ -118,7 +118,7 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     for line in (*explained, *remarks(result["vehicles"])):
         out.print(line)
     if others := [name for i, name in enumerate(run.scenario.vehicle_names) if i not in run.vehicles]:
-        out.print(f"{listed(others)}: heard by radio, not estimated here", soft_wrap=True)
+        out.print(f"{listed(others)}: received by radio, not estimated here", soft_wrap=True)
     out.print(f"Outcome: {result['outcome']}. {done}.")
     if isinstance(run.engine.backend, Repeating) and run.engine.backend.stopped:
         out.print(f"Stopped: {run.engine.backend.stopped}", soft_wrap=True, markup=False)

@@ -267,7 +267,7 @@ def _draw_paths(
         (True, "first estimate", style.mark_look("^", GREY, GREY)),
         (True, "true end", style.mark_look("X", INK, GREY)),
         (True, "last estimate", style.mark_look("x", GREY, GREY)),
-        (elsewhere, "heard by radio", {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}),
+        (elsewhere, "received by radio", {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}),
         (False in motions, "landmark", style.mark_look("o", DARK_BLUE, DARK_BLUE)),
         (True in motions, "moving landmark", {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}),
         (drawing.outside, "starts outside", style.mark_look("^", INK, "white")),

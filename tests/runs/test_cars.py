@@ -58,7 +58,7 @@ def test_it_ends_with_the_vehicles_that_are_estimated_here(run: dict[str, Any]) 
 def test_no_table_is_about_a_vehicle_that_is_estimated_elsewhere(run: dict[str, Any]) -> None:
     assert [row["vehicle"] for row in run["result"]["vehicles"]] == ["vehicle_1"]
     about = [line for line in run["out"].splitlines() if "vehicle_2" in line]
-    assert about == ["vehicle_2: heard by radio, not estimated here"]
+    assert about == ["vehicle_2: received by radio, not estimated here"]
     assert (run["folder"] / "errors.png").stat().st_size > 10_000
 
 
@@ -66,7 +66,7 @@ def test_figures_name_a_vehicle_that_is_estimated_elsewhere(run: dict[str, Any])
     made = run["run"]
     figure = trajectory_figure_2d(made.trajectory().of_vehicles([0]), scenario=made.scenario)
     words = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert words.count("heard by radio") == 1 and "moving landmark" not in words and "$f_{2}$" not in words
+    assert words.count("received by radio") == 1 and "moving landmark" not in words and "$f_{2}$" not in words
     assert "$f_{2}$" in [text.get_text() for text in figure.axes[0].texts]
 
 
