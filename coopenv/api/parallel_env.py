@@ -94,6 +94,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
         self.state_space = spaces.Box(-LIMIT, LIMIT, shape=self.state().shape, dtype=np.float32)
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
+        self._targets = scenario.target_names  # made once, as every step needs both
+        self._notes = backend.notes if isinstance(backend, Broadcasting) else None
         lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
         self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
 
@@ -195,9 +197,9 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
         seen: list[list[str]] = [[] for _ in ended]
         for i, target in zip(*(each.tolist() for each in np.nonzero(step["visible"][0])), strict=True):
-            seen[i].append(self.scenario.target_names[target])
+            seen[i].append(self._targets[target])
         late, missing = engine.world.late.tolist(), engine.world.missing.tolist()
-        time, backend = float(step["time"][0, 0]), engine.backend
+        time = float(step["time"][0, 0])
         infos = {}
         for agent in agents:
             i = self._index[agent]
@@ -211,7 +213,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
                 "outcome": self._outcomes[ended[i]],
                 "late_ticks": late[i],
                 "missing_ticks": missing[i],
-                **({"car": backend.notes(i)} if isinstance(backend, Broadcasting) else {}),
+                **({"car": self._notes(i)} if self._notes else {}),
             }
         return infos
 
