@@ -138,10 +138,9 @@ def _pieces(route: Route) -> Pieces:
 
 def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:
     """Return the numbers of the routes that may follow one: as designed they start within the radius of its end."""
-    end = np.array(route.waypoints[-1])
-    near = [np.linalg.norm(np.array(other.waypoints[0]) - end) <= vehicle.goal_radius for other in routes]
-    allowed = vehicle.next_routes or tuple(other.name for other in routes)
-    return [i for i, other in enumerate(routes) if near[i] and other.name in allowed]
+    end, radius = route.waypoints[-1], vehicle.goal_radius
+    near = [i for i, other in enumerate(routes) if math.dist(other.waypoints[0], end) <= radius]
+    return [i for i in near if not vehicle.next_routes or routes[i].name in vehicle.next_routes]
 
 
 SPLINE_STEP = 0.02

@@ -211,15 +211,16 @@ class PerWorld:
 
     value: Any
 
-    def part(self, start: int, stop: int) -> Any:
-        """Return the argument for worlds start..stop-1, sharing memory."""
+    def part(self, share: tuple[int, int], worlds: int) -> Any:
+        """Return the argument for a range of the worlds, sharing memory."""
+        if share == (0, worlds):
+            return self.value
         if isinstance(self.value, wp.array):
-            return self.value[start:stop] if self.value.size > 0 else self.value  # Warp cannot slice what is empty
+            return self.value[slice(*share)] if self.value.size > 0 else self.value  # Warp cannot slice what is empty
         part = type(self.value)()
         for name in field_types(self.value):
             value = getattr(self.value, name)
-            cut = isinstance(value, wp.array) and value.size > 0
-            setattr(part, name, value[start:stop] if cut else value)
+            setattr(part, name, PerWorld(value).part(share, worlds) if isinstance(value, wp.array) else value)
         return part
 
 
@@ -232,7 +233,7 @@ class Launcher:
     """
 
     def __init__(self, worlds: int, device: str, precision_name: str, threads: int = 1) -> None:
-        self._device, self._precision = device, precision_name
+        self._worlds, self._device, self._precision = worlds, device, precision_name
         self._shares = _split(0, worlds, threads)
         self._recorded: dict[Hashable, list[list[Callable[[], Any]]]] = {}
         self._pool: ThreadPoolExecutor | None = None
@@ -267,7 +268,7 @@ class Launcher:
         command = launch(
             kernel(function, self._precision),
             dim=(share[1] - share[0], *inner),
-            inputs=[a.part(*share) if isinstance(a, PerWorld) else a for a in arguments],
+            inputs=[a.part(share, self._worlds) if isinstance(a, PerWorld) else a for a in arguments],
             device=self._device,
             record_cmd=True,
         )
