@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -16,6 +17,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Small matrices: more BLAS threads only get in each other's way. Read when NumPy is loaded, so not in a fixture.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Containers often forbid byte code: each of hundreds of processes then compiles all the Python that it imports.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
