@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import NullLocator
 
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replacing_file
@@ -278,7 +278,7 @@ def _columns_width(lengths: Sequence[float], columns: int) -> float:
 
 def show_decades(ax: Axes) -> None:
     """Label a logarithmic ordinate, on which everything has been drawn, at decades only, two at least in sight."""
-    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.yaxis.set_minor_locator(NullLocator())
     low, high = ax.dataLim.intervaly
     if 0 < low <= high < np.inf:
         ax.set_autoscaley_on(False)  # it would complain about a single value

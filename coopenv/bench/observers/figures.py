@@ -18,7 +18,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from coopenv.base.format import jsonable, number
 from coopenv.bench.observers.convergence import ANGLE_BINS, RADIUS, Draw, by_angle
@@ -236,7 +236,7 @@ def _plain(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 KINDS: dict[str, Callable[[Leaderboard, str, float | None], Figure | None]] = {
