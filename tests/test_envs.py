@@ -20,16 +20,21 @@ from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_acti
 ENVS = coopenv.list_envs()
 
 
-@pytest.fixture(params=ENVS)
+@pytest.fixture(scope="module", params=ENVS)
 def name(request: pytest.FixtureRequest) -> str:
     if coopenv.load_scenario(request.param).backend == "highway":
         pytest.importorskip("highway_env", reason="needs the extra highway")
     return str(request.param)
 
 
+@pytest.fixture(scope="module")
+def make(name: str) -> Make:
+    return partial(coopenv.parallel_env, coopenv.load_scenario(name, {"horizon": 6.0}))
+
+
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_suite(name: str, check: Callable[[Make], None]) -> None:
-    check(partial(coopenv.parallel_env, name, overrides={"horizon": 6.0}))
+def test_suite(make: Make, check: Callable[[Make], None]) -> None:
+    check(make)
 
 
 def test_registries(name: str) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple, Self
 
@@ -18,6 +19,24 @@ SPACING = 0.25  # m between the points of a route that is not straight ...
 MOST_POINTS = 64  # ... and how many there are at most
 
 STRAIGHT = 1e-6  # rad; a smaller turn at a waypoint is no corner
+
+
+class Shape(NamedTuple):
+    """What is between the L + 1 waypoints of a route, and at them."""
+
+    length: np.ndarray  # (L,) m
+    heading: np.ndarray  # (L,) rad
+    turn: np.ndarray  # (L + 1,) rad, positive to the left; 0 at both ends
+    cut: np.ndarray  # (L + 1,) m before and behind a waypoint, where its arc begins and ends
+
+
+class Pieces(NamedTuple):
+    """Straight lines and arcs, one after the other."""
+
+    position: np.ndarray  # (n, 2) m, where they begin
+    heading: np.ndarray  # (n,) rad, there
+    curvature: np.ndarray  # (n,) 1/m, positive to the left
+    length: np.ndarray  # (n,) m
 
 
 class Route(Section):
@@ -40,6 +59,26 @@ class Route(Section):
         """Farthest that a drawn route is from the waypoints' line, m."""
         return self.lateral_spread + self.wander
 
+    @cached_property
+    def shape(self) -> Shape:
+        """Its straight lines and turns."""
+        leg = np.diff(np.array(self.waypoints), axis=0)
+        heading = np.arctan2(leg[:, 1], leg[:, 0])
+        turn = np.pad((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi, 1)
+        turn[np.abs(turn) <= STRAIGHT] = 0.0
+        return Shape(np.linalg.norm(leg, axis=1), heading, turn, self.corner_radius * np.tan(np.abs(turn) / 2))
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Straight lines and arcs from its beginning to its end."""
+        length, heading, turn, cut = self.shape
+        points, ahead, radius = np.array(self.waypoints), _direction(heading), self.corner_radius
+        lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
+        curvature = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
+        arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
+        there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
+        return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
+
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         for problem in _problems(self):
@@ -47,29 +86,20 @@ class Route(Section):
         return self
 
 
-class Pieces(NamedTuple):
-    """Straight lines and arcs, one after the other."""
-
-    position: np.ndarray  # (n, 2) m, where they begin
-    heading: np.ndarray  # (n,) rad, there
-    curvature: np.ndarray  # (n,) 1/m, positive to the left
-    length: np.ndarray  # (n,) m
-
-
 def route_length(route: Route) -> float:
     """Return the length of a route as designed, m."""
-    return math.fsum(_pieces(route).length)
+    return math.fsum(route.pieces.length)
 
 
 def point_count(route: Route) -> int:
     """Return how many points describe a route; those of a straight line are its ends."""
-    straight = route.wander == 0.0 and not _shape(route).turn.any()
+    straight = route.wander == 0.0 and not route.shape.turn.any()
     return 2 if straight else min(MOST_POINTS, math.ceil(route_length(route) / SPACING) + 1)
 
 
 def route_points(route: Route, s: np.ndarray) -> np.ndarray:
     """Return (x, y, heading), (K, 3) in m and rad, of a route as designed at arc lengths s (K,), m."""
-    pieces = _pieces(route)
+    pieces = route.pieces
     begin = np.concatenate([[0.0], np.cumsum(pieces.length)[:-1]])
     which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, None)
     position, heading, curvature, _ = (values[which] for values in pieces)
@@ -88,25 +118,8 @@ def _direction(heading: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 
 
-class Shape(NamedTuple):
-    """What is between the L + 1 waypoints of a route, and at them."""
-
-    length: np.ndarray  # (L,) m
-    heading: np.ndarray  # (L,) rad
-    turn: np.ndarray  # (L + 1,) rad, positive to the left; 0 at both ends
-    cut: np.ndarray  # (L + 1,) m before and behind a waypoint, where its arc begins and ends
-
-
-def _shape(route: Route) -> Shape:
-    leg = np.diff(np.array(route.waypoints), axis=0)
-    heading = np.arctan2(leg[:, 1], leg[:, 0])
-    turn = np.pad((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi, 1)
-    turn[np.abs(turn) <= STRAIGHT] = 0.0
-    return Shape(np.linalg.norm(leg, axis=1), heading, turn, route.corner_radius * np.tan(np.abs(turn) / 2))
-
-
 def _problems(route: Route) -> Iterator[str]:
-    length, _, turn, cut = _shape(route)
+    length, _, turn, cut = route.shape
     for i in np.flatnonzero(length < 1e-6):
         yield f"waypoints.{i + 1}: the same place as the waypoint before"
     for i in np.flatnonzero(np.abs(turn) > math.pi - 1e-3):
@@ -124,16 +137,6 @@ def _problems(route: Route) -> Iterator[str]:
         )
     if route.start_spread >= (total := route_length(route)):
         yield f"start_spread: {route.start_spread:g} m must be below the route's length ({total:g} m)"
-
-
-def _pieces(route: Route) -> Pieces:
-    length, heading, turn, cut = _shape(route)
-    points, ahead, radius = np.array(route.waypoints), _direction(heading), route.corner_radius
-    lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
-    curvature = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
-    arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
-    there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
-    return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
 
 
 def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:

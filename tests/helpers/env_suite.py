@@ -20,7 +20,7 @@ Env = coopenv.CooperativeLocalisationEnv
 Make = Callable[..., Env]
 """Makes one and the same environment with options of `coopenv.parallel_env`: observation, dtype, render_mode."""
 
-STEPS = 40
+STEPS = 25
 CHECKS: list[Callable[[Make], None]] = []
 """All checks that hold for environments of any backend."""
 
@@ -138,7 +138,7 @@ def layout_covers_the_observation_once(make: Make) -> None:
 @check
 def infos(make: Make) -> None:
     env = make(dtype="float64")
-    steps = rollout(env, 5, 40)
+    steps = rollout(env, 5, STEPS)
     keys = set(steps[0][1]["vehicle_1"])
     weights = env.scenario.reward.weights.model_dump()
     for step in steps:
