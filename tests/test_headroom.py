@@ -18,7 +18,7 @@ from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
 from tests.helpers.marks import largest_slow
 
-WORLDS = {"open_square": 48, "facade": 48, "behind_truck": 48, "urban_crossing": 48, "large_crossing": 6}
+WORLDS = {"open_square": 32, "facade": 32, "behind_truck": 32, "urban_crossing": 48, "large_crossing": 6}
 """How many suffice for intervals that tell the drivers apart."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""
@@ -32,6 +32,7 @@ def episodes(environment: str, agent: str, sensing: str = "sensed", times: int =
     return drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
 
 
+@cache
 def figures(
     environment: str, agent: str, sensing: str = "sensed", times: int = 2
 ) -> dict[str, tuple[float, float, float]]:
@@ -55,7 +56,7 @@ def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environmen
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", WORLDS)
 def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
-    assert change_of_time(environment, 10).relative <= MOST_TIME
+    assert change_of_time(environment, 15).relative <= MOST_TIME
 
 
 @pytest.mark.parametrize("environment", largest_slow(WORLDS))
