@@ -21,7 +21,8 @@ MOST_POINTS = 64  # ... and how many there are at most
 STRAIGHT = 1e-6  # rad; a smaller turn at a waypoint is no corner
 
 
-class Shape(NamedTuple):
+@dataclass(frozen=True, eq=False)  # arrays cannot be compared where routes are
+class Shape:
     """What is between the L + 1 waypoints of a route, and at them."""
 
     length: np.ndarray  # (L,) m
@@ -30,7 +31,8 @@ class Shape(NamedTuple):
     cut: np.ndarray  # (L + 1,) m before and behind a waypoint, where its arc begins and ends
 
 
-class Pieces(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Pieces:
     """Straight lines and arcs, one after the other."""
 
     position: np.ndarray  # (n, 2) m, where they begin
@@ -71,7 +73,7 @@ class Route(Section):
     @cached_property
     def pieces(self) -> Pieces:
         """Straight lines and arcs from its beginning to its end."""
-        length, heading, turn, cut = self.shape
+        length, heading, turn, cut = vars(self.shape).values()
         points, ahead, radius = np.array(self.waypoints), _direction(heading), self.corner_radius
         lines = points[:-1] + cut[:-1, None] * ahead, heading, 0.0 * heading, length - cut[:-1] - cut[1:]
         curvature = np.copysign(1.0 / radius if radius else 0.0, turn[1:])
@@ -102,7 +104,7 @@ def route_points(route: Route, s: np.ndarray) -> np.ndarray:
     pieces = route.pieces
     begin = np.concatenate([[0.0], np.cumsum(pieces.length)[:-1]])
     which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, None)
-    position, heading, curvature, _ = (values[which] for values in pieces)
+    position, heading, curvature, _ = (values[which] for values in vars(pieces).values())
     h = np.asarray(s) - begin[which]
     turn = curvature * h
     chord, middle = h * np.sinc(turn / (2 * np.pi)), heading + turn / 2
@@ -119,7 +121,7 @@ def _direction(heading: np.ndarray) -> np.ndarray:
 
 
 def _problems(route: Route) -> Iterator[str]:
-    length, _, turn, cut = route.shape
+    length, _, turn, cut = vars(route.shape).values()
     for i in np.flatnonzero(length < 1e-6):
         yield f"waypoints.{i + 1}: the same place as the waypoint before"
     for i in np.flatnonzero(np.abs(turn) > math.pi - 1e-3):
