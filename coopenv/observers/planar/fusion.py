@@ -60,10 +60,10 @@ def sightings_of(extra: Mapping[str, Array]) -> Sightings | None:
 
 def _plausible(pose: Array, covariance: Array) -> bool:
     """Return whether a pose is finite and near, and its covariance symmetric and positive semidefinite."""
-    if not (np.isfinite(pose).all() and np.isfinite(covariance).all()) or np.abs(pose).max() > FARTHEST_M:
-        return False
     scale = float(np.abs(covariance).max())
-    if scale > FARTHEST_M**2 or not np.allclose(covariance, covariance.T, atol=1e-3 * scale):
+    if not (np.abs(pose).max() <= FARTHEST_M and scale <= FARTHEST_M**2):  # of NaN neither holds
+        return False
+    if (np.abs(covariance - covariance.T) > 1e-3 * scale + 1e-5 * np.abs(covariance.T)).any():
         return False
     return bool(np.linalg.eigvalsh(covariance)[0] >= -1e-3 * scale)
 
@@ -93,19 +93,17 @@ class RobotMonitor:
         self._sum, self._fitting = 0.0, 0
         self._sums: dict[int, float] = {}  # of the sightings of every other sender
         self._localised = -math.inf
-        self._time = -math.inf
+        self.time = -math.inf  # s, of the last report
         self._last: PlanarPose | None = None
 
     def test_report(self, time: float, reported: PlanarPose) -> None:
-        """Exclude the sender if its reported position, valid at a time in s, has jumped."""
-        if time <= self._time:
-            return
-        if self._last is not None and time - self._time < SILENCE_S:
+        """Exclude the sender if its reported position has jumped, valid at a time in s after that of the last one."""
+        if self._last is not None and time - self.time < SILENCE_S:
             moved = math.dist(reported.pose[:2].tolist(), self._last.pose[:2].tolist())
             spread = sum(float(of.covariance[0, 0] + of.covariance[1, 1]) for of in (reported, self._last))
-            if moved > FASTEST * (time - self._time) + WIDE * math.sqrt(spread):
+            if moved > FASTEST * (time - self.time) + WIDE * math.sqrt(spread):
                 self.exclude()
-        self._time, self._last = time, reported
+        self.time, self._last = time, reported
 
     def test_innovation(self, ratio: float, variance: float, localised: bool) -> None:
         """Test a bearing to or from the sender by its normalised innovation squared and its variance, rad^2.
@@ -172,8 +170,9 @@ class RobotMonitors:
     def test_reports(self, tick: Tick) -> None:
         """Test the received positions against the earlier ones."""
         for target, received in tick.messages.items():
-            if (reported := received_position(received)) is not None:
-                self.of(target).test_report(tick.time - received.age, reported)
+            monitor, time = self.of(target), tick.time - received.age
+            if monitor.time < time and (reported := received_position(received)) is not None:
+                monitor.test_report(time, reported)
 
     def accepts(self, target: int, time: float) -> bool:
         """Return whether a sender is not excluded; its report then counts as fused at a time in s."""
