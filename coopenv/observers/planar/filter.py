@@ -96,19 +96,19 @@ class PlanarFilter:
 
     def move(self, dt: float) -> OdometryStep:
         """Move the estimate on by dt in s, by what was commanded."""
-        k, s = self.tuning, self.state
         if self.history is None:
             return OdometryStep(0.0, 0.0, 0.0, 0.0)
-        done, late = self.history.response(dt, float(s[LEAD]))
+        k, s = self.tuning, self.state.tolist()  # numbers of Python: those of NumPy are slow one by one
+        done, late = (sums.tolist() for sums in self.history.response(dt, s[LEAD]))
         turning, turning_late = (
             sums[COMMANDED] + s[SHARE] * (sums[TURN] - sums[COMMANDED]) - s[TURN_OFFSET] * sums[TURNING]
             for sums in (done, late)
         )
         turned = s[TURN_SCALE] * turning + s[DRIFT] * dt
         driven = s[SPEED_SCALE] * done[PATH] + s[SPEED_OFFSET] * done[ARC] - s[SLOWDOWN] * done[SLOWING]
-        middle = float(s[HEADING] + turned / 2)
+        middle = s[HEADING] + turned / 2
         c, sn = math.cos(middle), math.sin(middle)
-        shrunk, astray = self._astray(float(driven))
+        shrunk, astray = self._astray(driven)
         turn_row, along = np.zeros(STATES), np.zeros(STATES)
         turn_row[TURN_SCALE], turn_row[TURN_OFFSET] = turning, -s[TURN_SCALE] * done[TURNING]
         turn_row[LEAD], turn_row[SHARE] = s[TURN_SCALE] * turning_late, s[TURN_SCALE] * (done[TURN] - done[COMMANDED])
@@ -122,9 +122,7 @@ class PlanarFilter:
         f[X] += c * along - sn * across
         f[Y] += sn * along + c * across
         f[HEADING] += turn_row
-        s[X] += driven * c
-        s[Y] += driven * sn
-        s[HEADING] += turned
+        self.state[[X, Y, HEADING]] += driven * c, driven * sn, turned
         p = f @ self.covariance @ f.T
         p.flat[:: STATES + 1] += self._walk * dt
         speed, rate = abs(done[PATH]) / dt, abs(done[TURN]) / dt
@@ -132,14 +130,14 @@ class PlanarFilter:
         q_path = factor * (k.path_noise[0] + k.path_noise[1] * speed) ** 2 * dt + astray[0]
         q_side = factor * (k.slide_noise * speed) ** 2 * dt + astray[1]
         q_turn = (k.turn_noise[0] + k.turn_noise[1] * rate + k.turn_noise[2] * speed) ** 2 * dt
-        q_turn = factor * (q_turn + k.jitter**2 * float(done[SWITCHING]))
+        q_turn = factor * (q_turn + k.jitter**2 * done[SWITCHING])
         p[HEADING, HEADING] += q_turn
         p[X, X] += q_path * c * c + q_side * sn * sn
         p[Y, Y] += q_path * sn * sn + q_side * c * c
         p[X, Y] += (q_path - q_side) * c * sn
         p[Y, X] = p[X, Y]
         self.covariance = p
-        return OdometryStep(float(turned), float(driven), q_turn, q_path)
+        return OdometryStep(turned, driven, q_turn, q_path)
 
     def _astray(self, driven: float) -> tuple[float, tuple[float, float]]:
         """Return what a path in m shrinks by, and what an unsure heading adds along and across, m^2.

@@ -131,10 +131,10 @@ class CommandHistory:
         now, half = self._t[-1] - lead, dt / 2
         ends = np.array([now - dt - half, now - dt, now - half, now, now + half])
         at = (ends[:, None] - self._delay).ravel()
-        k = np.clip(np.searchsorted(self._t, at), 1, len(self._t) - 1)
-        share = np.minimum((at - self._t[k - 1]) / (self._t[k] - self._t[k - 1]), 1.0)
-        before = self._sum[:, k - 1]
-        sums = (before + share * (self._sum[:, k] - before)).reshape(7, len(ends), -1) @ self._share
+        k = np.searchsorted(self._t[1:-1], at)
+        t, before = self._t.take(k), self._sum[:, k]
+        share = np.minimum((at - t) / (self._t.take(k + 1) - t), 1.0)
+        sums = (before + share * (self._sum[:, k + 1] - before)).reshape(7, len(ends), -1) @ self._share
         earlier, start, middle, end, later = sums.T
         return end - start, -(later - 2 * middle + earlier) / dt
 
