@@ -40,7 +40,7 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
     if isinstance(name_or_path, Scenario):
         if not overrides:
             return name_or_path
-        raw = name_or_path.model_dump(exclude_unset=True)
+        raw = name_or_path.model_dump(mode="json", exclude_unset=True)
         override(raw, overrides)
         return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
     made = is_scene(str(name_or_path))

@@ -129,7 +129,7 @@ def _hostile(kind: int) -> Message:
 
 
 def test_what_is_no_message_ends_no_run_and_changes_nothing():
-    record = recording_of(barrier_robots(1, 25.0), "landmarks+robots")
+    record = recording_of(barrier_robots(1, 12.0), "landmarks+robots")
     babbling, silent = (run(PlanarRobust, record, Babbling(silent)) for silent in (False, True))
     assert not babbling.failure
     np.testing.assert_array_equal(babbling.position, silent.position)
