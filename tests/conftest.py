@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import sys
@@ -20,6 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Containers often forbid byte code: each of hundreds of processes then compiles all the Python that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+gc.set_threshold(20_000, 20, 20)  # with the usual numbers a tenth of the time goes into looking for unused objects
 
 MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
@@ -58,6 +60,11 @@ def browser() -> Iterator[Any]:
         started = tools.chromium.launch(executable_path=program, args=DRAWS_WITHOUT_A_GRAPHICS_CARD)
         yield started
         started.close()
+
+
+def pytest_collection_finish() -> None:
+    """Leave what has been loaded out of the search for unused objects."""
+    gc.freeze()
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
