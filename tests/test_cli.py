@@ -257,7 +257,7 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
         rotation, position = recording.truth.rotation.copy(), recording.truth.position.copy()
         rotation[unknown], position[unknown] = np.nan, np.nan
         write_recording(replace(recording, truth=Truth(rotation, position)), Path(name))
-    assert main(["run", "part.mcap", "--steady-from", "1"]) == 0
+    assert main(["run", "part.mcap", "--steady-from", "1", "--no-figures"]) == 0
     metrics = json.loads(Path("out/part/metrics.json").read_text())
     assert all(np.isfinite(vehicle["steady_position_rmse_m"]) for vehicle in metrics["vehicles"])
     assert metrics["simulated_time_s"] == 2.0
@@ -282,8 +282,8 @@ def test_results_that_cannot_be_written_are_found_before_the_run(
 @pytest.mark.parametrize(
     "options",
     [
-        ["urban_crossing", "--set", "observer.name=dead_reckoning", "--policy", "route_follower"],
-        ["busy_intersection", "--set", "observer.q=1e9", "--dtype", "float32"],
+        ["urban_crossing", "--set", "observer.name=dead_reckoning", "--set", "horizon=30.0", "--policy", "route_follower"],
+        ["busy_intersection", "--set", "observer.q=1e9", "--set", "horizon=20.0", "--dtype", "float32"],
     ],
 )
 def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -296,7 +296,7 @@ def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pyte
 
 def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
-    assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--out", "film"]) == 0
+    assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--no-figures", "--out", "film"]) == 0
     assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
     assert "pip install '.[video]'" in capsys.readouterr().err
 
@@ -306,7 +306,7 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
         'title = "Mine"\nhorizon = 2.0\n[[landmarks]]\nname = "A"\nposition = [1.0, 0.0, 2.0]\n'
         "[[vehicles]]\ninitial_pose.position = [0.0, 0.0, 0.0]\n"
     )
-    assert main(["run", "mine.toml", "--policy", "random"]) == 0
+    assert main(["run", "mine.toml", "--policy", "random", "--no-figures"]) == 0
     captured = capsys.readouterr()
     first, second = captured.err.splitlines()
     assert first.startswith("warning: only 1 landmark")
@@ -327,11 +327,12 @@ def test_an_interrupted_run_leaves_the_earlier_result(
             raise KeyboardInterrupt
         take(self)
 
-    assert main(["run", "overtaking", "--steps", "3", "--out", "cut"]) == 0
+    run = ["run", "overtaking", "--no-figures", "--out", "cut"]
+    assert main([*run, "--steps", "3"]) == 0
     before = {path.name: path.read_bytes() for path in Path("cut").iterdir()}
     capsys.readouterr()
     monkeypatch.setattr(Views, "take", interrupted)
-    assert main(["run", "overtaking", "--seed", "1", "--out", "cut"]) == 130
+    assert main([*run, "--seed", "1"]) == 130
     assert capsys.readouterr().out == ""
     assert {path.name: path.read_bytes() for path in Path("cut").iterdir()} == before
 
@@ -356,12 +357,13 @@ def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
 
 def test_the_installed_module_runs_in_a_process_of_its_own(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "coopenv"]
-    good = subprocess.run([*command, "run", "overtaking", "--steps", "5"], capture_output=True, text=True)
+    run = [*command, "run", "overtaking", "--steps", "5", "--no-figures"]
+    good = subprocess.run(run, capture_output=True, text=True)
     assert good.returncode == 0
     progress = r"[a-z ]+: \d+ (s|%.*)|compiling kernels .*"  # where the machine is slow, or new
     assert all(re.fullmatch(progress, line) for line in good.stderr.splitlines())
     assert "Overtaking: seed 0" in good.stdout
-    bad = subprocess.run([*command, "run", "overtaking", "--dtype", "half"], capture_output=True, text=True)
+    bad = subprocess.run([*run, "--dtype", "half"], capture_output=True, text=True)
     assert bad.returncode == 2
     assert bad.stderr.startswith("error: unknown dtype 'half'")
     assert bad.stderr.count("\n") == 1
