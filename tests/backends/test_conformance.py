@@ -105,7 +105,7 @@ def drive(folder: Path, lab: tuple[Path, Any]) -> Path:
     return folder / "drive.mcap"
 
 
-@pytest.fixture(params=["simulated", "in process", "over zenoh", "drive", "bag"])
+@pytest.fixture(scope="module", params=["simulated", "in process", "drive", "bag", "over zenoh"])
 def make(request: pytest.FixtureRequest, folder: Path) -> Make:
     if request.param == "simulated":
         return simulated
