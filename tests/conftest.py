@@ -21,17 +21,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Containers often forbid byte code: each of hundreds of processes then compiles all the Python that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
-gc.set_threshold(20_000, 20, 20)  # with the usual numbers a tenth of the time goes into looking for unused objects
+gc.set_threshold(20_000, 20, 20)  # otherwise a tenth of the time goes into looking for unused objects
 
 MODULES_AT_MOST = 90
 """Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
 STARTED = time.time()
 COMPILED = pytest.StashKey[int]()
 DRAWS_WITHOUT_A_GRAPHICS_CARD = [
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
+    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 ]
 
 
@@ -63,7 +60,6 @@ def browser() -> Iterator[Any]:
 
 
 def pytest_collection_finish() -> None:
-    """Leave what has been loaded out of the search for unused objects."""
     gc.freeze()
 
 

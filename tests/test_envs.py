@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,7 @@ from coopenv.base.installation import environment_id
 from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_actions, rollout
 
 ENVS = coopenv.list_envs()
+short = cache(partial(coopenv.load_scenario, overrides={"horizon": 6.0}))
 
 
 @pytest.fixture(scope="module", params=ENVS)
@@ -27,14 +28,9 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module")
-def make(name: str) -> Make:
-    return partial(coopenv.parallel_env, coopenv.load_scenario(name, {"horizon": 6.0}))
-
-
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_suite(make: Make, check: Callable[[Make], None]) -> None:
-    check(make)
+def test_suite(name: str, check: Callable[[Make], None]) -> None:
+    check(partial(coopenv.parallel_env, short(name)))
 
 
 def test_registries(name: str) -> None:

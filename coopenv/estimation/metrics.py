@@ -151,7 +151,8 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
     are a lower limit of the uncertainty. Without a descent of at least three samples that stands out of the scatter the
     rate is NaN, with a remark. The noise floor is by default the median over the last fifth of the record.
     """
-    from scipy.ndimage import median_filter  # here, as loading it takes time
+    from scipy.ndimage import median_filter  # here, as loading them takes 0.4 s
+    from scipy.stats import theilslopes
 
     t, error = np.asarray(t, float), np.asarray(error, float)
     if not np.isfinite(error).all():
@@ -169,8 +170,6 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
         if start <= _FIT_SAMPLES_MIN:
             return _no_rate(f"error fell below half {_within(start)}", len(index))
         return _no_rate(f"error fell from half to the noise floor {_within(len(index) + 1)}", len(index))
-    from scipy.stats import theilslopes  # here, as loading it takes 0.5 s
-
     index = index[:: math.ceil(len(index) / _FIT_SAMPLES)]
     slope, _, slope_low, slope_high = theilslopes(np.log(error[index]), t[index], alpha=0.95)
     fall = np.log(half / error[index].min())

@@ -101,10 +101,9 @@ def point_count(route: Route) -> int:
 
 def route_points(route: Route, s: np.ndarray) -> np.ndarray:
     """Return (x, y, heading), (K, 3) in m and rad, of a route as designed at arc lengths s (K,), m."""
-    pieces = route.pieces
-    begin = np.concatenate([[0.0], np.cumsum(pieces.length)[:-1]])
+    begin = np.concatenate([[0.0], np.cumsum(route.pieces.length)[:-1]])
     which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, None)
-    position, heading, curvature, _ = (values[which] for values in vars(pieces).values())
+    position, heading, curvature, _ = (values[which] for values in vars(route.pieces).values())
     h = np.asarray(s) - begin[which]
     turn = curvature * h
     chord, middle = h * np.sinc(turn / (2 * np.pi)), heading + turn / 2

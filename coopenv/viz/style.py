@@ -140,10 +140,9 @@ def summed_up(t: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of stretches without any
         middle = np.nanmean(stretches[0], axis=1)
-        whole = np.isfinite(stretches[1]).all(axis=1)
-        found = np.empty((3, len(whole)))
-        for rows, percentile in ((whole, np.percentile), (~whole, np.nanpercentile)):  # the latter is slow
-            found[:, rows] = percentile(stretches[1][rows], (RANGE[0], 50, RANGE[1]), axis=1)
+        whole, share = np.isfinite(stretches[1]).all(axis=1), (RANGE[0], 50, RANGE[1])
+        found = np.percentile(stretches[1], share, axis=1)
+        found[:, ~whole] = np.nanpercentile(stretches[1][~whole], share, axis=1)  # which is slow
     return middle, found[1], found[0], found[2]
 
 

@@ -26,13 +26,8 @@ SHORT = ("overtaking", "--set", "horizon=1.0")
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("coopenv.viz.figures.FIGURE_NAMES", ())  # pages are asked for here
     return tmp_path
-
-
-@pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the figures of runs out, but not their pages."""
-    monkeypatch.setattr("coopenv.viz.figures.save_figures", lambda *_, **__: [])
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +44,6 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.usefixtures("no_figures")
 def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", *SHORT, "--out", "there", "--policy", "zero"]) == 0
     printed = capsys.readouterr()
@@ -69,7 +63,6 @@ def test_a_recording_has_its_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["film", "drive.mcap", "--observer", "mekf", "--out", "film.gif", "--fps", "2"]) == 0
 
 
-@pytest.mark.usefixtures("no_figures")
 def test_without_the_extra_runs_say_what_is_missing(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,7 +110,6 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, broken: Path)
     assert message in refused(*arguments)
 
 
-@pytest.mark.usefixtures("no_figures")
 def test_without_a_display_no_browser_is_opened(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
