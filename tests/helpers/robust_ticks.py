@@ -20,6 +20,10 @@ TARGETS = np.arange(len(LANDMARKS) + VEHICLES)
 PERIOD = 1.0 / 60.0
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=PERIOD, bearing=0.003)
 STILL: Pose = (np.eye(3), np.zeros(3))
+BIAS, WALK = 0.2 * NOISE.angular_velocity, 0.1 * NOISE.angular_velocity
+"""rad/s, of the gyro where no larger one is declared; and its walk in a second."""
+CALIBRATION = np.diag([BIAS**2] * 3 + [1e-12, 1.0, 1.0])
+"""The covariance of the calibration state of odometry: bias, scale, and two entries without a meaning."""
 
 
 def known(vehicle: int = 0, noise: SensorNoise = NOISE) -> Setup:
@@ -115,6 +119,16 @@ def covariance(rng: np.random.Generator, angle: float, length: float) -> np.ndar
     C = A @ A.T
     scale = np.repeat([angle, length], 3) / np.sqrt(C.diagonal())
     return np.asarray(scale[:, None] * C * scale)
+
+
+def predicted(P: np.ndarray, dt: float = PERIOD) -> np.ndarray:
+    """Return the covariance (12, 12) of own and calibration errors after the first tick of a vehicle that stands."""
+    calibration = CALIBRATION + np.diag([WALK**2 * dt] * 3 + [0.0] * 3)
+    F = np.eye(12)
+    F[:3, 6:9] = -dt * np.eye(3)
+    start = np.zeros((12, 12))
+    start[:6, :6], start[6:, 6:] = P + np.diag(NOISE.odometry(dt)), calibration
+    return np.asarray(F @ start @ F.T)
 
 
 def drawn(rng: np.random.Generator, pose: Pose, P: np.ndarray) -> Pose:

@@ -60,7 +60,8 @@ def test_ticks_may_come_at_any_time() -> None:
     recording = small_errors(12.0)
     regular, _ = played(find("robust"), recording, lambda k: 0.0)
     late, _ = played(find("robust"), recording, lambda k: 2e-3 * np.sin(7.0 * k) * (k > 1))
-    assert [a.nis_dof for a in late] == [b.nis_dof for b in regular]
+    used = [[estimate.nis_dof for estimate in part] for part in (late, regular)]
+    assert np.mean(np.not_equal(*used)) < 0.01  # by bearings that are about as far off as the gate
     for estimates in (regular, late):
         for estimate, vehicle in zip(estimates[-5:], recording.order, strict=True):
             assert np.linalg.norm(estimate.position - recording.truth.position[200, vehicle]) < 0.6

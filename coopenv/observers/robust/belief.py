@@ -68,6 +68,12 @@ def own_estimate(memory: Any, world: int, i: int):
 
 
 @device_function
+def doubted_estimate(memory: Any, world: int, i: int):
+    """Return the own estimate with a covariance that includes what faults of sources add that are not certain."""
+    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.doubt[world, i])
+
+
+@device_function
 def put_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Set the own pose and covariance to an estimate."""
     memory.member[world, i, 0].pose = estimate.pose
@@ -92,8 +98,8 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 @device_function
 def is_free(memory: Any, world: int, i: int, k: int) -> bool:
-    """Return whether bearings correct a member; a considered member keeps its reported pose."""
-    return memory.member[world, i, k].considered == 0
+    """Return whether bearings correct a member; another vehicle keeps its reported pose."""
+    return k < memory.belief[world, i].others
 
 
 @device_function

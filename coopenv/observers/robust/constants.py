@@ -7,9 +7,9 @@ THIRD = 1.0 / 3.0
 MAX_MEMBERS = 5  # vehicles in a belief, the vehicle itself included, calibration states excluded
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; rad: largest turn of a line of sight without another linearisation. Tuned."""
-LINEARISATION_TIME, MEMBER_LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 1.0, 12.0
+LINEARISATION_TIME, CONSIDERED_LINEARISATION_TIME = 0.1, 12.0
 """s for which the linearisation error of a bearing is correlated, so that all frames of that time count as one: for a
-landmark, for a member, and for a considered member, whose error no later bearing corrects. Tuned."""
+landmark, and for another vehicle, whose error no later bearing corrects. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
@@ -31,55 +31,32 @@ SHARE_OF_CHANGE, LEAST_CHANGE = 0.2, 0.05
 MOUNTING_WALK = 0.02
 """Share of its declared deviation by which the mounting walks in a second. Without turns, heading and mounting
 are not separately observable, and linearisation makes both covariances slightly too small. Tuned."""
+GYRO_BIAS, GYRO_BIAS_WALK = 0.2, 0.1
+"""Ratios of the gyro's bias, and of its walk in a second, to the noise of a sample, where no larger one is declared."""
 MIN_ERROR_STD = 1e-6  # rad/s, a share, rad and m: of a calibration state that is not declared beside one that is
 
-# Tests
+# Monitors
 
 BEARING_GATE = 13.8  # gate of a bearing's normalised innovation squared: chi-square of 2, 0.999
-MESSAGE_GATE = 40.0
-"""Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
-AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
-"""s and m: how long and how closely an excluded sender must agree before it is readmitted. Chosen."""
-AGREEMENT_GATE = 16.8  # of the squared distance at which an excluded sender agrees: chi-square of 6, 0.99
-MAX_RETESTED_EXCLUSIONS = 2  # exclusions of a sender that may be retested. Chosen
-MAX_EXCLUSIONS = 7  # after which the exclusion lasts 2^(n - 1) s, a minute. Chosen
 SILENCE_TIME = 0.5  # s, after which a reported pose may jump: a lost sender broadcasts nothing. Chosen
 RESET_GROWTH = 0.5  # growth of a sender's variance, as a share of it, that counts as a reset. Chosen
-DRIFT_GATE, DRIFT_CLEAR = 28.0, 9.0
-"""Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 4e-6; and that of an excluded
-sender, 0.97."""
-DRIFT_STD = 6.0  # least drift for an exclusion, in reported standard deviations. Chosen
-DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0
-"""s: time constants of the sums that compare a sender's position with its odometry. Chosen."""
-SLACK = 0.1  # share of the odometry noise that a reported covariance may lack. Tuned
-JUMP_STD = 4.0  # standard deviations beyond braking that count as a jump of its odometry
-INNOVATION_SUM_GATE = 60.0
-"""Gate of the squared size of a sender's error that innovations reveal. Tuned: correct senders pass."""
-INNOVATION_SUM_SHARE = 0.5  # of a frame's information on that, because innovations are not quite white. Tuned
-LEAST_INFORMATION = 0.01  # 1/m^2, at first
-ERROR_FACTOR = 2.0  # ratio of the possible to the detected error of a faulty sender. Chosen
-GROSS_ERROR, GROSS_TURN = 0.5, 0.1
-"""m: error of a sender that invalidates linearisations; rad of the own pose per metre of that error. Tuned."""
-LOST_SHARE, LOST_TIME = 0.6, 0.5
-"""Share of bearings that contradict the belief, and the time over which it is averaged, s. Chosen: one wrong
-association of two does not exceed it."""
+FAULT_GATE, FAULT_RISK = 30.0, 1e-2
+"""Ratio, twice its logarithm, from which the fault of a source is likelier than none; probability that the source that
+is excluded is right. Tuned: in honest worlds the largest of all ratios was 34."""
+ODOMETRY_FAULT = 0.1  # standard deviation of the fault of the odometry's velocity, as a share of the speed. Chosen
+MONITOR_TIME, BLOCK_TIME = 10.0, 0.5
+"""s: time constant of the sums of a monitor, and time between two looks at them. Chosen."""
+READMISSION_TIME, MAX_DOUBLINGS = 2.0, 5
+"""s for which a source stays excluded at first, and how often that time is doubled for a source that is excluded again,
+to a minute. Chosen."""
+LOST_SHARE, FOUND_SHARE, LOST_TIME, OPEN_TIME = 0.6, 0.1, 1.0, 5.0
+"""Share of bearings that fail the gate from which on all bearings count, share below which the gate is closed again,
+time over which the share is averaged, and time after which a search begins, s. Chosen: one wrong association of two
+does not exceed the share."""
 HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
 """Share of contradicting bearings, and for how long, s, it must be lower for the pose to be an anchor. Chosen."""
 ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE = 0.05**2, 0.5**2
 """rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost. Chosen."""
-LANDMARK_ONLY_PERIOD = 0.2  # s between corrections of the landmark-only solution. Chosen
-LANDMARK_ONLY_NOISE = 4.0
-"""Ratio of the variances of its bearings and odometry to those declared: with two landmarks in view, linearisation
-makes the covariance of unobservable directions too small. Tuned."""
-SEPARATION_GATE = 24.0  # of the squared distance between belief and landmark-only solution: chi-square of 6, 0.9995
-DISPUTE_MARGIN = 6.0
-"""Difference in cost by which another sender than the suspect is found faulty: odds of exp(-3)."""
-RETEST_MARGIN = 12.0
-"""Difference in cost by which another exclusion replaces the present ones: odds of exp(-6). Tuned: at 6 some vehicles
-change their exclusions often, at 18 some are slow."""
-ENOUGH_LANDMARKS = 2  # in view for which the landmark-only solution outweighs several senders. Chosen
-NOT_AHEAD = 10.0  # rad, residual of a bearing whose target is behind the camera; it fails every gate
-CONSISTENT_QUANTILE = 3.09  # of a normal distribution, 0.999: bound on the cost of consistent bearings
 
 # Messages
 

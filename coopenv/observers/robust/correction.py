@@ -55,7 +55,7 @@ def set_gain(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool):
+def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool, projecting: bool):
     """Find the correction by all bearings that fit, without a change of the covariance; return the sum of their NIS.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. With `gating`, the
@@ -68,7 +68,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
         memory.scratch[world, k].correction = vec6d()
     for n in range(bearings):
         if memory.measurement[world, n].fits == 1:
-            if not gating:
+            if projecting:
                 project(memory, world, i, n)
             set_gain(memory, world, i, n)
             member = memory.measurement[world, n].member
@@ -78,6 +78,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                 if k >= 0:
                     left = memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
                     residual = residual + memory.derivative[world, n, part].jacobian * left
+            memory.measurement[world, n].innovation = residual
             weighted = memory.measurement[world, n].weight * residual
             nis = wp.dot(weighted, residual)
             if gating and member > 0 and nis > wp.float64(constants.BEARING_GATE):
@@ -89,7 +90,6 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                     memory.scratch[world, k].correction = correction
     for k in range(members):
         if not is_free(memory, world, i, k):
-            memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
             memory.scratch[world, k].correction = vec6d()
     return total
 
@@ -152,12 +152,12 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """
     bearings = frame.bearings
     store_poses(memory, world, i)
-    correct_by_bearings(memory, world, i, bearings, True)
+    correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].open == 0, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)
     while share > wp.float64(0.0) and step < constants.MAX_LINEARISATIONS:
         linearise_again(frame, memory, world, i, share)
-        correct_by_bearings(memory, world, i, bearings, False)
+        correct_by_bearings(memory, world, i, bearings, False, True)
         share = next_share(memory, world, i, bearings, False)
         step += 1
     for k in range(memory.belief[world, i].members):

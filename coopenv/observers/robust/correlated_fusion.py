@@ -19,16 +19,8 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import mat66d, vec6d
-from coopenv.observers.robust.propagation import lasting_noise
-from coopenv.observers.robust.sender_monitor import (
-    drift_of,
-    has_jumped,
-    is_excluded,
-    note_step,
-    propagate_information,
-    test_report,
-)
+from coopenv.observers.robust.memory import PoseEstimate, mat66d, vec6d
+from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
 from coopenv.observers.robust.tracklets import bit_of, depends_on_own, includes, propagate_member
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
@@ -76,7 +68,6 @@ def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     memory.member[world, i, n].pose = report.pose
-    memory.member[world, i, n].considered = 1
     regress(model, memory, world, i, n, after, False)
     set_row(memory, world, i, n)
 
@@ -88,6 +79,10 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         n = memory.belief[world, i].members
         report = memory.inbox[world, i, sender]
         append_member(memory, world, i, sender, report.pose, mat66d(report.P))
+        q = take_slot(memory, world, i, model.landmarks + sender, tick, False, model.camera_period)
+        memory.member[world, i, n].source = q
+        if not is_excluded(memory, world, i, q):
+            clear_source(memory, world, i, q)
         memory.member[world, i, n].report = report
         memory.member[world, i, n].seen_tick = tick
         known = includes(memory.belief[world, i].depends_on, sender)
@@ -114,16 +109,10 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
 
 
 @device_function
-def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, lasting: Any):
-    """Set a member to its new report, and correct the own pose by the increment if `fusing`.
-
-    `lasting` are the variances (rotation, translation), rad^2 and m^2, of the lasting odometry errors since the last
-    report. Only the sender knows its own odometry errors. They are excluded here, because otherwise lost information
-    would be counted as new.
-    """
+def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool):
+    """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
-    memory.P[world, i, n, n] = algebra.with_noise(memory.P[world, i, n, n], -lasting)
     news = algebra.left_error(memory.member[world, i, n].pose, report.pose)
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
@@ -148,34 +137,62 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
 
 
 @device_function
+def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
+    """Add a variance (m^2 per axis) to member n's position, and to all errors that depend on it."""
+    members = memory.belief[world, i].members
+    inverse = algebra.inverse6(memory.P[world, i, n, n])
+    for k in range(members):
+        memory.scratch[world, k].column = memory.P[world, i, k, n] * inverse
+    for k in range(members):
+        A = memory.scratch[world, k].column
+        for j in range(k + 1):
+            B = memory.scratch[world, j].column
+            block = memory.P[world, i, k, j] + variance * (A[:, 3:] * wp.transpose(B[:, 3:]))
+            set_block(memory, world, i, k, j, block)
+
+
+@device_function
+def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
+    """Inflate the covariance where member n's new report shows a reset; return whether to replace the old report.
+
+    A reset shows as a covariance that has grown much, or as a jump of the position after a long silence.
+    """
+    report = memory.member[world, i, n].report
+    P = mat66d(report.P)
+    before = memory.P[world, i, n, n]
+    spread = algebra.position_variance(before)
+    grown = algebra.position_variance(P) - spread
+    if grown > wp.float64(constants.RESET_GROWTH) * spread:
+        inflate_dependents(memory, world, i, n, wp.float64(constants.THIRD) * grown)
+    if dt > wp.float64(constants.SILENCE_TIME):
+        estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+        if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
+            inflate_dependents(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
+            return True
+    return False
+
+
+@device_function
 def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
-    """Propagate a member to its new report, test the report, and fuse it."""
+    """Propagate a member to its new report, and fuse it."""
     last = memory.member[world, i, n].report
     report = memory.inbox[world, i, sender]
     dt = wp.float64(report.tick - last.tick) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
-    lasting = lasting_noise(memory, world, i, step, dt, wp.float64(constants.ERRORS_TIME))
-    noise = white + lasting
-    jumped = has_jumped(model, memory, world, i, n, step, dt)
-    propagate_member(model, memory, world, i, n, step, dt, noise)
+    propagate_member(model, memory, world, i, n, step, dt, white)
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
-    learnt = note_step(memory, world, i, n, last, noise, lasting, dt)
-    if memory.member[world, i, n].excluded == 0:  # an excluded sender has no sums, and its reports may jump
-        propagate_information(memory, world, i, sender, learnt, noise[1])
-    drift = drift_of(memory, world, i, n)
-    anew = test_report(model, memory, world, i, n, tick, dt, drift, jumped)
-    if memory.member[world, i, n].excluded == 1:
-        memory.member[world, i, n].considered = 0
+    q = memory.member[world, i, n].source
+    if is_excluded(memory, world, i, q):
+        set_to_report(model, memory, world, i, n)
         return
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
-    if anew:
+    if sender_reset_detected(memory, world, i, n, dt):
+        clear_source(memory, world, i, q)
         set_to_report(model, memory, world, i, n)
     else:
-        fusing = steady and lasting[0] <= white[0] and lasting[1] <= white[1]
-        fusing = fusing and not depends_on_own(memory, world, i, n)
-        fuse_increment(model, memory, world, i, n, fusing, lasting)
+        fuse_increment(model, memory, world, i, n, steady and not depends_on_own(memory, world, i, n))
 
 
 @device_function
@@ -237,7 +254,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
         target = model.targets[i, n]
         sender = target - model.landmarks
         if state.sight[world, i, target] == VISIBLE and is_received(model, state, memory, world, i, sender, tick):
-            if index_of(memory, world, i, sender) == 0 and not is_excluded(memory, world, i, sender, tick):
+            if index_of(memory, world, i, sender) == 0:
                 at = rank(model, sender, memory.inbox[world, i, sender])
                 if at > last and (best < 0 or at < best):
                     best = at

@@ -30,6 +30,7 @@ from coopenv.observers.robust.memory import (
     mat66f,
     vec3d,
 )
+from coopenv.observers.robust.sources import is_excluded
 from coopenv.observers.robust.tracklets import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
@@ -50,14 +51,14 @@ def rank(model: Any, vehicle: int, report: SenderReport) -> int:
 
 @device_function
 def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> int:
-    """Return the considered member of the highest rank below that of member `last` (0: any), 0 if there is none."""
+    """Return the used member of the highest rank below that of member `last` (0: any), 0 if there is none."""
     found = int(0)
     best = int(-1)
     limit = int(2147483647)
     if last > 0:
         limit = rank(model, memory.member[world, i, last].vehicle, memory.member[world, i, last].report)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if memory.member[world, i, n].considered == 1:
+        if not is_excluded(memory, world, i, memory.member[world, i, n].source):
             at = rank(model, memory.member[world, i, n].vehicle, memory.member[world, i, n].report)
             if at > best and at < limit:
                 found = n
@@ -68,7 +69,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
 @device_function
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
-    P = memory.P[world, i, 0, 0]
+    P = memory.P[world, i, 0, 0] + memory.doubt[world, i]
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):
@@ -237,7 +238,7 @@ def note_correlations(
     """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors."""
     A = factor(after)
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if k != n and memory.member[world, i, k].considered == 1:  # otherwise it does not have its reported pose
+        if k != n:
             known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
             if known and is_broadcast == broadcast:
                 covariance = A * X * wp.transpose(factor(memory.P[world, i, k, k]))

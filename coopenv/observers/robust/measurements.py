@@ -13,8 +13,8 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, vec3d
-from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
-from coopenv.observers.robust.sender_monitor import is_excluded
+from coopenv.observers.robust.propagation import mounting_of, mounting_variances
+from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.observers.robust.tracklets import only_returns
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -57,6 +57,7 @@ def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any
     memory.measurement[world, n].bearing = b
     memory.measurement[world, n].point = point
     memory.measurement[world, n].variance = variance
+    memory.measurement[world, n].source = -1
 
 
 @device_function
@@ -108,7 +109,7 @@ def set_measurement_of_member(
         gone = step.p
         turned = step.R
         passed = wp.float64(memory.inbox[world, i, sender].tick - stands) * model.camera_period
-        variance = increment_noise(model, memory, world, i, step, passed)[1]
+        variance = odometry_noise(model, i, passed)[1]
         stands = memory.inbox[world, i, sender].tick
     age = wp.float64(frame.tick - stands) * model.camera_period
     if age > wp.float64(0.0):
@@ -138,19 +139,29 @@ def set_measurement_of_target(
     if sender < 0:
         point = vec3d(marker_position(model, state, world, target))
         set_bearing_measurement(memory, world, frame.bearings, 0, b, point, wp.float64(0.0))
+        if frame.purpose == TRACKING:
+            q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
+            memory.measurement[world, frame.bearings].source = q
         return True
     received = is_received(model, state, memory, world, i, sender, frame.tick)
     if frame.purpose == SEARCH:
-        received = received and not is_excluded(memory, world, i, sender, frame.tick)
+        received = received and not is_excluded(memory, world, i, slot_of(memory, world, i, target))
         if received:
             variance = received_variance(model, memory, world, i, sender, frame)
             point = memory.inbox[world, i, sender].pose.p
             set_bearing_measurement(memory, world, frame.bearings, 0, b, point, variance)
         return received
     member = index_of(memory, world, i, sender)
-    if member > 0 and not (frame.purpose == TRACKING and only_returns(memory, world, i, member)):
-        return set_measurement_of_member(model, memory, world, i, frame, member, received, b)
-    return False
+    if member == 0:
+        return False
+    q = memory.member[world, i, member].source
+    if frame.purpose == TRACKING and only_returns(memory, world, i, member) and not is_excluded(memory, world, i, q):
+        return False
+    usable = set_measurement_of_member(model, memory, world, i, frame, member, received, b)
+    if frame.purpose == TRACKING:
+        memory.measurement[world, frame.bearings].source = q
+        memory.source[world, i, q].seen_tick = frame.tick
+    return usable
 
 
 @device_function
@@ -193,9 +204,7 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
     total = wp.trace(V)
     time = wp.float64(constants.LINEARISATION_TIME)
     if member > 0:
-        time = wp.float64(constants.MEMBER_LINEARISATION_TIME)
-        if memory.member[world, i, member].considered == 1:
-            time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)
+        time = wp.float64(constants.CONSIDERED_LINEARISATION_TIME)
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)
         C = block3(memory.P[world, i, 0, member], 3, 3)

@@ -11,7 +11,7 @@ import warp as wp
 
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import are_covariances
-from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_EXCLUSIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
+from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
 from coopenv.world.state import (
     COVARIANCE,
     FLAG,
@@ -33,6 +33,8 @@ mat33d: Any = wp.mat33d
 vec6d: Any = wp.types.vector(6, wp.float64)
 mat26d: Any = wp.types.matrix((2, 6), wp.float64)
 mat66d: Any = wp.types.matrix((6, 6), wp.float64)
+mat63d: Any = wp.types.matrix((6, 3), wp.float64)
+mat23d: Any = wp.types.matrix((2, 3), wp.float64)
 mat66f: Any = wp.types.matrix((6, 6), wp.float32)
 
 
@@ -78,33 +80,30 @@ class Member:
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: SenderReport  # its last one, at which it stands
-    excluded: wp.int32
-    agreement_time: wp.float64  # s for which an excluded sender has agreed
-    considered: wp.int32  # whether its pose is the reported one, which bearings do not correct
+    source: wp.int32  # the slot of its monitor, see source_monitor.py
     correlation_unknown: wp.int32  # whether it is an earlier source of information whose correlation is not known
 
 
 @wp.struct
-class Drift:
-    """A cumulative sum of steps with exponential forgetting, see sender_monitor.py."""
+class Source:
+    """A source of information and the monitor of its fault f, see source_monitor.py."""
 
-    sum: vec3d  # m
-    covariance: mat33d  # m^2
-
-
-@wp.struct
-class SenderMonitor:
-    """Fault tests of one sender, see sender_monitor.py; along the axes of the map."""
-
-    information_vector: vec3d  # 1/m: on the error of its position
-    information_matrix: mat33d  # 1/m^2: on that error
-    drift: Drift  # of its position from its odometry
-    slow_drift: Drift  # the same over a longer time
-    rejected_share: wp.float64  # mean share of bearings to it that fail the gate
-    fitted_time: wp.float64  # s for which bearings to it have passed the gate
-    self_inconsistent: wp.int32  # whether it was excluded because its reports contradict its odometry
+    target: wp.int32  # a landmark, or the number of landmarks plus a vehicle; -1: none
+    seen_tick: wp.int32  # when it was last in view
+    excluded: wp.int32
     exclusions: wp.int32  # how many so far
-    excluded_until: wp.int32  # the first tick at which it may be readmitted
+    vector: vec3d  # a, of the present block
+    sum: vec3d  # v, of the blocks of late
+    information: mat33d  # V, likewise
+    rejected: wp.float64  # mean share of its bearings that fail the gate
+    ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
+    offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
+    covariance: mat33d  # of that fault
+    joint: vec3d  # a of the blocks of late
+    deviates: wp.int32  # whether a sender deviates from landmarks and odometry
+    alone_offset: vec3d  # its fault if all senders have one
+    alone_covariance: mat33d  # of that fault
+    time: wp.float64  # s for which it has been excluded and in view
 
 
 @wp.struct
@@ -121,9 +120,9 @@ class JointBelief:
     depends_on: wp.uint64  # bits of vehicles
     rejected_share: wp.float64  # mean share of bearings that fail the gate
     healthy_time: wp.float64  # s for which it has been low
-    suspect: wp.int32  # the member that this frame's bearings contradict, 0: none
-    suspect_error: wp.float64  # m, of its position
-    suspect_fused: wp.int32  # whether the own pose has fused that error
+    open: wp.int32  # whether all bearings count, because most have failed the gate
+    open_time: wp.float64  # s for which they have counted
+    judged_time: wp.float64  # s since the monitors have last been looked at
     news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
 
 
@@ -178,15 +177,16 @@ class BearingMeasurement:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
     member: wp.int32  # its target; 0: a point in the map
-    reported_by: wp.int32  # the member whose report states that point, see solution_separation.py
+    source: wp.int32  # the slot of its monitor, -1: none
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
-    fits: wp.int32
+    fits: wp.int32  # 1: used, -1: only by the monitors, 0: not
     noise: wp.float64  # rad^2 per axis
     common_noise: wp.float64  # rad^2, the largest for any hypothesis
     distance: wp.float64  # m
     residual: vec2d  # rad
+    innovation: vec2d  # rad, what earlier bearings leave of it
     weight: mat22d  # 1/rad^2, inverse of the innovation's covariance
 
 
@@ -205,7 +205,6 @@ class Scratch:
     column: mat66d  # a block of the covariance
     row: mat66d  # another one, as it will be
     correction: vec6d
-    full_correction: vec6d  # the correction of a member that is considered, which is not carried out
     last_correction: vec6d  # at which the measurements were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
     pose: Pose  # before the correction
@@ -230,22 +229,11 @@ class Regressor:
 
 
 @wp.struct
-class LandmarkOnlySolution:
-    """The pose from landmarks and odometry alone, see solution_separation.py."""
-
-    begun: wp.int32  # 0 during a search, and after it was found wrong: it begins anew
-    exposed: wp.int32  # whether the belief has fused a sender since it was last set to this solution
-    tick: wp.int32  # of the last propagation
-    odometry: Pose  # of the belief, then
-    estimate: PoseEstimate
-
-
-@wp.struct
 class RobustMemory:
     """The memory of a world's observers.
 
     K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on, C correlations
-    of a message; other axes as in `coopenv.world.state`.
+    of a message, Q sources; other axes as in `coopenv.world.state`.
     """
 
     belief: array("WN", JointBelief)
@@ -253,7 +241,14 @@ class RobustMemory:
     P: array("WNKK", mat66d)  # blocks of the members' joint covariance
     anchor: array("WN", Anchor)
     search: array("WN", Search)
-    monitor: array("WNN", SenderMonitor)  # per receiver and sender
+    source: array("WNQ", Source)
+    sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
+    information: array("WNQQ", mat33d)  # on faults, below the diagonal
+    joint: array("WNTT", mat33d)  # on the faults of senders, likewise, of the blocks of late
+    doubt: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
+    effect: array("WAQ", mat23d)  # scratch: of an innovation by the fault of a source
+    nuisance: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors
+    nuisance_member: array("WK", wp.int32)  # scratch: the members whose errors they are
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", SenderReport)
     inbox: array("WNN", SenderReport)  # per receiver and sender
@@ -261,7 +256,6 @@ class RobustMemory:
     derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WK", Scratch)
     gain: array("WAK", mat26d)  # scratch: of a bearing in a member, transposed and not yet weighted, see correction.py
-    landmark_only: array("WN", LandmarkOnlySolution)
     outbox_correlation: array("WNSC", Correlation)
     correlation: array("WNNC", Correlation)  # per receiver and sender
     known: array("WK", Regressor)  # scratch
@@ -271,7 +265,17 @@ class RobustMemory:
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
 DERIVATIVES = 3  # the most errors that a bearing depends on
-ROBUST_SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1, "J": DERIVATIVES, "C": MAX_CORRELATIONS}
+SENDER_SLOTS, LANDMARK_SLOTS = MAX_MEMBERS - 1, 4
+SOURCES = 1 + SENDER_SLOTS + LANDMARK_SLOTS
+ROBUST_SIZES = {
+    "K": MAX_MEMBERS + MOUNTING,
+    "H": MAX_HYPOTHESES + 1,
+    "J": DERIVATIVES,
+    "C": MAX_CORRELATIONS,
+    "Q": SOURCES,
+    "T": SENDER_SLOTS,
+    "O": 1 + MOUNTING,
+}
 """Besides the hypotheses of one frame there is the prior."""
 
 
@@ -297,7 +301,6 @@ def clear(memory: Any, world: int, i: int):
     fill(memory.member[world, i], Member())
     fill_rows(memory.P[world, i], mat66d())
     fill(memory.hypothesis[world, i], Hypothesis())
-    fill(memory.monitor[world, i], SenderMonitor())
     fill(memory.outbox[world, i], SenderReport())
     never = SenderReport()
     never.tick = -1
@@ -306,6 +309,14 @@ def clear(memory: Any, world: int, i: int):
     fill(memory.measurement[world], BearingMeasurement())
     fill_rows(memory.derivative[world], Derivative())
     fill_rows(memory.gain[world], mat26d())
+    fill(memory.source[world, i], Source())
+    fill_rows(memory.sensitivity[world, i], mat63d())
+    fill_rows(memory.information[world, i], mat33d())
+    fill_rows(memory.joint[world, i], mat33d())
+    memory.doubt[world, i] = mat66d()
+    fill_rows(memory.effect[world], mat23d())
+    fill_rows(memory.nuisance[world], mat33d())
+    fill(memory.nuisance_member[world], 0)
 
 
 LARGE = numbers(LARGEST**3)
@@ -345,14 +356,15 @@ def robust_rules() -> dict[str, Rule]:
     """Return the rules of a saved memory by field, see `coopenv.world.state`."""
     members = ROBUST_SIZES["K"]
     flags = (
-        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.excluded member.considered "
-        "member.correlation_unknown outbox.news inbox.news member.report.news member.report.valid measurement.fits "
-        "belief.suspect_fused monitor.self_inconsistent landmark_only.begun landmark_only.exposed"
+        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
+        "member.correlation_unknown outbox.news inbox.news member.report.news member.report.valid "
+        "belief.open"
     )
-    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick landmark_only.tick"
+    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
-        "measurement.common_noise measurement.weight scratch.column gain monitor.information_matrix"
+        "measurement.common_noise measurement.weight scratch.column gain doubt effect sensitivity information "
+        "source.vector source.ratio source.sum source.information source.covariance source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
@@ -360,15 +372,19 @@ def robust_rules() -> dict[str, Rule]:
         **dict.fromkeys(large.split(), LARGE),
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
         **dict.fromkeys(("search.attempts", "belief.news_interval"), whole(0, 10**9)),
-        "monitor.exclusions": whole(0, MAX_EXCLUSIONS),
-        "monitor.excluded_until": whole(0, 2**31 - 1),
+        "source.target": whole(-1, "agents"),
+        "source.exclusions": whole(0, 10**9),
+        "source.deviates": FLAG,
+        "nuisance_member": whole(0, members - 1),
         "belief.members": whole(1, members),
-        "belief.suspect": whole(0, 0),
         "belief.others": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        **dict.fromkeys(("measurement.member", "measurement.reported_by"), whole(0, members - 1)),
+        "measurement.member": whole(0, members - 1),
+        "measurement.fits": whole(-1, 1),
+        "measurement.source": whole(-1, SOURCES - 1),
+        "member.source": whole(-1, SOURCES - 1),
         "derivative.member": whole(-1, members - 1),
         "known.member": whole(0, members - 1),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
@@ -381,5 +397,4 @@ def robust_rules() -> dict[str, Rule]:
     rules |= where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
-    solution = {"estimate.pose.R": ROTATION, "estimate.P": COVARIANCE, "odometry.R": ROTATION}
-    return rules | where("landmark_only.begun", {f"landmark_only.{name}": rule for name, rule in solution.items()})
+    return rules

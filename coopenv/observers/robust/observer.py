@@ -2,8 +2,9 @@
 
 A vehicle estimates a joint state of itself and of the vehicles that it receives. Bearings to landmarks and to vehicles
 correct it. A neighbour's message adds the information that is new since its last message. So no information counts
-twice, and the neighbour's slowly varying error does not count as white noise. Without a useful prior, or if most
-bearings fail the gate, the pose is searched for; during a search the vehicle broadcasts nothing.
+twice, and the neighbour's slowly varying error does not count as white noise. If most bearings fail the gate, all of
+them count for a while. If that does not help, or without a useful prior, the pose is searched for; during a search the
+vehicle broadcasts nothing.
 
 After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
 that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
@@ -32,14 +33,23 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
     with_noise,
 )
-from coopenv.observers.robust.belief import apply_error, begin_belief, own_estimate, set_anchor, set_block
+from coopenv.observers.robust.belief import (
+    apply_error,
+    begin_belief,
+    doubted_estimate,
+    own_estimate,
+    set_anchor,
+    set_block,
+)
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
-from coopenv.observers.robust.correlations import receive_broadcast, send_broadcast
+from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
+from coopenv.observers.robust.fault_hypotheses import judge_sources, test_excluded
 from coopenv.observers.robust.measurements import (
     RESECTION,
     TRACKING,
     innovation_squared,
+    innovation_weight,
     set_bearing_measurements,
 )
 from coopenv.observers.robust.memory import (
@@ -67,8 +77,8 @@ from coopenv.observers.robust.propagation import (
     walk_mounting,
 )
 from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
-from coopenv.observers.robust.sender_monitor import reset_monitors, test_innovations, test_rejected_bearings
-from coopenv.observers.robust.solution_separation import begin_broadcasts, separate
+from coopenv.observers.robust.source_monitor import correct_sources
+from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.world.embedded import Embedded
 from coopenv.world.v2x import start_covariance
@@ -79,24 +89,36 @@ from coopenv.world.warp_internals import device_function
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     """Linearise the bearings and gate them; return the share of rejected ones, the number of the others, and their NIS.
 
-    Bearings to excluded senders do not count in the share, which is -1 if none counts.
+    Bearings to excluded sources are not used and do not count in the share, which is -1 if none counts.
     """
     counted = int(0)
     missed = int(0)
     fitting = int(0)
     total = wp.float64(0.0)
+    all_count = frame.purpose == TRACKING and memory.belief[world, i].open == 1
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
-        fits = int(0)
-        if nis >= wp.float64(0.0) and nis < wp.float64(constants.BEARING_GATE):
-            fits = 1
-            total += nis
-        memory.measurement[world, n].fits = fits
-        fitting += fits
-        member = memory.measurement[world, n].member
-        if member == 0 or memory.member[world, i, member].excluded == 0:
+        ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
+        fits = ahead and nis < wp.float64(constants.BEARING_GATE)
+        q = memory.measurement[world, n].source
+        used = not is_excluded(memory, world, i, q)
+        if used:
             counted += 1
-            missed += 1 - fits
+            missed += wp.where(fits, 0, 1)
+        elif ahead:
+            test_excluded(frame, memory, world, i, n, q)
+        memory.measurement[world, n].fits = 0
+        if used and (fits or (all_count and ahead)):
+            memory.measurement[world, n].fits = 1
+            fitting += 1
+            total += nis
+        elif used and ahead and frame.purpose == TRACKING:  # for the monitors, limited to the gate
+            memory.measurement[world, n].fits = -1
+            memory.measurement[world, n].weight = innovation_weight(
+                memory, world, n, memory.measurement[world, n].noise
+            )
+            limit = wp.sqrt(wp.float64(constants.BEARING_GATE) / nis)
+            memory.measurement[world, n].innovation = limit * memory.measurement[world, n].residual
     share = wp.float64(-1.0)
     if counted > 0:
         share = wp.float64(missed) / wp.float64(counted)
@@ -113,7 +135,6 @@ def is_valid(estimate: PoseEstimate):
 @device_function
 def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
     """Begin a search whose prior is the anchor, propagated by odometry."""
-    reset_monitors(memory, world, i)
     anchor = memory.anchor[world, i]
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
@@ -123,29 +144,46 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
 
 
 @device_function
+def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
+    """Let all bearings count from when most fail the gate until few do; begin a search if that does not help."""
+    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
+    missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
+    memory.belief[world, i].rejected_share = missed
+    if missed > wp.float64(constants.LOST_SHARE):
+        memory.belief[world, i].open = 1
+    elif missed < wp.float64(constants.FOUND_SHARE):
+        memory.belief[world, i].open = 0
+        memory.belief[world, i].open_time = wp.float64(0.0)
+    memory.belief[world, i].open_time += wp.float64(memory.belief[world, i].open) * now.period
+    healthy = memory.belief[world, i].healthy_time + now.period
+    if missed >= wp.float64(constants.HEALTHY_SHARE):
+        healthy = wp.float64(0.0)
+    memory.belief[world, i].healthy_time = healthy
+    if memory.belief[world, i].open_time > wp.float64(constants.OPEN_TIME) and missed > wp.float64(
+        constants.LOST_SHARE
+    ):
+        declare_lost(model, memory, world, i, now.tick)
+    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_valid(own_estimate(memory, world, i)):
+        noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
+        set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
+
+
+@device_function
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: BearingFrame):
-    """Correct the belief by the bearings of a frame that pass the gate; begin a search if most fail."""
+    """Correct the belief by the bearings of a frame that pass the gate, and test all sources."""
     share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-        test_innovations(frame, memory, world, i, now)
-    if share < wp.float64(0.0):
-        return
-    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
-    missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
-    healthy = memory.belief[world, i].healthy_time + now.period
-    if missed >= wp.float64(constants.HEALTHY_SHARE):
-        healthy = wp.float64(0.0)
-    memory.belief[world, i].rejected_share = missed
-    test_rejected_bearings(memory, world, i, frame.bearings, now.period)
-    memory.belief[world, i].healthy_time = healthy
-    if missed > wp.float64(constants.LOST_SHARE):
-        declare_lost(model, memory, world, i, now.tick)
-    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_valid(own_estimate(memory, world, i)):
-        noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
-        set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
+        correct_sources(frame, memory, world, i)
+    memory.belief[world, i].judged_time += frame.period
+    block = memory.belief[world, i].judged_time
+    if block > wp.float64(constants.BLOCK_TIME - constants.SAME_TIME):
+        memory.belief[world, i].judged_time = wp.float64(0.0)
+        judge_sources(memory, world, i, block)
+    if share >= wp.float64(0.0):
+        note_rejections(model, memory, world, i, share, now)
 
 
 @device_function
@@ -210,7 +248,10 @@ ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # status of the own pose; found: by the 
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
     begin_belief(memory, world, i, estimate)
+    begin_sources(memory, world, i)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
+    memory.belief[world, i].open = 0
+    memory.belief[world, i].open_time = wp.float64(0.0)
     bits = wp.uint64(0)
     for n in range(model.target_count[i]):
         if model.targets[i, n] >= model.landmarks:
@@ -224,7 +265,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
-    estimate = own_estimate(memory, world, i)
+    estimate = doubted_estimate(memory, world, i)
     if memory.search[world, i].active == 1:
         estimate = memory.search[world, i].prior
         if memory.search[world, i].hypotheses > 0:
@@ -254,7 +295,9 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     set_anchor(memory, world, i, initial.P, 0)
     if not is_known(initial.P):
         begin_search(memory, world, i, initial)
-    begin_broadcasts(model, memory, world, i)
+    else:
+        memory.belief[world, i].depends_on = wp.uint64(0)  # an initial estimate depends on no sender
+    clear_broadcasts(memory, world, i)
     write(state, memory, world, i)
     receive_broadcast(model, state, memory, world, i)
 
@@ -312,7 +355,6 @@ def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
             correct(model, state, memory, world, i, now, standing)
         if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
             declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
-    separate(model, state, memory, world, i, now)
     write(state, memory, world, i)
     if now.due:
         state.corrected_tick[world, i] = now.tick

@@ -20,6 +20,7 @@ from coopenv.observers.robust.memory import (
     vec4d,
     vec6d,
 )
+from coopenv.observers.robust.sources import propagate_sources
 from coopenv.world.warp_internals import device_function
 
 
@@ -62,9 +63,16 @@ TWELFTH = 1.0 / 12.0
 
 
 @device_function
+def odometry_std(model: Any, i: int):
+    """Return the standard deviation of a gyro's sample, rad/s."""
+    return wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(constants.MIN_ANGULAR_VELOCITY_STD))
+
+
+@device_function
 def lasting_variances(model: Any, i: int):
     """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale (4,)."""
-    bias = vec3d(model.noise[i].gyro_bias)
+    least = wp.float64(constants.GYRO_BIAS) * odometry_std(model, i)
+    bias = wp.max(vec3d(model.noise[i].gyro_bias), vec3d(least))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale))
     return wp.cw_mul(errors, errors)
 
@@ -72,22 +80,20 @@ def lasting_variances(model: Any, i: int):
 @device_function
 def walk_variances(model: Any, i: int):
     """Return the growth of these variances per second."""
-    bias = vec3d(model.noise[i].gyro_bias_walk)
+    least = wp.float64(constants.GYRO_BIAS_WALK) * odometry_std(model, i)
+    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(least))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
     return wp.cw_mul(errors, errors)
 
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
-    """Begin the calibration states of odometry, member 1, and of the mounting, member 2, where errors are declared."""
+    """Begin the calibration states of odometry, member 1, and of the mounting, member 2, if its errors are declared."""
     lasting = lasting_variances(model, i)
     mounting = mounting_variances(model, i)
-    has_mounting = wp.max(mounting) > wp.float64(0.0)
-    if wp.max(lasting + walk_variances(model, i)) > wp.float64(0.0) or has_mounting:
-        one = wp.float64(1.0)  # entries without a state are arbitrary
-        variances = vec6d(lasting[0], lasting[1], lasting[2], lasting[3], one, one)
-        begin_calibration(memory, world, i, ERRORS, variances)
-    if has_mounting:
+    one = wp.float64(1.0)  # entries without a state are arbitrary
+    begin_calibration(memory, world, i, ERRORS, vec6d(lasting[0], lasting[1], lasting[2], lasting[3], one, one))
+    if wp.max(mounting) > wp.float64(0.0):
         variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
         begin_calibration(memory, world, i, MOUNTING, variances)
 
@@ -95,17 +101,14 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 @device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Inflate the covariance of the odometry's errors by their walk over dt."""
-    if memory.belief[world, i].others > ERRORS:
-        walk = walk_variances(model, i)
-        for k in range(4):
-            memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
+    walk = walk_variances(model, i)
+    for k in range(4):
+        memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
 
 
 @device_function
 def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return an increment over dt without the estimated errors, to first order in the bias."""
-    if memory.belief[world, i].others <= ERRORS:
-        return step
     bias = memory.member[world, i, ERRORS].w
     scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]
     turn = bias * dt
@@ -137,15 +140,15 @@ def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
 def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: Any):
     """Propagate the own pose by a corrected increment over dt, with noise and the remaining calibration errors."""
     propagate(memory, world, i, 0, step, noise)
-    if memory.belief[world, i].others > ERRORS:
-        G = errors_transition(memory, world, i, step, dt)
-        for k in range(memory.belief[world, i].members):
-            coupled = G * memory.P[world, i, ERRORS, k]
-            if k > 0:
-                set_block(memory, world, i, 0, k, memory.P[world, i, 0, k] + coupled)
-            else:
-                both = coupled + wp.transpose(coupled) + G * memory.P[world, i, ERRORS, ERRORS] * wp.transpose(G)
-                memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)
+    G = errors_transition(memory, world, i, step, dt)
+    for k in range(memory.belief[world, i].members):
+        coupled = G * memory.P[world, i, ERRORS, k]
+        if k > 0:
+            set_block(memory, world, i, 0, k, memory.P[world, i, 0, k] + coupled)
+        else:
+            both = coupled + wp.transpose(coupled) + G * memory.P[world, i, ERRORS, ERRORS] * wp.transpose(G)
+            memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)
+    propagate_sources(memory, world, i, step, G, dt)
 
 
 @device_function
@@ -155,13 +158,10 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
     They have the covariance of the vehicle's own calibration. A lasting error adds up like noise that is constant over
     the time `correlated`, s.
     """
-    noise = vec2d()
-    if memory.belief[world, i].others > ERRORS:
-        P = memory.P[world, i, ERRORS, ERRORS]
-        time = wp.max(correlated, dt)
-        noise[0] = wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) * dt * time
-        noise[1] = P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(constants.SAME_TIME))
-    return noise
+    P = memory.P[world, i, ERRORS, ERRORS]
+    time = wp.max(correlated, dt)
+    turning = wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) * dt * time
+    return vec2d(turning, P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(constants.SAME_TIME)))
 
 
 @device_function

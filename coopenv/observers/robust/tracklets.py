@@ -15,7 +15,7 @@ import warp as wp
 from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
-from coopenv.observers.robust.memory import Pose, PoseEstimate, SenderReport, mat66f, vec3d
+from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
 from coopenv.world.v2x import as_broadcast, claimed_std
 from coopenv.world.warp_internals import device_function
 
@@ -47,7 +47,7 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     """
     report = SenderReport()
     report.tick = tick
-    P = memory.P[world, i, 0, 0]
+    P = memory.P[world, i, 0, 0] + memory.doubt[world, i]
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):
@@ -86,23 +86,6 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: 
 
 
 @device_function
-def test_sender(memory: Any, world: int, i: int, n: int, reported: PoseEstimate, dt: Any):
-    """Exclude or readmit a sender by the distance of its new report, dt after the last one, from its estimate."""
-    estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-    agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.MESSAGE_GATE)
-    agreed = wp.float64(0.0)
-    excluded = wp.where(agrees, 0, 1)
-    if memory.member[world, i, n].excluded == 1:
-        away = algebra.left_error(estimated.pose, reported.pose)
-        agrees = algebra.distance_squared(estimated, reported) < wp.float64(constants.AGREEMENT_GATE)
-        if agrees and wp.length(away[3:]) < wp.float64(constants.AGREEMENT_DISTANCE):
-            agreed = memory.member[world, i, n].agreement_time + dt
-        excluded = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)
-    memory.member[world, i, n].agreement_time = agreed
-    memory.member[world, i, n].excluded = excluded
-
-
-@device_function
 def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n's report may contain this vehicle's own information."""
     return includes(memory.member[world, i, n].report.depends_on, i)
@@ -127,7 +110,7 @@ def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
     an order, as Assumption 1 of the paper requires.
     """
     shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].correlation_unknown == 1
-    if memory.member[world, i, n].considered == 0 or not shares:
+    if not shares:
         return False
     own = algebra.position_variance(memory.P[world, i, 0, 0])
     return algebra.position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own

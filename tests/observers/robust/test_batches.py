@@ -8,6 +8,7 @@ import pytest
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 from tests.helpers.builders import State, assert_same, constant, reset, scenario, simulate, start, vehicle
+from tests.helpers.robust_sources import scene
 from tests.helpers.warp_calls import DTYPES
 
 LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
@@ -94,6 +95,16 @@ def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, errors: dict
     other.set_state(saved)
     assert_same(saved, other.get_state())
     assert_same(straight, played(other, 90))
+
+
+def test_a_state_with_bearings_that_the_gate_rejects_is_accepted() -> None:
+    world, rejected = start(scene((1,), 6.0, kind="jump", start=2.0), [3]), False
+    while not rejected:
+        world.advance(6)
+        saved = world.get_state()
+        rejected = bool((saved["observer_measurement.fits"] < 0).any())
+    world.set_state(saved)
+    assert_same(saved, world.get_state())
 
 
 def test_a_saved_state_without_the_memory_is_refused() -> None:

@@ -18,7 +18,6 @@ from tests.helpers.robust_ticks import (
     LANDMARKS,
     MARKER,
     NOISE,
-    PERIOD,
     Pose,
     covariance,
     direction,
@@ -27,6 +26,7 @@ from tests.helpers.robust_ticks import (
     left_error,
     measured,
     pose_of,
+    predicted,
     started,
     tick,
 )
@@ -34,18 +34,19 @@ from tests.helpers.robust_ticks import (
 AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
 
 
-def least_cost(prior: Pose, P: np.ndarray, bearings: dict[int, np.ndarray]) -> tuple[Pose, np.ndarray]:
-    """Return the most probable pose and its covariance, from a prior and bearings to landmarks."""
+def least_cost(prior: Pose, P: np.ndarray, bearings: dict[int, np.ndarray]) -> tuple[Pose, np.ndarray, np.ndarray]:
+    """Return the most probable pose and calibration, and their covariance, from a prior and bearings to landmarks."""
     whiten = np.linalg.inv(np.linalg.cholesky(P))
 
-    def residuals(pose: Pose) -> np.ndarray:
+    def residuals(e: np.ndarray, about: np.ndarray) -> np.ndarray:
+        pose = displaced(displaced(prior, about[:6]), e[:6])
         seen = [(direction(pose, LANDMARKS[n]) - b) / NOISE.bearing for n, b in bearings.items()]
-        return np.concatenate([whiten @ left_error(prior, pose), *seen])
+        return np.concatenate([whiten @ [*left_error(prior, pose), *(about + e)[6:]], *seen])
 
-    found = least_squares(lambda e: residuals(displaced(prior, e)), np.zeros(6), x_scale="jac")
-    best = displaced(prior, found.x)
-    J = least_squares(lambda e: residuals(displaced(best, e)), np.zeros(6), max_nfev=1).jac
-    return best, np.linalg.inv(J.T @ J)
+    none = np.zeros(12)
+    best = least_squares(residuals, none, x_scale="jac", args=(none,)).x
+    J = least_squares(residuals, none, max_nfev=1, args=(best,)).jac
+    return displaced(prior, best[:6]), best[6:], np.linalg.inv(J.T @ J)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -58,8 +59,9 @@ def test_a_frame_of_landmarks_is_a_least_squares(angle: float, length: float, se
     bearings = {n: measured(truth, LANDMARKS[n], rng) for n in range(5)}
     observer = started(AT, P)
     observer.update(tick(observer, 1, bearings=bearings))
-    best, expected = least_cost(AT, P + np.diag(NOISE.odometry(PERIOD)), bearings)
-    off = left_error(best, pose_of(observer))
+    best, calibration, expected = least_cost(AT, predicted(P), bearings)
+    errors = observer.members[1]
+    off = np.concatenate([left_error(best, pose_of(observer)), [*errors["w"], *errors["v"]] - calibration])
     small = angle < 0.05
     assert np.sqrt(off @ np.linalg.solve(expected if small else observer.P, off)) < (0.1 if small else 2.0)
     ratio = eigvalsh(observer.P, expected)
@@ -98,7 +100,7 @@ def test_a_sender_s_error_is_considered(seed: int) -> None:
     truth = drawn(rng, AT, P)
     b = measured(truth, drawn(rng, there, Q)[1] + there[0] @ MARKER, rng)
     observer.update(tick(observer, 1, bearings={6: b}, messages={1: (message, 0.0)}))
-    P, Q = P + np.diag(NOISE.odometry(PERIOD)), sender.P
+    P, Q = predicted(P)[:6, :6], sender.P[:6, :6]
     pose, expected, cross = schmidt(AT, P, reported, Q, b)
     scale = np.sqrt(P.diagonal())
     assert_allclose(observer.members["pose"]["p"][-1], point, atol=1e-6)
@@ -110,7 +112,7 @@ def test_a_sender_s_error_is_considered(seed: int) -> None:
     at_marker = cross @ to_marker.T
     other = np.sqrt((to_marker @ Q @ to_marker.T).diagonal())
     assert np.abs(at_marker / np.outer(scale, other)).max() > 0.1
-    assert_allclose(observer.P[:6, 6:] / np.outer(scale, other), at_marker / np.outer(scale, other), atol=0.03)
+    assert_allclose(observer.P[:6, 12:] / np.outer(scale, other), at_marker / np.outer(scale, other), atol=0.03)
 
 
 def test_a_target_behind_the_camera_corrects_nothing() -> None:

@@ -98,11 +98,13 @@ def test_any_meetings_leave_a_belief_in_order(frames):
         members, P = observer.member_numbers, observer.P
         assert members[0] == 0 and observer.ignored_messages == 0
         assert len(set(members)) == len(members) <= MAX_MEMBERS
-        assert P.shape == (6 * len(members), 6 * len(members))
+        assert P.shape == (6 * len(members) + 6, 6 * len(members) + 6)  # with the odometry's errors
         np.testing.assert_array_equal(P, P.T)
         assert np.linalg.eigvalsh(P)[0] > 0.0
+        monitored = [observer.memory.source["target"][max(m["source"], 0)] - L for m in observer.others]
+        assert monitored == members[1:]
         room = MAX_MEMBERS - len(members)
         for v in in_view & set(heard):
             assert v in members or room == 0
         now = observer.units(time)
-        assert all(abs(m["seen_tick"] - now) <= 1 for m in observer.members[1:] if m["vehicle"] in in_view)
+        assert all(abs(m["seen_tick"] - now) <= 1 for m in observer.others if m["vehicle"] in in_view)

@@ -10,13 +10,11 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
 from coopenv.observers.robust.constants import LEAST_LEFT
 from coopenv.observers.robust.correlations import excess
 from coopenv.observers.robust.memory import Pose
-from coopenv.observers.robust.solution_separation import consistent_cost
 from tests.helpers.warp_calls import Calls
 
 
@@ -42,7 +40,6 @@ CALLS = Calls(
         inverse6: "66 > 66",
         is_regular: "66 66 1 > b",
         excess: "66 66 > 66",
-        consistent_cost: "i > 1",
     },
 )
 
@@ -107,12 +104,6 @@ def test_regularity_is_that_of_the_spectrum() -> None:
     clear = np.abs(np.log(condition / 1e6)) > 1e-3
     assert (regular == (condition < 1e6))[clear].all()
     assert 0 < regular.sum() < 200 and clear.sum() > 190
-
-
-def test_what_consistent_bearings_cost_is_a_quantile_of_chi_square() -> None:
-    costs = call(consistent_cost, np.arange(7))
-    assert costs[0] == 0.0
-    assert_allclose(costs[1:], chi2.ppf(0.999, 2 * np.arange(1, 7)), rtol=0.03)
 
 
 def test_a_sender_is_vaguer_where_what_is_told_of_it_contradicts_what_is_believed() -> None:

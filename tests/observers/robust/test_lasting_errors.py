@@ -39,12 +39,16 @@ def normalised_errors(world: World) -> np.ndarray:
     return errors / np.sqrt(np.einsum("wnii->wni", P)[..., :4])
 
 
-def test_nothing_is_carried_where_nothing_is_declared() -> None:
-    world = simulate(load_scenario("busy_intersection_tracking", ROBUST), 1)
+def test_a_small_bias_is_estimated_where_none_is_declared() -> None:
+    """Its prior deviation is a fifth of that of a gyro's sample, and the vehicle that sees landmarks reduces it."""
+    scenario = load_scenario("busy_intersection_tracking", ROBUST)
+    world, prior = simulate(scenario, 1), (0.2 * scenario.noise.angular_velocity) ** 2
     reset(world)
-    world.advance(6)
     memory: Any = world.memory
-    assert (memory.belief.numpy()["others"] == 1).all()
+    assert (memory.belief.numpy()["others"] == 2).all()
+    np.testing.assert_allclose(np.einsum("wnii->wni", memory.P.numpy()[:, :, 1, 1])[..., :3], prior)
+    world.advance(480)
+    assert (memory.P.numpy()[0, 0, 1, 1].diagonal()[:3] < 0.5 * prior).all()
 
 
 @pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY])

@@ -10,7 +10,18 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.contract import SensorNoise
-from tests.helpers.robust_ticks import NOISE, PERIOD, Pose, covariance, displaced, pose_of, started, tick
+from tests.helpers.robust_ticks import (
+    CALIBRATION,
+    NOISE,
+    PERIOD,
+    WALK,
+    Pose,
+    covariance,
+    displaced,
+    pose_of,
+    started,
+    tick,
+)
 
 AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
 TICKS = 90
@@ -37,21 +48,30 @@ def step(dt: float) -> Pose:
     return T[:3, :3], T[:3, 3]
 
 
+def rate_with_calibration() -> np.ndarray:
+    """Return the derivative of left errors, gyro bias and scale error by themselves at a constant twist."""
+    A = np.zeros((10, 10))
+    A[:6, :6], A[:3, 6:9], A[3:6, 9] = rate(), -np.eye(3), -V
+    return A
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_covariance_follows_its_differential_equation(seed: int) -> None:
-    P = covariance(np.random.default_rng(seed), 0.02, 0.05)
-    observer = started(AT, P)
+    P = np.zeros((10, 10))
+    P[:6, :6], P[6:, 6:] = covariance(np.random.default_rng(seed), 0.02, 0.05), CALIBRATION[:4, :4]
+    observer = started(AT, P[:6, :6])
     for k in range(1, TICKS + 1):
         observer.update(tick(observer, k, step(PERIOD)))
-    A, Q = rate(), np.diag(NOISE.odometry(1.0))
+    A, Q = rate_with_calibration(), np.diag([*NOISE.odometry(1.0), *[WALK**2] * 3, 0.0])
 
     def slope(t: float, x: np.ndarray) -> np.ndarray:
-        X = x.reshape(6, 6)
+        X = x.reshape(10, 10)
         return np.asarray(A @ X + X @ A.T + Q).ravel()
 
-    expected = solve_ivp(slope, (0.0, TICKS * PERIOD), P.ravel(), rtol=1e-9, atol=1e-12).y[:, -1].reshape(6, 6)
+    expected = solve_ivp(slope, (0.0, TICKS * PERIOD), P.ravel(), rtol=1e-9, atol=1e-14).y[:, -1].reshape(10, 10)
     scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
-    assert_allclose(observer.P / scale, expected / scale, atol=0.01)
+    assert_allclose(observer.P[:10, :10] / scale, expected / scale, atol=0.01)
+    assert np.abs(expected / scale)[:6, 6:9].max() > 0.05
     R, p = step(TICKS * PERIOD)
     assert_allclose(pose_of(observer)[0], AT[0] @ R, atol=1e-9)
     assert_allclose(pose_of(observer)[1], AT[1] + AT[0] @ p, atol=1e-9)
@@ -67,11 +87,7 @@ def test_what_lasts_is_in_the_covariance_as_in_drawn_trips(seed: int) -> None:
     observer = started(AT, P, noise=noise)
     for k in range(1, TICKS + 1):
         observer.update(tick(observer, k, step(PERIOD)))
-    B = np.zeros((6, 4))  # of the rates of both errors by bias and scale
-    B[:3, :3], B[3:, 3] = -np.eye(3), -V
-    whole = np.zeros((10, 10))
-    whole[:6, :6], whole[:6, 6:] = rate(), B
-    F = expm(TICKS * PERIOD * whole)
+    F = expm(TICKS * PERIOD * rate_with_calibration())
     start = np.zeros((10, 10))
     start[:6, :6], start[6:, 6:] = P, np.diag([*np.square(bias), scale**2])
     expected = F @ start @ F.T

@@ -1,0 +1,252 @@
+"""Hypotheses of faults: one source, or all senders that deviate from landmarks and odometry.
+
+All sources have the same prior odds, and several senders those of as many faults. The sources of a hypothesis that is
+nearly certain are excluded: the covariance grows by what the solution without them differs by, and what it is less
+certain. Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An
+excluded source is tested on, and readmitted when its bearings fit better without a fault than with the one it had.
+"""
+
+import math
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import block3, symmetric_part
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.belief import remove_member, set_block
+from coopenv.observers.robust.measurements import innovation_weight
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    SENDER_SLOTS,
+    SOURCES,
+    BearingFrame,
+    fill,
+    mat33d,
+    mat63d,
+    mat66d,
+    vec3d,
+)
+from coopenv.observers.robust.source_monitor import end_block, invert_blocks, joint_between
+from coopenv.observers.robust.sources import ODOMETRY, clear_source, is_active
+from coopenv.world.warp_internals import device_function
+
+ODDS = -2.0 * math.log(constants.FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
+
+
+@device_function
+def judge_senders(memory: Any, world: int, i: int, count: int):
+    """Return twice the log-likelihood ratio of faults of all senders to none, and how many of them deviate.
+
+    Their faults are those of the solution from landmarks and odometry alone.
+    """
+    least = wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)
+    for a in range(count):
+        q = memory.member[world, i, memory.nuisance_member[world, a]].source
+        for b in range(count):
+            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            memory.nuisance[world, a, b] = joint_between(memory, world, i, q, c)
+        memory.nuisance[world, a, a] += wp.float64(constants.ROUNDING) * memory.nuisance[world, a, a] + least
+    invert_blocks(memory, world, count)
+    deviating = int(0)
+    for a in range(count):
+        k = memory.nuisance_member[world, a]
+        q = memory.member[world, i, k].source
+        f = vec3d()
+        for b in range(count):
+            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            f = f + memory.nuisance[world, a, b] * memory.source[world, i, c].joint
+        memory.source[world, i, q].alone_offset = f
+        memory.source[world, i, q].alone_covariance = memory.nuisance[world, a, a]
+    for a in range(count):
+        k = memory.nuisance_member[world, a]
+        Rk = memory.member[world, i, k].pose.R
+        for b in range(count):
+            j = memory.nuisance_member[world, b]
+            Rj = memory.member[world, i, j].pose.R
+            memory.nuisance[world, a, b] += Rk * block3(memory.P[world, i, k, j], 3, 3) * wp.transpose(Rj)
+        q = memory.member[world, i, k].source
+        f = memory.source[world, i, q].alone_offset
+        size = wp.dot(f, wp.inverse(memory.nuisance[world, a, a]) * f)
+        memory.source[world, i, q].deviates = wp.where(size > wp.float64(constants.BEARING_GATE), 1, 0)
+        deviating += memory.source[world, i, q].deviates
+    invert_blocks(memory, world, count)
+    ratio = wp.float64(0.0)
+    for a in range(count):
+        q = memory.member[world, i, memory.nuisance_member[world, a]].source
+        for b in range(count):
+            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            f = memory.nuisance[world, a, b] * memory.source[world, i, c].alone_offset
+            ratio += wp.dot(memory.source[world, i, q].alone_offset, f)
+    return ratio, deviating
+
+
+@device_function
+def spread_of(memory: Any, world: int, i: int, q: int):
+    """Return what a fault of a source adds to the covariance of the source's error.
+
+    Bearings that the gate rejects do not pass into the estimate.
+    """
+    passed = wp.float64(1.0) - memory.source[world, i, q].rejected
+    f = memory.source[world, i, q].offset
+    return (passed * passed) * (memory.source[world, i, q].covariance + wp.outer(f, f))
+
+
+@device_function
+def withdraw(memory: Any, world: int, i: int, q: int):
+    """Add to the covariance what the solution without a source differs by, and what it is less certain.
+
+    The pose stays: how much of a recent fault has passed into it is not known, and the next bearings will show it.
+    """
+    spread = spread_of(memory, world, i, q)
+    for o in range(memory.belief[world, i].others):
+        X = memory.sensitivity[world, i, q, o] * spread
+        for j in range(o + 1):
+            block = memory.P[world, i, o, j] + X * wp.transpose(memory.sensitivity[world, i, q, j])
+            set_block(memory, world, i, o, j, block)
+    fill(memory.sensitivity[world, i, q], mat63d())
+
+
+@device_function
+def forget_faults(memory: Any, world: int, i: int):
+    """Begin all sums anew; excluded sources stay so."""
+    for c in range(SOURCES):
+        if is_active(memory, world, i, c):
+            memory.source[world, i, c].sum = vec3d()
+            memory.source[world, i, c].information = mat33d()
+            memory.source[world, i, c].joint = vec3d()
+    for a in range(SENDER_SLOTS):
+        for b in range(SENDER_SLOTS):
+            memory.joint[world, i, a, b] = mat33d()
+
+
+@device_function
+def exclude(memory: Any, world: int, i: int, q: int):
+    """Exclude a source; the own odometry is used on, with an uncertain scale."""
+    withdraw(memory, world, i, q)
+    if q == ODOMETRY:
+        admit_scale_error(memory, world, i)
+        return
+    f = memory.source[world, i, q].offset
+    clear_source(memory, world, i, q)
+    memory.source[world, i, q].offset = f
+    memory.source[world, i, q].excluded = 1
+    memory.source[world, i, q].exclusions += 1
+    memory.source[world, i, q].time = wp.float64(0.0)
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if memory.member[world, i, k].source == q:
+            remove_member(memory, world, i, k)
+            break
+
+
+@device_function
+def exclude_senders(memory: Any, world: int, i: int):
+    """Exclude all senders that deviate from landmarks and odometry."""
+    for q in range(1, 1 + SENDER_SLOTS):
+        if is_active(memory, world, i, q) and memory.source[world, i, q].deviates == 1:
+            memory.source[world, i, q].offset = memory.source[world, i, q].alone_offset
+            memory.source[world, i, q].covariance = memory.source[world, i, q].alone_covariance
+            exclude(memory, world, i, q)
+
+
+@device_function
+def set_doubt(memory: Any, world: int, i: int, most: Any, total: Any):
+    """Set `doubt`, what the hypotheses of single faults add to the covariance of the own pose.
+
+    A hypothesis of a probability w adds the covariance of the solution without the source and the square of its
+    distance, both times w.
+    """
+    doubt = mat66d()
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            w = weight_of(memory.source[world, i, q].ratio, most) / total
+            Phi = memory.sensitivity[world, i, q, 0]
+            doubt += w * (Phi * spread_of(memory, world, i, q) * wp.transpose(Phi))
+    memory.doubt[world, i] = symmetric_part(doubt)
+
+
+@device_function
+def judge_sources(memory: Any, world: int, i: int, time: Any):
+    """Weigh the hypotheses after a block of a time, s; exclude the source, or the senders, of one nearly certain.
+
+    Each hypothesis has the same prior odds, and that of several senders those of as many faults; that one is looked at
+    only where one source alone is suspicious.
+    """
+    count = end_block(memory, world, i, time)
+    memory.doubt[world, i] = mat66d()
+    if memory.belief[world, i].open == 1:  # bearings refuse the belief, which is no judge then
+        forget_faults(memory, world, i)
+        return
+    gate = wp.float64(constants.FAULT_GATE)
+    most = gate
+    worst = int(-1)
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q) and memory.source[world, i, q].ratio > most:
+            most = memory.source[world, i, q].ratio
+            worst = q
+    if worst < 0:
+        return
+    several = wp.float64(0.0)
+    if count > 1:
+        ratio, deviating = judge_senders(memory, world, i, count)
+        if deviating > 1:
+            several = ratio - gate * wp.float64(deviating - 1)
+    total = weight_of(gate, most) + weight_of(several, most)
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            total += weight_of(memory.source[world, i, q].ratio, most)
+    if several > most + wp.float64(ODDS):
+        exclude_senders(memory, world, i)
+        forget_faults(memory, world, i)
+    elif total < wp.float64(1.0 + constants.FAULT_RISK):
+        exclude(memory, world, i, worst)
+        forget_faults(memory, world, i)
+    else:
+        set_doubt(memory, world, i, most, total)
+
+
+@wp.func
+def weight_of(ratio: Any, most: Any):
+    """Return the weight of a hypothesis by its likelihood, relative to the most likely one's."""
+    return wp.exp(wp.float64(0.5) * (ratio - most))
+
+
+@device_function
+def admit_scale_error(memory: Any, world: int, i: int):
+    """Let the odometry's scale have the error that its velocity seems to have."""
+    f = memory.source[world, i, ODOMETRY].offset
+    covariance = memory.source[world, i, ODOMETRY].covariance
+    v = memory.belief[world, i].mean_v
+    square = wp.dot(v, v)
+    if square > wp.float64(constants.MIN_VELOCITY_STD * constants.MIN_VELOCITY_STD):
+        scale = wp.dot(v, f) / square
+        variance = wp.dot(v, covariance * v) / (square * square)
+        memory.member[world, i, ERRORS].v[0] -= scale
+        memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * scale + variance
+
+
+@device_function
+def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, q: int):
+    """Readmit an excluded source if its bearings fit well without an offset, and not with the one that it had.
+
+    Errors of the own pose are the same in many frames, so that all frames together count as one.
+    """
+    H = -(memory.derivative[world, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
+    W = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
+    share = wp.min(frame.period / wp.float64(constants.READMISSION_TIME), wp.float64(1.0))
+    HW = share * (wp.transpose(H) * W)
+    kept = wp.float64(1.0) - share
+    A = kept * memory.source[world, i, q].information + HW * H
+    a = kept * memory.source[world, i, q].sum + HW * memory.measurement[world, n].residual
+    memory.source[world, i, q].information = A
+    memory.source[world, i, q].sum = a
+    memory.source[world, i, q].time += frame.period
+    f = memory.source[world, i, q].offset
+    least = wp.float64(constants.ROUNDING) * wp.trace(A) + wp.float64(constants.MIN_VARIANCE)
+    present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
+    gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)
+    fits = present < wp.float64(constants.BEARING_GATE) and gain > wp.float64(constants.BEARING_GATE)
+    doublings = wp.min(memory.source[world, i, q].exclusions - 1, constants.MAX_DOUBLINGS)
+    least_time = wp.float64(constants.READMISSION_TIME) * wp.float64(1 << doublings)
+    if fits and memory.source[world, i, q].time > least_time:
+        memory.source[world, i, q].excluded = 0
+        clear_source(memory, world, i, q)

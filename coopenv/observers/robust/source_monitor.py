@@ -1,0 +1,240 @@
+"""One monitor per source of information: landmarks, senders and the vehicle's own odometry.
+
+A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
+reported position (m, map), or the error of the odometry's velocity (m/s, body). The own error depends on it by a
+sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
+covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
+
+Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
+Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
+f = V^-1 v, and twice the logarithm of its likelihood ratio to none is v^T f. The solution without the source is
+x + Phi f with the covariance P + Phi V^-1 Phi^T; it needs no filter of its own.
+Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear
+systems, IEEE Transactions on Automatic Control 21(1), 1976; Blanch et al., Baseline advanced RAIM user algorithm and
+possible improvements, IEEE Transactions on Aerospace and Electronic Systems 51(1), 2015, for solution separation.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import block3
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    MOUNTING,
+    SENDER_SLOTS,
+    SOURCES,
+    BearingFrame,
+    mat33d,
+    mat63d,
+    vec3d,
+)
+from coopenv.observers.robust.sources import ODOMETRY, is_active
+from coopenv.world.warp_internals import device_function
+
+
+@wp.func
+def by_blocks(G: Any, M: Any):
+    """Return G M for a 6x6 matrix that is zero but for its blocks of 3x3 on the diagonal, and M, 6x3."""
+    result = mat63d()
+    result[:3, :] = block3(G, 0, 0) * M[:3, :]
+    result[3:, :] = block3(G, 3, 3) * M[3:, :]
+    return result
+
+
+@device_function
+def share_of(frame: BearingFrame, memory: Any, world: int, n: int):
+    """Return the share of a bearing's information that counts: errors of messages are the same for `NEWS_TIME`."""
+    if memory.measurement[world, n].member == 0:
+        return wp.float64(1.0)
+    return wp.min(frame.period / wp.float64(constants.NEWS_TIME), wp.float64(1.0))
+
+
+@device_function
+def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
+    """Add the innovations of a frame to the vector of a source, and correct its sensitivities."""
+    others = memory.belief[world, i].others
+    turn = wp.transpose(memory.scratch[world, 0].pose.R)
+    own = memory.sensitivity[world, i, q, 0]
+    errors = memory.sensitivity[world, i, q, ERRORS]
+    mounting = memory.sensitivity[world, i, q, MOUNTING]
+    vector = memory.source[world, i, q].vector
+    for n in range(frame.bearings):
+        fits = memory.measurement[world, n].fits
+        if fits != 0:
+            H = memory.derivative[world, n, 0].jacobian
+            M = H * own
+            if frame.mounting > 0:
+                M = M + memory.derivative[world, n, 2].jacobian * mounting
+            if memory.measurement[world, n].source == q:
+                M = M - H[:, 3:] * turn
+            memory.effect[world, n, q] = M
+            WM = memory.measurement[world, n].weight * M
+            vector = vector + share_of(frame, memory, world, n) * (
+                wp.transpose(WM) * memory.measurement[world, n].innovation
+            )
+            if fits == 1:
+                own = own - wp.transpose(memory.gain[world, n, 0]) * WM
+                errors = errors - wp.transpose(memory.gain[world, n, ERRORS]) * WM
+                if others > MOUNTING:
+                    mounting = mounting - wp.transpose(memory.gain[world, n, MOUNTING]) * WM
+    memory.source[world, i, q].vector = vector
+    memory.sensitivity[world, i, q, 0] = by_blocks(memory.scratch[world, 0].recentring, own)
+    memory.sensitivity[world, i, q, ERRORS] = errors
+    if others > MOUNTING:
+        memory.sensitivity[world, i, q, MOUNTING] = by_blocks(memory.scratch[world, MOUNTING].recentring, mounting)
+
+
+@device_function
+def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
+    """Add the innovations of a correction to the information on all faults, and correct the sensitivities."""
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            correct_source(frame, memory, world, i, q)
+    weight = wp.min(frame.period / wp.float64(constants.LOST_TIME), wp.float64(1.0))
+    for n in range(frame.bearings):
+        q = memory.measurement[world, n].source
+        fits = memory.measurement[world, n].fits
+        if fits != 0 and q >= 0:
+            rejected = wp.where(fits == 1, wp.float64(0.0), wp.float64(1.0)) - memory.source[world, i, q].rejected
+            memory.source[world, i, q].rejected += weight * rejected
+    for n in range(frame.bearings):
+        if memory.measurement[world, n].fits != 0:
+            W = share_of(frame, memory, world, n) * memory.measurement[world, n].weight
+            for q in range(SOURCES):
+                if is_active(memory, world, i, q):
+                    MW = wp.transpose(memory.effect[world, n, q]) * W
+                    for c in range(q + 1):
+                        if is_active(memory, world, i, c):
+                            A = memory.information[world, i, q, c] + MW * memory.effect[world, n, c]
+                            memory.information[world, i, q, c] = A
+
+
+@device_function
+def information_between(memory: Any, world: int, i: int, q: int, c: int):
+    """Return A at (q, c); only one triangle is stored."""
+    if c <= q:
+        return memory.information[world, i, q, c]
+    return wp.transpose(memory.information[world, i, c, q])
+
+
+@device_function
+def invert_blocks(memory: Any, world: int, n: int):
+    """Invert the symmetric positive definite matrix of n x n blocks in `nuisance` by Gauss and Jordan's elimination."""
+    for p in range(n):
+        D = wp.inverse(memory.nuisance[world, p, p])
+        for j in range(n):
+            if j != p:
+                memory.nuisance[world, p, j] = D * memory.nuisance[world, p, j]
+        for k in range(n):
+            if k != p:
+                X = memory.nuisance[world, k, p]
+                for j in range(n):
+                    if j != p:
+                        memory.nuisance[world, k, j] = memory.nuisance[world, k, j] - X * memory.nuisance[world, p, j]
+                memory.nuisance[world, k, p] = -(X * D)
+        memory.nuisance[world, p, p] = D
+
+
+@device_function
+def eliminate_senders(memory: Any, world: int, i: int, scale: Any) -> int:
+    """Set `nuisance` to Pi, the covariance of the used senders' errors given all innovations; return how many."""
+    count = int(0)
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if is_active(memory, world, i, memory.member[world, i, k].source):
+            memory.nuisance_member[world, count] = k
+            for b in range(count + 1):
+                j = memory.nuisance_member[world, b]
+                Rk = memory.member[world, i, k].pose.R
+                Rj = memory.member[world, i, j].pose.R
+                X = scale * (Rk * block3(memory.P[world, i, k, j], 3, 3) * wp.transpose(Rj))
+                memory.nuisance[world, count, b] = X
+                memory.nuisance[world, b, count] = wp.transpose(X)
+            count += 1
+    invert_blocks(memory, world, count)
+    for a in range(count):
+        for b in range(count):
+            q = memory.member[world, i, memory.nuisance_member[world, a]].source
+            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            memory.nuisance[world, a, b] += information_between(memory, world, i, q, c)
+    invert_blocks(memory, world, count)
+    return count
+
+
+@device_function
+def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
+    """Return A_q Pi of a source and the b-th sender, 3x3."""
+    X = mat33d()
+    for a in range(count):
+        c = memory.member[world, i, memory.nuisance_member[world, a]].source
+        X = X + information_between(memory, world, i, q, c) * memory.nuisance[world, a, b]
+    return X
+
+
+@device_function
+def end_block(memory: Any, world: int, i: int, time: Any):
+    """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block."""
+    count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
+    kept = wp.exp(-time / wp.float64(constants.MONITOR_TIME))
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            V = memory.information[world, i, q, q]
+            v = memory.source[world, i, q].vector
+            for b in range(count):
+                c = memory.member[world, i, memory.nuisance_member[world, b]].source
+                X = coupling(memory, world, i, count, q, b)
+                V = V - X * information_between(memory, world, i, c, q)
+                v = v - X * memory.source[world, i, c].vector
+            V = kept * memory.source[world, i, q].information + wp.float64(0.5) * (V + wp.transpose(V))
+            v = kept * memory.source[world, i, q].sum + v
+            memory.source[world, i, q].information = V
+            memory.source[world, i, q].sum = v
+            least = wp.float64(constants.ROUNDING) * wp.trace(V) + wp.float64(constants.MIN_VARIANCE)
+            if q == ODOMETRY:
+                least = wp.float64(1.0) / wp.max(speed_error(memory, world, i), wp.float64(constants.MIN_VARIANCE))
+            covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
+            memory.source[world, i, q].covariance = covariance
+            memory.source[world, i, q].offset = covariance * v
+            memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
+    keep_joint(memory, world, i, kept)
+    clear_block(memory, world, i)
+    return count
+
+
+@device_function
+def keep_joint(memory: Any, world: int, i: int, kept: Any):
+    """Add the information of a block on the faults of all senders together to its sums."""
+    for a in range(1, 1 + SENDER_SLOTS):
+        if is_active(memory, world, i, a):
+            memory.source[world, i, a].joint = (
+                kept * memory.source[world, i, a].joint + memory.source[world, i, a].vector
+            )
+            for b in range(1, a + 1):
+                J = kept * memory.joint[world, i, a - 1, b - 1] + memory.information[world, i, a, b]
+                memory.joint[world, i, a - 1, b - 1] = J
+
+
+@device_function
+def joint_between(memory: Any, world: int, i: int, q: int, c: int):
+    """Return the joint information on the faults of two senders."""
+    if c <= q:
+        return memory.joint[world, i, q - 1, c - 1]
+    return wp.transpose(memory.joint[world, i, c - 1, q - 1])
+
+
+@device_function
+def speed_error(memory: Any, world: int, i: int):
+    """Return the variance, (m/s)^2, of the fault of the odometry's velocity: a share of the speed."""
+    share = wp.float64(constants.ODOMETRY_FAULT * constants.ODOMETRY_FAULT)
+    return share * wp.length_sq(memory.belief[world, i].mean_v)
+
+
+@device_function
+def clear_block(memory: Any, world: int, i: int):
+    """Clear the information of a block on the sources that are used."""
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            memory.source[world, i, q].vector = vec3d()
+            for c in range(q + 1):
+                memory.information[world, i, q, c] = mat33d()

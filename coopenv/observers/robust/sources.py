@@ -1,0 +1,139 @@
+"""The sources of a vehicle's information: a slot each for its odometry, senders and landmarks, with their monitors."""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.algebra import forward
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    SENDER_SLOTS,
+    SOURCES,
+    Pose,
+    Source,
+    fill,
+    mat33d,
+    mat63d,
+    mat66d,
+    vec3d,
+)
+from coopenv.world.warp_internals import device_function
+
+ODOMETRY = 0  # the slot of the own odometry; then those of senders, then those of landmarks
+NO_TARGET = -1
+
+
+@device_function
+def clear_source(memory: Any, world: int, i: int, q: int):
+    """Clear the information about a source."""
+    memory.source[world, i, q].rejected = wp.float64(0.0)
+    memory.source[world, i, q].vector = vec3d()
+    memory.source[world, i, q].sum = vec3d()
+    memory.source[world, i, q].joint = vec3d()
+    if q > 0 and q <= SENDER_SLOTS:
+        for c in range(SENDER_SLOTS):
+            memory.joint[world, i, q - 1, c] = mat33d()
+            memory.joint[world, i, c, q - 1] = mat33d()
+    memory.source[world, i, q].information = mat33d()
+    fill(memory.sensitivity[world, i, q], mat63d())
+    for c in range(SOURCES):
+        memory.information[world, i, q, c] = mat33d()
+        memory.information[world, i, c, q] = mat33d()
+
+
+@device_function
+def free_source(memory: Any, world: int, i: int, q: int):
+    """Empty a slot."""
+    clear_source(memory, world, i, q)
+    memory.source[world, i, q] = Source()
+    memory.source[world, i, q].target = NO_TARGET
+
+
+@device_function
+def begin_sources(memory: Any, world: int, i: int):
+    """Begin without any information about sources; all are used."""
+    memory.doubt[world, i] = mat66d()
+    for q in range(SOURCES):
+        free_source(memory, world, i, q)
+
+
+@device_function
+def slot_of(memory: Any, world: int, i: int, target: int) -> int:
+    """Return the slot of a target, -1 if it has none."""
+    for q in range(1, SOURCES):
+        if memory.source[world, i, q].target == target:
+            return q
+    return -1
+
+
+@device_function
+def is_held(memory: Any, world: int, i: int, q: int) -> bool:
+    """Return whether a slot is that of a member."""
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if memory.member[world, i, k].source == q:
+            return True
+    return False
+
+
+@device_function
+def longest_unseen_slot(memory: Any, world: int, i: int, first: int, last: int) -> int:
+    """Return the free slot, or else that of the source unseen for longest, among some slots; -1 if members hold all."""
+    found = int(-1)
+    for q in range(first, last):
+        if memory.source[world, i, q].target == NO_TARGET:
+            return q
+        if not is_held(memory, world, i, q):
+            if found < 0 or memory.source[world, i, q].seen_tick < memory.source[world, i, found].seen_tick:
+                found = q
+    return found
+
+
+@device_function
+def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any) -> int:
+    """Return the slot of a target, a new one if there is room, else -1; note that it is in view.
+
+    A member needs a slot, which it takes from a source that is no member; a landmark takes one only from a source that
+    has been out of view for `FORGET_TIME`.
+    """
+    q = slot_of(memory, world, i, target)
+    if q < 0:
+        first = wp.where(landmark, 1 + SENDER_SLOTS, 1)
+        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, SOURCES, 1 + SENDER_SLOTS))
+        if landmark and q >= 0 and memory.source[world, i, q].target != NO_TARGET:
+            unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
+            q = wp.where(unseen > wp.float64(constants.FORGET_TIME), q, -1)
+        if q >= 0:
+            free_source(memory, world, i, q)
+            memory.source[world, i, q].target = target
+    if q >= 0:
+        memory.source[world, i, q].seen_tick = tick
+    return q
+
+
+@device_function
+def is_active(memory: Any, world: int, i: int, q: int) -> bool:
+    """Return whether a slot is of a source that is used."""
+    active = q == ODOMETRY or memory.source[world, i, q].target != NO_TARGET
+    return active and memory.source[world, i, q].excluded == 0
+
+
+@device_function
+def is_excluded(memory: Any, world: int, i: int, q: int) -> bool:
+    """Return whether the source of a slot is excluded; False for -1."""
+    if q < 0:
+        return False
+    return memory.source[world, i, q].excluded == 1
+
+
+@device_function
+def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: Any):
+    """Carry the sensitivities through an increment of odometry over dt; G: of the own error by the odometry's."""
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            Phi = forward(step, memory.sensitivity[world, i, q, 0]) + G * memory.sensitivity[world, i, q, ERRORS]
+            if q == ODOMETRY:
+                E = dt * wp.transpose(step.R)
+                for k in range(3):
+                    Phi[k + 3] = Phi[k + 3] + E[k]
+            memory.sensitivity[world, i, q, 0] = Phi
