@@ -94,7 +94,7 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(DOCS / "agents.md", "class Mine")
-    assert "arrival_rate: 0.8" in capsys.readouterr().out
+    assert "arrival_rate: 0.9" in capsys.readouterr().out
     (tmp_path / "mine.py").write_text(python_blocks(DOCS / "agents.md")[1], encoding="utf-8")
     scenario = load_scenario("urban_crossing")
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)

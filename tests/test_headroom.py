@@ -64,7 +64,7 @@ def test_errors_depend_on_what_is_sensed(environment: str) -> None:
     sensed = figures(environment, "route_follower")
     ideal, blind = (figures(environment, "route_follower", how, 1) for how in ("ideal", "blind"))
     assert ideal["e95_m"][2] < 0.5 * sensed["e95_m"][1]
-    assert sensed["e50_m"][0] < blind["e50_m"][1]
+    assert sensed["e50_m"][2] < blind["e50_m"][1]  # these intervals are apart, too
     assert ideal["arrival_rate"][0] > 0.97
 
 

@@ -59,7 +59,7 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
         assert (folder / "lost.png").stat().st_size > 20_000
         error = [info["position_error"] for info in program["infos"].values()]
         assert max(error[:4]) < 0.2 < error[4]  # as the page says
-        assert 0.1 < error[4] / program["infos"]["vehicle_5"]["position_std"] < 3.0
+        assert 0.3 < error[4] / program["infos"]["vehicle_5"]["position_std"] < 3.0
     elif page == "tutorials/own_observer.md":
         rows = program["found"].rows
         mean = {

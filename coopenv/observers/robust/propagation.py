@@ -63,16 +63,9 @@ TWELFTH = 1.0 / 12.0
 
 
 @device_function
-def odometry_std(model: Any, i: int):
-    """Return the standard deviation of a gyro's sample, rad/s."""
-    return wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(constants.MIN_ANGULAR_VELOCITY_STD))
-
-
-@device_function
 def lasting_variances(model: Any, i: int):
-    """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale (4,)."""
-    least = wp.float64(constants.GYRO_BIAS) * odometry_std(model, i)
-    bias = wp.max(vec3d(model.noise[i].gyro_bias), vec3d(least))
+    """Return the variances of the gyro's bias per axis, `GYRO_BIAS` at least, and of the odometry's scale (4,)."""
+    bias = wp.max(vec3d(model.noise[i].gyro_bias), vec3d(wp.float64(constants.GYRO_BIAS)))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale))
     return wp.cw_mul(errors, errors)
 
@@ -80,8 +73,7 @@ def lasting_variances(model: Any, i: int):
 @device_function
 def walk_variances(model: Any, i: int):
     """Return the growth of these variances per second."""
-    least = wp.float64(constants.GYRO_BIAS_WALK) * odometry_std(model, i)
-    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(least))
+    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS_WALK)))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
     return wp.cw_mul(errors, errors)
 
