@@ -107,24 +107,6 @@ def wrong_velocity(recording: Recording, offset: ArrayLike) -> Recording:
     return replace(recording, translation=translation, velocity=recording.velocity + offset)
 
 
-def gyro_bias(recording: Recording, bias: ArrayLike, start: float) -> Recording:
-    """Return a recording whose gyros have a bias, rad/s, from a time on."""
-    late, w = recording.t > start, np.asarray(bias)
-    rotation, rate = recording.rotation.copy(), recording.angular_velocity.copy()
-    rotation[late] = rotation[late] @ Rotation.from_rotvec(w * recording.dt).as_matrix()
-    rate[late] += w
-    return replace(recording, rotation=rotation, angular_velocity=rate)
-
-
-def random_bearings(recording: Recording, share: float, seed: int = 0) -> Recording:
-    """Return a recording of which a share of bearings are random directions."""
-    rng = np.random.default_rng(seed)
-    wrong = recording.visible & (rng.random(recording.visible.shape) < share)
-    bearings, drawn = recording.bearings.copy(), rng.normal(size=(wrong.sum(), 3))
-    bearings[wrong] = drawn / np.linalg.norm(drawn, axis=1)[:, None]
-    return replace(recording, bearings=bearings)
-
-
 @dataclass
 class Lies:
     """A vehicle says that it is elsewhere by an offset, for some time; its odometry agrees with what it says."""

@@ -3,7 +3,7 @@
 All sources have the same prior odds, and several senders those of as many faults. The sources of a hypothesis that is
 nearly certain are excluded: the covariance grows by what the solution without them differs by, and what it is less
 certain. Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An
-excluded source is tested on, and readmitted when its bearings fit better without a fault than with the one it had.
+excluded source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, symmetric_part
+from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.belief import remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
@@ -26,7 +26,13 @@ from coopenv.observers.robust.memory import (
     mat66d,
     vec3d,
 )
-from coopenv.observers.robust.source_monitor import end_block, invert_blocks, joint_between
+from coopenv.observers.robust.source_monitor import (
+    end_block,
+    invert_blocks,
+    joint_between,
+    reported_covariance,
+    source_at,
+)
 from coopenv.observers.robust.sources import ODOMETRY, clear_source, is_active
 from coopenv.world.warp_internals import device_function
 
@@ -41,30 +47,26 @@ def judge_senders(memory: Any, world: int, i: int, count: int):
     """
     least = wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)
     for a in range(count):
-        q = memory.member[world, i, memory.nuisance_member[world, a]].source
+        q = source_at(memory, world, i, a)
         for b in range(count):
-            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            c = source_at(memory, world, i, b)
             memory.nuisance[world, a, b] = joint_between(memory, world, i, q, c)
         memory.nuisance[world, a, a] += wp.float64(constants.ROUNDING) * memory.nuisance[world, a, a] + least
     invert_blocks(memory, world, count)
     deviating = int(0)
     for a in range(count):
-        k = memory.nuisance_member[world, a]
-        q = memory.member[world, i, k].source
+        q = source_at(memory, world, i, a)
         f = vec3d()
         for b in range(count):
-            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            c = source_at(memory, world, i, b)
             f = f + memory.nuisance[world, a, b] * memory.source[world, i, c].joint
         memory.source[world, i, q].alone_offset = f
         memory.source[world, i, q].alone_covariance = memory.nuisance[world, a, a]
     for a in range(count):
         k = memory.nuisance_member[world, a]
-        Rk = memory.member[world, i, k].pose.R
         for b in range(count):
-            j = memory.nuisance_member[world, b]
-            Rj = memory.member[world, i, j].pose.R
-            memory.nuisance[world, a, b] += Rk * block3(memory.P[world, i, k, j], 3, 3) * wp.transpose(Rj)
-        q = memory.member[world, i, k].source
+            memory.nuisance[world, a, b] += reported_covariance(memory, world, i, k, memory.nuisance_member[world, b])
+        q = source_at(memory, world, i, a)
         f = memory.source[world, i, q].alone_offset
         size = wp.dot(f, wp.inverse(memory.nuisance[world, a, a]) * f)
         memory.source[world, i, q].deviates = wp.where(size > wp.float64(constants.BEARING_GATE), 1, 0)
@@ -72,9 +74,9 @@ def judge_senders(memory: Any, world: int, i: int, count: int):
     invert_blocks(memory, world, count)
     ratio = wp.float64(0.0)
     for a in range(count):
-        q = memory.member[world, i, memory.nuisance_member[world, a]].source
+        q = source_at(memory, world, i, a)
         for b in range(count):
-            c = memory.member[world, i, memory.nuisance_member[world, b]].source
+            c = source_at(memory, world, i, b)
             f = memory.nuisance[world, a, b] * memory.source[world, i, c].alone_offset
             ratio += wp.dot(memory.source[world, i, q].alone_offset, f)
     return ratio, deviating

@@ -138,6 +138,19 @@ def invert_blocks(memory: Any, world: int, n: int):
 
 
 @device_function
+def reported_covariance(memory: Any, world: int, i: int, k: int, j: int):
+    """Return the covariance (3, 3), m^2 and map frame, of the reported positions of two members."""
+    P = block3(memory.P[world, i, k, j], 3, 3)
+    return memory.member[world, i, k].pose.R * P * wp.transpose(memory.member[world, i, j].pose.R)
+
+
+@device_function
+def source_at(memory: Any, world: int, i: int, a: int) -> int:
+    """Return the slot of the a-th sender in `nuisance`."""
+    return memory.member[world, i, memory.nuisance_member[world, a]].source
+
+
+@device_function
 def eliminate_senders(memory: Any, world: int, i: int, scale: Any) -> int:
     """Set `nuisance` to Pi, the covariance of the used senders' errors given all innovations; return how many."""
     count = int(0)
@@ -145,19 +158,15 @@ def eliminate_senders(memory: Any, world: int, i: int, scale: Any) -> int:
         if is_active(memory, world, i, memory.member[world, i, k].source):
             memory.nuisance_member[world, count] = k
             for b in range(count + 1):
-                j = memory.nuisance_member[world, b]
-                Rk = memory.member[world, i, k].pose.R
-                Rj = memory.member[world, i, j].pose.R
-                X = scale * (Rk * block3(memory.P[world, i, k, j], 3, 3) * wp.transpose(Rj))
+                X = scale * reported_covariance(memory, world, i, k, memory.nuisance_member[world, b])
                 memory.nuisance[world, count, b] = X
                 memory.nuisance[world, b, count] = wp.transpose(X)
             count += 1
     invert_blocks(memory, world, count)
     for a in range(count):
         for b in range(count):
-            q = memory.member[world, i, memory.nuisance_member[world, a]].source
-            c = memory.member[world, i, memory.nuisance_member[world, b]].source
-            memory.nuisance[world, a, b] += information_between(memory, world, i, q, c)
+            X = information_between(memory, world, i, source_at(memory, world, i, a), source_at(memory, world, i, b))
+            memory.nuisance[world, a, b] += X
     invert_blocks(memory, world, count)
     return count
 
@@ -167,7 +176,7 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
     """Return A_q Pi of a source and the b-th sender, 3x3."""
     X = mat33d()
     for a in range(count):
-        c = memory.member[world, i, memory.nuisance_member[world, a]].source
+        c = source_at(memory, world, i, a)
         X = X + information_between(memory, world, i, q, c) * memory.nuisance[world, a, b]
     return X
 
@@ -182,7 +191,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             V = memory.information[world, i, q, q]
             v = memory.source[world, i, q].vector
             for b in range(count):
-                c = memory.member[world, i, memory.nuisance_member[world, b]].source
+                c = source_at(memory, world, i, b)
                 X = coupling(memory, world, i, count, q, b)
                 V = V - X * information_between(memory, world, i, c, q)
                 v = v - X * memory.source[world, i, c].vector

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from benchmarks.evidence import CHANGES, STEP_AT
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import BLOCK_TIME, FAULT_GATE, MONITOR_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
@@ -220,10 +221,10 @@ def test_a_sender_that_lies_costs_little() -> None:
 
 def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
     """Of 1 deg/s from 12 s on."""
-    ratios = [
-        cost(watch(faults.gyro_bias(busy(24.0, seed), (0.0, 0.0, 0.01745), 12.0)), usual(busy, 24.0, seed), 12.0)
-        for seed in range(4)
-    ]
+    step, ratios = CHANGES["gyro bias steps to 1 deg/s at 12 s"], []
+    for seed in range(4):
+        without = usual(busy, 24.0, seed)
+        ratios.append(cost(watch(step(without.recording, np.random.default_rng(seed))), without, STEP_AT))
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)
 
 
@@ -241,7 +242,7 @@ def test_random_bearings_cost_little(make: Callable[..., Recording]) -> None:
     ratios = []
     for seed in range(3):
         without = usual(make, 16.0, seed)
-        found = watch(faults.random_bearings(without.recording, 0.1, seed))
+        found = watch(CHANGES["10 % of the bearings random"](without.recording, np.random.default_rng(seed)))
         assert not found.excluded()
         ratios.append(cost(found, without, 5.0))
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)
