@@ -75,6 +75,7 @@ order changes too often, and at 0.5 many bearings are unused."""
 LEAST_NEWS = 0.1
 """Share of a sender's variance that counts as noise of its increment: linearisation errors of small corrections add up.
 Tuned."""
+LEAST_STEP = 0.003  # share of a sender's variance that its monitor adds to that of a step. Chosen: small
 STEP_GATE = 22.5
 """Gate of the squared size of such an increment in standard deviations: chi-square of 6, 0.999."""
 MAX_SENDER_ANGLE = 0.01

@@ -14,12 +14,13 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import PoseEstimate, mat66d, vec6d
+from coopenv.observers.robust.memory import PoseEstimate, mat33d, mat66d, vec6d
+from coopenv.observers.robust.source_monitor import add_step
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
 from coopenv.observers.robust.tracklets import bit_of, depends_on_own, includes, propagate_member
 from coopenv.world.camera import VISIBLE
@@ -103,9 +104,25 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
         memory.scratch[world, k].correction = gain * d
         for j in range(k, members):
             set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, j].column)
+    q = memory.member[world, i, n].source
+    if q >= 0:
+        for k in range(others):
+            e = memory.steps_effect[world, i, q - 1, k] - memory.scratch[world, k].correction
+            memory.steps_effect[world, i, q - 1, k] = e
     for k in range(others, members):
         memory.scratch[world, k].correction = vec6d()
     apply_corrections(memory, world, i)
+
+
+@device_function
+def note_step(memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any):
+    """Hand a step of member n's report to its monitor."""
+    R = memory.member[world, i, n].pose.R
+    N = block3(before - after + more, 3, 3)
+    if wp.trace(N) < wp.float64(0.0):
+        N = mat33d()
+    N = N + wp.float64(constants.LEAST_STEP) * block3(before, 3, 3)
+    add_step(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
 @device_function
@@ -129,6 +146,7 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
     N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
+    note_step(memory, world, i, n, d, before, after, more)
     variance = algebra.position_variance(before)
     reach = wp.float64(constants.MAX_SENDER_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):

@@ -33,7 +33,8 @@ from coopenv.observers.robust.source_monitor import (
     reported_covariance,
     source_at,
 )
-from coopenv.observers.robust.sources import ODOMETRY, clear_source, is_active
+from coopenv.observers.robust.sources import ODOMETRY, clear_source, clear_steps, is_active, is_sender
+from coopenv.observers.robust.tracklets import includes
 from coopenv.world.warp_internals import device_function
 
 ODDS = -2.0 * math.log(constants.FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
@@ -109,6 +110,16 @@ def withdraw(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
+def withdraw_steps(memory: Any, world: int, i: int, q: int):
+    """Add to the covariance the square of what a sender's steps have passed into the estimate."""
+    for o in range(memory.belief[world, i].others):
+        for j in range(o + 1):
+            a = memory.steps_effect[world, i, q - 1, o]
+            block = memory.P[world, i, o, j] + wp.outer(a, memory.steps_effect[world, i, q - 1, j])
+            set_block(memory, world, i, o, j, block)
+
+
+@device_function
 def forget_faults(memory: Any, world: int, i: int):
     """Begin all sums anew; excluded sources stay so."""
     for c in range(SOURCES):
@@ -116,28 +127,74 @@ def forget_faults(memory: Any, world: int, i: int):
             memory.source[world, i, c].sum = vec3d()
             memory.source[world, i, c].information = mat33d()
             memory.source[world, i, c].joint = vec3d()
+            if is_sender(c):
+                clear_steps(memory, world, i, c)
     for a in range(SENDER_SLOTS):
         for b in range(SENDER_SLOTS):
             memory.joint[world, i, a, b] = mat33d()
 
 
 @device_function
+def member_of(memory: Any, world: int, i: int, q: int) -> int:
+    """Return the member whose slot one is, 0 if there is none."""
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if memory.member[world, i, k].source == q:
+            return k
+    return 0
+
+
+@device_function
 def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; the own odometry is used on, with an uncertain scale."""
-    withdraw(memory, world, i, q)
     if q == ODOMETRY:
+        withdraw(memory, world, i, q)
         admit_scale_error(memory, world, i)
         return
+    if drifts(memory, world, i, q):
+        withdraw_steps(memory, world, i, q)
+        memory.source[world, i, q].offset = -memory.source[world, i, q].steps
+    else:
+        withdraw(memory, world, i, q)
     f = memory.source[world, i, q].offset
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
     memory.source[world, i, q].excluded = 1
     memory.source[world, i, q].exclusions += 1
     memory.source[world, i, q].time = wp.float64(0.0)
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if memory.member[world, i, k].source == q:
-            remove_member(memory, world, i, k)
-            break
+    k = member_of(memory, world, i, q)
+    if k > 0:
+        remove_member(memory, world, i, k)
+
+
+@device_function
+def drifts(memory: Any, world: int, i: int, q: int) -> bool:
+    """Return whether a sender nearly certainly drifts from its own odometry."""
+    certain = wp.float64(constants.FAULT_GATE + ODDS)
+    return is_sender(q) and is_active(memory, world, i, q) and memory.source[world, i, q].steps_ratio > certain
+
+
+@device_function
+def is_misled(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
+    """Return whether a sender depends on another one whose fault would explain its drift."""
+    depends_on = memory.member[world, i, member_of(memory, world, i, q)].report.depends_on
+    for c in range(1, 1 + SENDER_SLOTS):
+        vehicle = memory.source[world, i, c].target - landmarks
+        if c != q and is_active(memory, world, i, c) and includes(depends_on, vehicle):
+            evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].steps_ratio)
+            if evidence > wp.float64(ODDS):
+                return True
+    return False
+
+
+@device_function
+def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
+    """Exclude all senders that drift, and return whether there are any; no other fault explains their steps."""
+    found = bool(False)
+    for q in range(1, 1 + SENDER_SLOTS):
+        if drifts(memory, world, i, q) and not is_misled(memory, world, i, q, landmarks):
+            exclude(memory, world, i, q)
+            found = True
+    return found
 
 
 @device_function
@@ -167,7 +224,7 @@ def set_doubt(memory: Any, world: int, i: int, most: Any, total: Any):
 
 
 @device_function
-def judge_sources(memory: Any, world: int, i: int, time: Any):
+def judge_sources(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source, or the senders, of one nearly certain.
 
     Each hypothesis has the same prior odds, and that of several senders those of as many faults; that one is looked at
@@ -176,6 +233,9 @@ def judge_sources(memory: Any, world: int, i: int, time: Any):
     count = end_block(memory, world, i, time)
     memory.doubt[world, i] = mat66d()
     if memory.belief[world, i].open == 1:  # bearings refuse the belief, which is no judge then
+        forget_faults(memory, world, i)
+        return
+    if exclude_drifting(memory, world, i, landmarks):
         forget_faults(memory, world, i)
         return
     gate = wp.float64(constants.FAULT_GATE)

@@ -99,6 +99,10 @@ class Source:
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault
+    steps: vec3d  # m, sum of the steps of a sender's report that its odometry does not explain, of late
+    steps_vector: vec3d  # their sum, weighted by the inverse of the covariance that each has without a fault
+    steps_information: mat33d  # the sum of these weights
+    steps_ratio: wp.float64  # like `ratio`, of a drift of the sender
     joint: vec3d  # a of the blocks of late
     deviates: wp.int32  # whether a sender deviates from landmarks and odometry
     alone_offset: vec3d  # its fault if all senders have one
@@ -243,6 +247,7 @@ class RobustMemory:
     search: array("WN", Search)
     source: array("WNQ", Source)
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
+    steps_effect: array("WNTO", vec6d)  # likewise, by all steps of a sender as they have come
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
     joint: array("WNTT", mat33d)  # on the faults of senders, likewise, of the blocks of late
     doubt: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
@@ -359,7 +364,9 @@ def robust_rules() -> dict[str, Rule]:
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
         "measurement.common_noise measurement.weight scratch.column gain doubt effect sensitivity information "
-        "source.vector source.ratio source.sum source.information source.covariance source.offset"
+        "steps_effect source.steps source.steps_vector source.steps_information source.steps_ratio source.vector "
+        "source.ratio source.sum source.information source.covariance "
+        "source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),

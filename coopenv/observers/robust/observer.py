@@ -181,7 +181,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     block = memory.belief[world, i].judged_time
     if block > wp.float64(constants.BLOCK_TIME - constants.SAME_TIME):
         memory.belief[world, i].judged_time = wp.float64(0.0)
-        judge_sources(memory, world, i, block)
+        judge_sources(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
         note_rejections(model, memory, world, i, share, now)
 

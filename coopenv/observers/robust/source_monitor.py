@@ -9,6 +9,10 @@ Senders have errors within their covariance without a fault. These are eliminate
 Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
 f = V^-1 v, and twice the logarithm of its likelihood ratio to none is v^T f. The solution without the source is
 x + Phi f with the covariance P + Phi V^-1 Phi^T; it needs no filter of its own.
+
+A sender's reports are also held against its own odometry. A step d of a report that the odometry does not explain has
+the covariance N that fuse_increment derives; a drift gives all steps the same mean. If the steps are a fault, the own
+error that they have caused is `steps_effect`.
 Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear
 systems, IEEE Transactions on Automatic Control 21(1), 1976; Blanch et al., Baseline advanced RAIM user algorithm and
 possible improvements, IEEE Transactions on Aerospace and Electronic Systems 51(1), 2015, for solution separation.
@@ -30,7 +34,7 @@ from coopenv.observers.robust.memory import (
     mat63d,
     vec3d,
 )
-from coopenv.observers.robust.sources import ODOMETRY, is_active
+from coopenv.observers.robust.sources import ODOMETRY, clear_steps, is_active, is_sender
 from coopenv.world.warp_internals import device_function
 
 
@@ -87,11 +91,59 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
 
 
 @device_function
+def correct_steps_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
+    """Correct the own and the calibration errors that a sender's steps cause, if they are a fault."""
+    others = memory.belief[world, i].others
+    f = -(wp.transpose(memory.scratch[world, 0].pose.R) * memory.source[world, i, q].steps)
+    for n in range(frame.bearings):
+        if memory.measurement[world, n].fits == 1:
+            r = memory.derivative[world, n, 0].jacobian * memory.steps_effect[world, i, q - 1, 0]
+            if frame.mounting > 0:
+                r = r + memory.derivative[world, n, 2].jacobian * memory.steps_effect[world, i, q - 1, MOUNTING]
+            if memory.measurement[world, n].source == q:
+                r = r - memory.derivative[world, n, 0].jacobian[:, 3:] * f
+            r = memory.measurement[world, n].weight * r
+            for k in range(others):
+                e = memory.steps_effect[world, i, q - 1, k] - wp.transpose(memory.gain[world, n, k]) * r
+                memory.steps_effect[world, i, q - 1, k] = e
+
+
+@device_function
+def add_step(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
+    """Add a step of a sender's report that its odometry does not explain, d (m, map) of covariance N, to its sums."""
+    if q >= 0:
+        W = wp.inverse(N + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64))
+        memory.source[world, i, q].steps = memory.source[world, i, q].steps + d
+        memory.source[world, i, q].steps_vector = memory.source[world, i, q].steps_vector + W * d
+        memory.source[world, i, q].steps_information = memory.source[world, i, q].steps_information + W
+
+
+@device_function
+def end_steps(memory: Any, world: int, i: int, q: int, kept: Any):
+    """Set the likelihood ratio of a sender's drift, which gives all steps the same mean, at the end of a block.
+
+    A drift begins where the ratio is last as small as without a fault.
+    Source: Page, Continuous inspection schemes, Biometrika 41, 1954.
+    """
+    v = memory.source[world, i, q].steps_vector
+    V = memory.source[world, i, q].steps_information
+    ratio = wp.dot(v, wp.inverse(V + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)) * v)
+    memory.source[world, i, q].steps_ratio = ratio
+    if ratio < wp.float64(3.0):
+        clear_steps(memory, world, i, q)
+    else:
+        memory.source[world, i, q].steps_vector = kept * v
+        memory.source[world, i, q].steps_information = kept * V
+
+
+@device_function
 def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     """Add the innovations of a correction to the information on all faults, and correct the sensitivities."""
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             correct_source(frame, memory, world, i, q)
+            if is_sender(q):
+                correct_steps_effect(frame, memory, world, i, q)
     weight = wp.min(frame.period / wp.float64(constants.LOST_TIME), wp.float64(1.0))
     for n in range(frame.bearings):
         q = memory.measurement[world, n].source
@@ -206,6 +258,8 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].covariance = covariance
             memory.source[world, i, q].offset = covariance * v
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
+            if is_sender(q):
+                end_steps(memory, world, i, q, kept)
     keep_joint(memory, world, i, kept)
     clear_block(memory, world, i)
     return count

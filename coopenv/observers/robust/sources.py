@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import forward
+from coopenv.observers.robust.algebra import forward, forward_error
 from coopenv.observers.robust.memory import (
     ERRORS,
     SENDER_SLOTS,
@@ -17,11 +17,28 @@ from coopenv.observers.robust.memory import (
     mat63d,
     mat66d,
     vec3d,
+    vec6d,
 )
 from coopenv.world.warp_internals import device_function
 
 ODOMETRY = 0  # the slot of the own odometry; then those of senders, then those of landmarks
 NO_TARGET = -1
+
+
+@wp.func
+def is_sender(q: int) -> bool:
+    """Return whether a slot is one of senders."""
+    return q > 0 and q <= SENDER_SLOTS
+
+
+@device_function
+def clear_steps(memory: Any, world: int, i: int, q: int):
+    """Begin the sum of a sender's steps anew."""
+    memory.source[world, i, q].steps = vec3d()
+    memory.source[world, i, q].steps_vector = vec3d()
+    memory.source[world, i, q].steps_ratio = wp.float64(0.0)
+    memory.source[world, i, q].steps_information = mat33d()
+    fill(memory.steps_effect[world, i, q - 1], vec6d())
 
 
 @device_function
@@ -31,7 +48,8 @@ def clear_source(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].vector = vec3d()
     memory.source[world, i, q].sum = vec3d()
     memory.source[world, i, q].joint = vec3d()
-    if q > 0 and q <= SENDER_SLOTS:
+    if is_sender(q):
+        clear_steps(memory, world, i, q)
         for c in range(SENDER_SLOTS):
             memory.joint[world, i, q - 1, c] = mat33d()
             memory.joint[world, i, c, q - 1] = mat33d()
@@ -137,3 +155,6 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
                 for k in range(3):
                     Phi[k + 3] = Phi[k + 3] + E[k]
             memory.sensitivity[world, i, q, 0] = Phi
+            if is_sender(q):
+                e = forward_error(step, memory.steps_effect[world, i, q - 1, 0])
+                memory.steps_effect[world, i, q - 1, 0] = e + G * memory.steps_effect[world, i, q - 1, ERRORS]
