@@ -207,6 +207,9 @@ class Estimate:
     nis: float | None = None
     """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not stated."""
     nis_dof: int = 0  # its degrees of freedom: two per bearing used
+    protection_level: tuple[float, float] | None = None
+    """Bounds of the horizontal error, m, and of the angle, rad, with one faulty source; infinite: unknown, None: not
+    given."""
 
 
 @runtime_checkable
@@ -271,6 +274,8 @@ def check_estimate(estimate: Estimate) -> None:
         _check_covariance(_checked_array("covariance", estimate.covariance, LARGEST**2, COVARIANCE))
     if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
         raise CoopenvError("nis is not finite, or nis_dof negative")
+    if estimate.protection_level is not None and not all(level >= 0.0 for level in estimate.protection_level):
+        raise CoopenvError("protection_level is not at least 0")
 
 
 def check_message(message: Message) -> None:

@@ -145,7 +145,8 @@ class KernelObserver:
         if coordinates is Coordinates.LEFT:
             P = left_covariance(p, P)
         dof = int(s.nis_dof)
-        return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
+        levels = tuple(s.protection_level.tolist()) if s.protection_level[0] > 0.0 else None
+        return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof, levels)
 
     def message(self) -> Message:
         """Return the message that the kernels send."""

@@ -46,6 +46,7 @@ class Run:
     nees_dof: int  # 6, or 3 on a plane
     nis: Array  # (K, N), NaN where the observer states none
     nis_dof: NDArray[np.int64]  # (K, N)
+    protection_level: Array  # (K, N, 2) m and rad, infinite: unknown, NaN where the observer states none
     bytes_per_second: Array  # (N,) sent, payload
     microseconds_per_update: Array  # (N,) median, message included; a joint observer's time is shared out
     refused: NDArray[np.int64]  # (N,) invalid or unreadable messages per receiver
@@ -91,6 +92,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     r, failure = recording, ""
     group, shape = ObserverGroup(factory, r.observer_init, tamper), (r.ticks, len(r.setups))
     R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
+    levels = np.full((*shape, 2), np.nan)
     nis, nis_dof, elapsed = np.full(shape, np.nan), np.zeros(shape, np.int64), np.full(shape, np.nan)
     try:
         group.start(r.start_rotation, r.start_position, None if r.interference is None else r.interference.at(0))
@@ -100,6 +102,8 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
                 R[k, i], p[k, i], elapsed[k, i] = estimate.rotation, estimate.position, seconds
                 if estimate.covariance is not None:
                     P[k, i] = estimate.covariance
+                if estimate.protection_level is not None:
+                    levels[k, i] = estimate.protection_level
                 if estimate.nis is not None and estimate.nis_dof > 0:
                     nis[k, i], nis_dof[k, i] = estimate.nis, estimate.nis_dof
     except ObserverError as error:  # the comparison goes on with the next observer
@@ -121,6 +125,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         nees_dof=len(states),
         nis=nis,
         nis_dof=nis_dof,
+        protection_level=levels,
         bytes_per_second=group.mail.bytes / max(r.dt, (r.ticks - 1) * r.dt),
         microseconds_per_update=np.array([1e6 * float(np.median(c)) if len(c) else np.nan for c in timed]),
         refused=group.refused,

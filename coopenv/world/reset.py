@@ -189,6 +189,7 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.corrected_tick[world, vehicle] = 0
     state.nis[world, vehicle] = wp.float64(0.0)
     state.nis_dof[world, vehicle] = 0
+    state.protection_level[world, vehicle] = wp.vec2d()
     for sample in range(model.samples_per_tick):
         state.sampled_velocity[world, vehicle, sample] = o
         state.sampled_angular_velocity[world, vehicle, sample] = o

@@ -142,6 +142,9 @@ def numbers(largest: float = LARGEST) -> Rule:
     return Rule(f"finite and at most {largest:g}", lambda values, fields, model: np.abs(values) <= largest)
 
 
+LEVELS = Rule("at least 0", lambda values, fields, model: values >= 0.0)
+
+
 def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
     """Return which counts are those of the tick, at which sample m has been taken if m / rate is not later."""
     due = fields["tick"][:, None] * (model.camera_period * model.odometry_rate)
@@ -304,6 +307,7 @@ def state_struct(p: Precision) -> Any:
         covariance: array("WN", mat66, COVARIANCE)  # P over (2 lambda, p)
         corrected_tick: array("WN", wp.int32, whole(0, "tick"))  # tick of the observer's last correction
         nis: array("WN", wp.float64, numbers(LARGEST**3))  # normalised innovation squared of its last tick, if given
+        protection_level: array("WN", wp.vec2d, LEVELS)  # horizontal, m, and angular, rad; inf: unknown, 0: not given
         nis_dof: array("WN", wp.int32, whole(0, 10**6))  # degrees of freedom; 0: no correction, or not given
 
         gramian_11: array("WNB", mat33, numbers(LARGEST**3))  # block sums of int C^T C dt, map axes

@@ -44,6 +44,7 @@ RESET_GROWTH = 0.5  # growth of a sender's variance, as a share of it, that coun
 FAULT_GATE, FAULT_RISK = 30.0, 1e-2
 """Ratio, twice its logarithm, from which the fault of a source is likelier than none; probability that the source that
 is excluded is right. Tuned: in honest worlds the largest of all ratios was 34."""
+PROTECTION_RISK = 1e-3  # of an error above the protection level
 ODOMETRY_FAULT = 0.1  # standard deviation of the fault of the odometry's velocity, as a share of the speed. Chosen
 MONITOR_TIME, BLOCK_TIME = 10.0, 0.5
 """s: time constant of the sums of a monitor, and time between two looks at them. Chosen."""

@@ -76,6 +76,7 @@ from coopenv.observers.robust.propagation import (
     walk_errors,
     walk_mounting,
 )
+from coopenv.observers.robust.protection import protection_level
 from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
 from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
@@ -275,6 +276,9 @@ def write(state: Any, memory: Any, world: int, i: int):
     state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
     state.estimate_position[world, i] = type(state.estimate_position[world, i])(position)
     state.covariance[world, i] = type(state.covariance[world, i])(P)
+    state.protection_level[world, i] = vec2d(wp.float64(wp.inf))
+    if memory.search[world, i].active == 0:
+        state.protection_level[world, i] = protection_level(memory, world, i)
 
 
 @device_function
