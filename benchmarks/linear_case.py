@@ -8,7 +8,6 @@ inflations are left out. The second table has the mean of the monitors' statisti
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -17,7 +16,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers.robust.constants import RETURNING_SHARE
 from coopenv.runs.console import number_table
 
-SOURCES = 400
+SOURCES = 512
 """Most independent sources of an example."""
 SENDER_NOISE, BEARING_NOISE = 0.1, 0.1
 """Variances of a follower's own error beside that of the vehicle that it follows, and of a relative measurement."""
@@ -56,26 +55,30 @@ class Receiver:
     def regressed(self, known: dict[int, float]) -> Array:
         """Return the covariance of an error with all errors by regression on its known ones, by index."""
         at = list(known)
-        return np.linalg.solve(self.P[np.ix_(at, at)], np.array([*known.values()])) @ self.P[at] if at else 0 * self.P[0]
+        coefficients: Array = np.linalg.solve(self.P[np.ix_(at, at)], np.array([*known.values()]))
+        return coefficients @ self.P[at]
 
     def measure(self, n: int) -> None:
         """Measure the position relative to member n; only the own estimate is corrected."""
         H = np.zeros(len(self.P))
         H[0], H[n] = -1.0, 1.0
         K = (self.P @ H)[0] / (H @ self.P @ H + BEARING_NOISE)
+        self.correct(K, H, self.sources.draw(BEARING_NOISE))
+
+    def correct(self, K: float, H: Array, noise: Array) -> None:
+        """Correct the own estimate by a gain times the innovation of a measurement H with a noise."""
         G = np.eye(len(self.P))
         G[0] -= K * H
         self.errors, self.P = G @ self.errors, G @ self.P @ G.T
-        self.errors[0] -= K * self.sources.draw(BEARING_NOISE)
-        self.P[0, 0] += K * K * BEARING_NOISE
+        self.errors[0] -= K * noise
+        self.P[0, 0] += K * K * float(noise @ noise)
 
-    def propagate(self, own: float, steps: dict[int, tuple[Array, float]]) -> None:
-        """Add odometry noise: to the own error, and to members, whose true noise and stated variance are given."""
-        self.errors[0] = self.errors[0] + self.sources.draw(own)
+    def propagate(self, own: float, noise: Array, variance: float) -> None:
+        """Add odometry noise: of a variance to the own error; to member 1 a true noise, with a stated variance."""
+        self.errors[0] += self.sources.draw(own)
+        self.errors[1] += noise
         self.P[0, 0] += own
-        for n, (noise, variance) in steps.items():
-            self.errors[n] = self.errors[n] + noise
-            self.P[n, n] += variance
+        self.P[1, 1] += variance
 
     def report(self, n: int, error: Array) -> None:
         """Take a new report of a member as an increment of the own estimate."""
@@ -111,26 +114,26 @@ def flat(*senders: Array, known: dict[int, dict[int, float]] | None = None) -> R
     return receiver
 
 
-def leader(lost: int) -> Receiver:
-    """Return a receiver of one sender that measures a landmark, after 60 steps; of the reports, 1 in `lost` arrives."""
+def leader(every: int, odometry: float) -> Receiver:
+    """Return a receiver of a sender that measures a landmark, after 60 steps; one report in `every` is fused."""
     sources = Sources()
     sender, P = sources.draw(1.0), 1.0
     receiver = Receiver(sources, sources.draw(1.0))
     receiver.add(sender)
     for step in range(1, 61):
-        noise = sources.draw(0.01)
-        sender, P = sender + noise, P + 0.01
-        receiver.propagate(0.01, {1: (noise, 0.01)})
+        noise = sources.draw(odometry)
+        sender, P = sender + noise, P + odometry
+        receiver.propagate(0.01, noise, odometry)
         K = P / (P + 1.0)
         sender, P = sender - K * (sender + sources.draw(1.0)), (1.0 - K) * P
-        if step % lost == 0:
+        if step % every == 0:
             receiver.report(1, sender)
         receiver.measure(1)
     return receiver
 
 
 def ancestors(links: int, broadcast: bool) -> Receiver:
-    """Return a receiver of two senders with one ancestor so many links away, whose correlations are broadcast or not."""
+    """Return a receiver of two senders with one ancestor so many links away; correlations are broadcast or not."""
     sources = Sources()
     root = sources.draw(1.0)
     pair = [root + sum(sources.draw(SENDER_NOISE) for _ in range(links)) for _ in range(2)]
@@ -192,21 +195,69 @@ def other_odometry() -> Receiver:
     sender = sources.draw(1.0)
     receiver = flat(sender)
     for _ in range(10):
-        receiver.propagate(0.0, {1: (np.zeros(SOURCES), 0.1)})
+        receiver.propagate(0.0, np.zeros(SOURCES), 0.1)
         receiver.report(1, sender)
     return receiver
 
 
 EXAMPLES: dict[str, Callable[[], Receiver]] = {
-    "one sender, all reports": lambda: leader(1),
-    "one sender, one report of three": lambda: leader(3),
+    "one sender, every report fused": lambda: leader(1, 0.01),
+    "one sender, every twelfth, exact odometry": lambda: leader(12, 0.0),
+    "one sender, every twelfth, noisy odometry": lambda: leader(12, 0.01),
     "common ancestor, correlation known": lambda: ancestors(1, True),
     "common ancestor, correlation missing": lambda: ancestors(2, False),
     "two common ancestors, product of one": two_ancestors,
     "four newcomers, common ancestor": lambda: newcomers(4),
     "sixteen newcomers, common ancestor": lambda: newcomers(16),
-    "second encounter at the order's limit": second_encounter,
-    "circle of two, senders twice": circle,
+    "second encounter, limit of the order": second_encounter,
+    "circle of two, sender counts twice": circle,
     "correlation of an older report": old_correlation,
     "odometry of the sender less noisy": other_odometry,
 }
+
+
+def monitor(frames: int, sender: float) -> tuple[float, float, float]:
+    """Return the mean statistic of the faults of odometry, a sender and a landmark, 1 for a chi-square of 1.
+
+    The receiver measures a landmark and the sender, whose nominal error is constant with a variance, in each frame.
+    """
+    sources = Sources()
+    receiver = Receiver(sources, sources.draw(1.0))
+    receiver.add(sources.draw(sender))
+    Phi, A, a = np.zeros(3), np.zeros((3, 3)), np.zeros((3, SOURCES))
+    for _ in range(frames):
+        receiver.propagate(0.01, np.zeros(SOURCES), 0.0)
+        Phi[0] += 1.0
+        for q, H in ((2, np.array([-1.0, 0.0])), (1, np.array([-1.0, 1.0]))):
+            noise, M = sources.draw(BEARING_NOISE), -Phi
+            M[q] += 1.0
+            W = 1.0 / (H @ receiver.P @ H + BEARING_NOISE)
+            innovation, K = H @ receiver.errors + noise, W * (receiver.P @ H)[0]
+            A, a = A + W * np.outer(M, M), a + W * np.outer(M, innovation)
+            receiver.correct(K, H, noise)
+            Phi = Phi - K * M
+    Pi = 1.0 / (1.0 / sender + A[1, 1])
+    v = a - Pi * np.outer(A[:, 1], a[1])
+    V = np.diag(A) - Pi * A[:, 1] ** 2
+    statistic = (v**2).sum(axis=1) / V
+    return float(statistic[0]), float(statistic[1]), float(statistic[2])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print both tables; return the exit status."""
+    argparse.ArgumentParser(prog="python -m benchmarks.linear_case", description=__doc__).parse_args(arguments)
+    console = Console(markup=False, highlight=False)
+    table = number_table(["\nexample"], ["own variance,\ntrue / stated", "largest\nratio"])
+    for name, build in EXAMPLES.items():
+        table.add_row(name, *(f"{ratio:.3f}" for ratio in build().ratios()))
+    console.print(table)
+    table = number_table(["variance of\nthe sender"], ["\nframes", "\nodometry", "\nsender", "\nlandmark"])
+    for sender in (1e-9, 0.1, 1.0):
+        for frames in (1, 10, 100):
+            table.add_row(f"{sender:g}", str(frames), *(f"{mean:.3f}" for mean in monitor(frames, sender)))
+    console.print("\nMean of the monitors' statistic without a fault", table, sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
