@@ -56,7 +56,8 @@ class Receiver:
         """Return the covariance of an error with all errors by regression on its known ones, by index."""
         at = list(known)
         coefficients: Array = np.linalg.solve(self.P[np.ix_(at, at)], np.array([*known.values()]))
-        return coefficients @ self.P[at]
+        row: Array = coefficients @ self.P[at]
+        return row
 
     def measure(self, n: int) -> None:
         """Measure the position relative to member n; only the own estimate is corrected."""

@@ -52,7 +52,8 @@ def rotations(angle: Array) -> Array:
 
 def moved(pose: Array, error: Array) -> Array:
     """Return poses (S, 3), angle and position, moved by left errors (S, 3)."""
-    return pose + np.column_stack([error[:, 0], np.einsum("nij,nj->ni", rotations(pose[:, 0]), error[:, 1:])])
+    change = np.einsum("nij,nj->ni", rotations(pose[:, 0]), error[:, 1:])
+    return np.column_stack([pose[:, 0] + error[:, 0], pose[:, 1:] + change])
 
 
 def bearing(own: Array, leader: Array) -> tuple[Array, Array, Array]:
@@ -83,7 +84,8 @@ def second_order(P: Array, H: Array, u: Array) -> Array:
     square = 1.0 / np.sum(H[:, 1:3] ** 2, axis=1)
     along = np.einsum("ni,nij,nj->n", u, P[:, 1:3, 1:3], u)
     across = np.trace(P[:, 1:3, 1:3], axis1=1, axis2=2) - along
-    return VARIANCE_TIME * RATE * along * across / square**2
+    variance: Array = VARIANCE_TIME * RATE * along * across / square**2
+    return variance
 
 
 def corrected(own: Array, leader: Array, P: Array, z: Array, point: str, N: Array, variance: bool) -> tuple[Array, ...]:
@@ -109,9 +111,11 @@ def corrected(own: Array, leader: Array, P: Array, z: Array, point: str, N: Arra
     return moved(own, dx[:, :3]), P, np.einsum("nij,nj->ni", G, N)
 
 
-def simulate(scene: str, point: str, seeds: int, seconds: float, variance: bool = False, first: int = 0) -> list[Look]:
-    """Return the looks of a filter over seeds, an even number, in pairs of opposite noise."""
-    random, dt = np.random.default_rng(first), 1.0 / RATE
+def simulate(
+    scene: str, point: str, seeds: int, seconds: float, variance: bool = False, scale: float = 1.0
+) -> list[Look]:
+    """Return the looks of a filter over seeds; `scale`: of the receiver's first errors."""
+    random, dt, start = np.random.default_rng(0), 1.0 / RATE, START * np.repeat([scale, 1.0], 3)
 
     def draw(*sizes: float) -> Array:
         half = random.standard_normal((seeds // 2, len(sizes))) * sizes
@@ -119,9 +123,9 @@ def simulate(scene: str, point: str, seeds: int, seconds: float, variance: bool 
 
     truth = np.zeros((seeds, 3))
     leader = np.tile([0.0, *AHEAD], (seeds, 1))
-    errors = draw(*START)
+    errors = draw(*start)
     own, theirs = (moved(pose, -part) for pose, part in ((truth, errors[:, :3]), (leader, errors[:, 3:])))
-    P = np.tile(np.diag(START**2), (seeds, 1, 1))
+    P = np.tile(np.diag(start**2), (seeds, 1, 1))
     N = np.column_stack([np.zeros(seeds), bearing(own, theirs)[2], np.zeros((seeds, 3))])
     step, straight = (np.tile([w * dt, SPEED * dt, 0.0], (seeds, 1)) for w in (SCENES[scene], 0.0))
     Q = np.diag([GYRO * dt, VELOCITY * dt, VELOCITY * dt, 0.0, 0.0, 0.0]) ** 2
@@ -149,21 +153,20 @@ def simulate(scene: str, point: str, seeds: int, seconds: float, variance: bool 
 
 def drawn(results: dict[tuple[str, str, bool], list[Look]], path: Path) -> None:
     """Write the figure: range bias over time, a panel per scene, with and without the variance."""
-    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
     axes = figure.subplots(1, len(SCENES), sharex=True)
     for ax, scene in zip(axes, SCENES, strict=True):
         for point, colour in zip(POINTS, style.VEHICLE_COLOURS, strict=False):
             for variance, line in ((False, "-"), (True, "--")):
-                looks = results[scene, point, variance]
-                label = point if line == "-" else None
-                ax.plot(
-                    [look.time for look in looks], [100 * look.bias for look in looks], line, color=colour, label=label
+                time, bias = zip(
+                    *((look.time, 100 * look.bias) for look in results[scene, point, variance]), strict=True
                 )
+                ax.plot(time, bias, line, color=colour, label=None if variance or ax is axes[0] else point)
         ax.axhline(0.0, color=style.GREY, linewidth=0.6)
         ax.set_title(scene)
         ax.set_xlabel("time [s]")
     axes[0].set_ylabel("range bias [cm]")
-    axes[0].legend(title="linearised at; dashed: with variance", fontsize="small", title_fontsize="small")
+    figure.legend(loc="outside lower center", ncols=4, title="linearised at; dashed: with linearisation variance")
     style.save(figure, path, about={"command": "python -m benchmarks.linearisation"})
 
 
@@ -172,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.linearisation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=200, help="number of seeds, even (default: 200)")
     parser.add_argument("--seconds", type=float, default=30.0, help="of each run, 5 at least (default: 30)")
+    parser.add_argument("--scale", type=float, default=1.0, help="of the receiver's first errors (default: 1)")
     parser.add_argument("--figure", type=Path, help="PNG, PDF or SVG to write")
     asked = parser.parse_args(arguments)
     if asked.seeds < 4 or asked.seeds % 2 or asked.seconds < LOOKS:
@@ -183,8 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with Progress(Console(stderr=True), "simulating", total=len(cases)) as progress:
         for done, (scene, point, variance) in enumerate(cases):
             progress.update(done)
-            looks = results[scene, point, variance] = simulate(scene, point, asked.seeds, asked.seconds, variance)
-            last = looks[-1]
+            looks = simulate(scene, point, asked.seeds, asked.seconds, variance, asked.scale)
+            results[scene, point, variance], last = looks, looks[-1]
             bias = in_parentheses(100 * last.bias, 100 * last.bias_error)
             table.add_row(scene, point, "12 s" if variance else "-", bias, in_parentheses(last.anees, last.anees_error))
     Console(markup=False, highlight=False).print(table, f"After {last.time:g} s, {asked.seeds} seeds.", sep="\n")

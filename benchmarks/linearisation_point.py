@@ -60,7 +60,7 @@ def measure(point: str, time: float, worlds: int) -> dict[str, list[float]]:
     from coopenv.estimation.metrics import nees
     from coopenv.estimation.poses import Coordinates
     from coopenv.scenario import load_scenario
-    from coopenv.scenario.routes import ConstantMotion
+    from coopenv.scenario.bodies import ConstantMotion
 
     found = {}
     for scene, turn in TURNS.items():
