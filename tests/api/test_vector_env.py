@@ -253,11 +253,6 @@ def test_wrong_resets(arguments: Any, message: str) -> None:
         busy()[0].reset(**arguments)
 
 
-def test_a_step_before_any_reset() -> None:
-    with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        coopenv.make_vec("busy_intersection", num_worlds=2).step(np.zeros((10, 2)))
-
-
 @pytest.mark.parametrize("seed", [-1, 1.5, "a", [1, -2], True])
 def test_wrong_seeds(seed: Any) -> None:
     with pytest.raises(coopenv.CoopenvError, match="seed"):

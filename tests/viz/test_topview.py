@@ -85,6 +85,8 @@ def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
     drive(env, 10)
     before = env.engine.get_state()
     picture = env.render()
+    env.state()
+    env.engine.refresh()
     after = env.engine.get_state()
     assert picture.shape == (HEIGHT, WIDTH, 3) and picture.dtype == np.uint8
     assert picture.flags.owndata and picture.std() > 10
