@@ -40,7 +40,6 @@ WATCH = ["watch", "--env", "facade", *SHORT, "--out", "film"]
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "acts.py").write_text(AGENTS)
     (tmp_path / "raises.py").write_text("raise RuntimeError('at import')")
-    (tmp_path / "exits.py").write_text("raise SystemExit(3)")
     (tmp_path / "file").touch()
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -57,8 +56,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ([*EVALUATE, "acts.py:Reset"], "the policy's reset failed at acts.py:18: ValueError: bad reset"),
         ([*EVALUATE, "acts.py:Init"], "agent 'Init' cannot be built: ZeroDivisionError: no"),
         ([*EVALUATE, "acts.py:Leaves"], "agent 'Leaves' cannot be built: SystemExit: 3"),
-        ([*EVALUATE, "raises.py:Mine"], "cannot be loaded: RuntimeError: at import"),
-        ([*EVALUATE, "exits.py:Mine"], "cannot be loaded: SystemExit: 3"),
         ([*EVALUATE, ","], "--agents ,: names none"),
         ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
         ([*EVALUATE, "peek", "--out", "file"], "cannot write to file: it is not a folder"),

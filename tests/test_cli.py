@@ -152,7 +152,6 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         ("schema --out missing/schema.json", "cannot write to"),
         ("describe", "ENV"),
         ("list things", "things"),
-        ("run occupied.db3", "no such bag: occupied.db3"),
         ("run ./rosbag", "rosbag: a ROS bag"),
         ("describe picture.toml", "picture.toml: not a text file"),
         ("run busy_intersection --figures gif", "--figures"),

@@ -54,6 +54,14 @@ def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environmen
 
 
 @pytest.mark.slow
+def test_a_planner_knows_better_where_it_is_and_loses_little_time() -> None:
+    straight, planner = figures("open_square", "route_follower"), figures("open_square", "look_ahead")
+    assert planner["e95_m"][0] < 0.6 * straight["e95_m"][0] and planner["e50_m"][0] < 0.7 * straight["e50_m"][0]
+    assert planner["few_targets_share"][0] < straight["few_targets_share"][0]
+    assert planner["travel_time_s"][0] < 1.15 * straight["travel_time_s"][0]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("environment", WORLDS)
 def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
     assert change_of_time(environment, 15).relative <= MOST_TIME

@@ -1,7 +1,8 @@
-"""Commands in an installation without any extra: one line that says which one to install."""
+"""Without an extra, commands and trainers say in one line which one to install."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -101,3 +102,19 @@ def test_one_line_names_the_extra(command: str, done: dict[str, tuple[int, str, 
     assert (status, errors.count("\n")) == (2, 1), errors
     assert f"pip install '.[{COMMANDS[command]}]'" in errors
     assert names == ["drive.bag", "drive.mcap", "recorded.mcap", "topics.toml"]
+
+
+@pytest.mark.parametrize(
+    ("module", "needed", "extra"),
+    [
+        ("coopenv.api.trainers.sb3", "stable_baselines3.common.vec_env", "train"),
+        ("coopenv.api.trainers.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
+        ("coopenv.api.trainers.torchrl", "torchrl.envs", "torchrl"),
+        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.pettingzoo.common", "benchmarl"),
+    ],
+)
+def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, needed, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install '\.\[{extra}\]'$"):
+        importlib.import_module(module)

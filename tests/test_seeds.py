@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given
@@ -99,22 +98,6 @@ def test_without_a_seed_worlds_are_for_training() -> None:
     keys = env.engine.view("seed")
     assert len({int(key) % WORD for key in keys}) == 1
     assert int(keys[0]) < 2**31
-
-
-WRONG = [
-    ({"typo": 1}, "unknown option 'typo'"),
-    ({"reset_maks": [True]}, "unknown option 'reset_maks'"),
-    ({"wrold": 3}, "unknown option 'wrold'"),
-    ([1], "options must be a dict, got list"),
-]
-
-
-@pytest.mark.parametrize(("options", "message"), WRONG)
-def test_unknown_options_are_one_error_everywhere(single: Any, options: Any, message: str) -> None:
-    one = gymnasium.make("coopenv/UrbanCrossing-v0", disable_env_checker=True)
-    for env in (single, coopenv.make_vec(NAME, num_worlds=2), one.unwrapped):
-        with pytest.raises(CoopenvError, match=message):
-            env.reset(seed=0, options=options)
 
 
 @pytest.mark.parametrize("world", [-1, WORD, 1.0, "2", True])

@@ -43,11 +43,6 @@ def test_wrong_actions(env: coopenv.CooperativeLocalisationEnv, actions: Any, me
     assert all(np.array_equal(before[key], after[key]) for key in before)
 
 
-def test_step_before_reset() -> None:
-    with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        coopenv.parallel_env(FOUR_WAY).step(GOOD)
-
-
 def test_out_of_range_is_clipped() -> None:
     a, b = coopenv.parallel_env(FOUR_WAY), coopenv.parallel_env(FOUR_WAY)
     a.reset(seed=1)

@@ -137,7 +137,8 @@ WRONG = [
 @pytest.mark.parametrize(("options", "message"), WRONG)
 def test_wrong_options_are_one_error_in_all_interfaces(options: Any, message: str) -> None:
     made = sometimes()
-    for env in (CooperativeLocalisationEnv(made, "test"), batch(made, 2)):
+    one = coopenv.api.make.SingleVehicleEnv(FOUR_WAY)
+    for env in (CooperativeLocalisationEnv(made, "test"), batch(made, 2), one):
         with pytest.raises(CoopenvError, match=message):
             env.reset(seed=0, options=options)
 

@@ -155,16 +155,3 @@ def test_truth_is_not_in_the_observation_by_value(observer: str) -> None:
 def rms_distance(a: np.ndarray, b: np.ndarray) -> float:
     """Return the root mean square distance in m of two paths (K, 3)."""
     return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1))))
-
-
-def test_observing_draws_nothing() -> None:
-    """render, state and refresh leave the world as it is."""
-    env = coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array")
-    env.reset(seed=0)
-    before = env.get_state()
-    env.state()
-    env.render()
-    env.engine.refresh()
-    after = env.get_state()
-    # a second report within a step has no progress to tell, but the world itself is untouched
-    assert all(np.array_equal(before[key], after[key]) for key in before)

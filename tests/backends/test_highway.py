@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.backends.sources import simulation_of
 from coopenv.estimation.outcomes import Sight
 
 pytest.importorskip("highway_env", reason="needs the extra highway")
@@ -270,13 +268,6 @@ def test_other_environments_know_no_traffic() -> None:
             coopenv.load_scenario("busy_intersection", overrides)
     with pytest.raises(CoopenvError, match="backend 'simulated': highway_roundabout has backend = \"highway\""):
         coopenv.parallel_env(ROUNDABOUT, backend="simulated")
-
-
-def test_without_highway_env_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "highway_env", None)
-    with pytest.raises(CoopenvError, match=r"needs highway-env, which is not installed: pip install '\.\[highway\]'"):
-        simulation_of(coopenv.load_scenario(CROSSING))
-    assert CROSSING in coopenv.list_envs()
 
 
 def test_states_of_others_are_refused() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,8 +14,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv import CoopenvError, DataError
-from coopenv.backends.mcap import format, read_recording, write_recording
+from coopenv import DataError
+from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
@@ -187,22 +186,6 @@ def test_foreign_files(tmp_path: Path) -> None:
         read_recording(path)
     with pytest.raises(DataError, match=r"nowhere\.mcap: cannot be read \(No such file"):
         read_recording(tmp_path / "nowhere.mcap")
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: Any, **options: Any) -> Any:
-        if name.split(".")[0] in ("mcap", "rosbags"):
-            raise ImportError(name)
-        return real(name, *rest, **options)
-
-    format.codec.cache_clear()
-    monkeypatch.setattr(builtins, "__import__", without)
-    for act in (lambda: read_recording(tmp_path / "a.mcap"), lambda: write_recording(simulated(), tmp_path / "a.mcap")):
-        with pytest.raises(CoopenvError, match=r"pip install '\.\[log\]'"):
-            act()
-    assert not list(tmp_path.iterdir())
 
 
 # The command

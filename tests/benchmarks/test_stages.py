@@ -1,4 +1,4 @@
-"""`python -m benchmarks.stages`: ratios, stages that are really off, and the whole command."""
+"""`python -m benchmarks.stages` and `benchmarks.view`: ratios, stages that are really off, and the whole commands."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import view
 from benchmarks.stages.__main__ import main
 from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_settings
 from benchmarks.stages.against import HERE
@@ -59,3 +60,28 @@ def test_the_whole_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert max(len(line) for line in out.splitlines()) <= 80
     assert main([*few, "--against", str(HERE), "--compiles", "0"]) == 0
     assert "this / other" in capsys.readouterr().out
+
+
+# The live view
+
+
+def test_simulating_is_a_part_of_what_is_measured(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    monkeypatch.setattr(view, "WARM_UP", 0.3)
+    assert view.main(["busy_intersection", "--seconds", "1.5"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("busy_intersection")]
+    assert [row[1] for row in rows] == ["no", "yes"]
+    for row in rows:
+        frames, cpu, scaled, without = (float(entry.rstrip("%")) for entry in row[2:])
+        assert frames > 0.0
+        assert cpu > 0.0
+        assert 0.0 < without < scaled
+
+
+def test_an_unknown_environment_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert view.main(["nosuch"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: unknown environment 'nosuch'; known: ")
+    assert error.count("\n") == 1

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.backends.replay import Replay
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.world.world import World
 
 
 @cache
@@ -31,3 +33,28 @@ def differences(a: Any, b: Any, where: str = "") -> list[str]:
     if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
         return [d for i, (x, y) in enumerate(zip(a, b, strict=True)) for d in differences(x, y, f"{where}.{i}")]
     return [] if type(a) is type(b) and a == b else [where]
+
+
+class Played(NamedTuple):
+    """K ticks of N vehicles."""
+
+    rotation: np.ndarray  # (K, N, 3, 3)
+    position: np.ndarray  # (K, N, 3) map, m
+    covariance: np.ndarray  # (K, N, 6, 6) over (2 lambda, p)
+    searching: np.ndarray  # (K, N) bool
+    world: World
+
+
+def replayed(recording: Recording, dtype: str = "float64", observer: str = "robust") -> Played:
+    """Replay a record."""
+    world = Replay(recording, "record", {"observer.name": observer}).world(1, dtype, "cpu", 1)
+    world.reset([0])
+    rows = []
+    for tick in range(recording.ticks):
+        if tick > 0:
+            world.advance(1)
+        R = world.view("estimate_rotation")[0].astype(float)
+        p = (R @ world.view("estimate_position")[0].astype(float)[..., None])[..., 0]
+        P = world.view("covariance")[0].astype(float)
+        rows.append((R, p, P, world.state_arrays()["observer_search.active"].numpy()[0] == 1))
+    return Played(*(np.array(column) for column in zip(*rows, strict=True)), world=world)

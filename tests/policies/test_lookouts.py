@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
-from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.policies.look_ahead import LookAhead, Peek
 from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
@@ -19,28 +17,6 @@ from tests.helpers.square import GROUPS, square
 from tests.oracles.geometry import is_occluded
 
 SCENARIO = square()
-WORLDS = 16
-
-
-@pytest.fixture(scope="module")
-def engine() -> Engine:
-    return Engine(SCENARIO, WORLDS)
-
-
-def figures(engine: Engine, name: str) -> dict[str, float]:
-    found = drive(engine, load_agent(name, SCENARIO), held_out_seeds(3, WORLDS))
-    return {result.metric: result.mean for result in score(found)}
-
-
-@pytest.mark.slow
-def test_lookouts_know_their_place_better_at_little_time(engine: Engine) -> None:
-    follower, peek, planner = (figures(engine, name) for name in ("route_follower", "peek", "look_ahead"))
-    assert peek["e95_m"] < 0.5 * follower["e95_m"] and peek["e50_m"] < 0.5 * follower["e50_m"]
-    assert planner["e95_m"] < 0.6 * follower["e95_m"] and planner["e50_m"] < 0.7 * follower["e50_m"]
-    for looking in (peek, planner):
-        assert looking["few_targets_share"] < follower["few_targets_share"]
-        assert looking["travel_time_s"] < 1.15 * follower["travel_time_s"]
-    assert peek["arrival_rate"] >= 0.95
 
 
 def observation(scenario: Scenario = SCENARIO, **fields: object) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -69,12 +68,6 @@ def test_prescribed_motion_has_no_episodes() -> None:
 
 
 IDENTITY = "coopenv/facade/route_follower-v0"
-
-
-def test_without_minari_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "minari", None)
-    assert "pip install '.[minari]'" in refused("dataset", "facade", "--out", str(tmp_path))
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,11 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import linear, placed, spacing_of
-from coopenv.viz.web.page import viser_module, write_replay
+from coopenv.viz.web.page import write_replay
 from coopenv.viz.web.panel import GAIN
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, levels
 
@@ -77,12 +75,6 @@ def test_every_environment_can_be_drawn(name: str, tmp_path: Path) -> None:
     path = write_replay(scene(name, horizon=1.0), tmp_path / "replay.html")
     length, _ = messages(path.read_text(encoding="utf-8"))
     assert length == pytest.approx(1.0, abs=0.21)
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(CoopenvError, match=r"pip install '\.\[view\]'"):
-        viser_module()
 
 
 def test_what_is_not_there_has_no_size() -> None:

@@ -317,24 +317,6 @@ def test_the_noise_of_bearings_is_scaled() -> None:
     assert thrice == pytest.approx(3.0 * once, rel=1e-2)
 
 
-def test_a_saved_world_goes_on_with_its_draws() -> None:
-    made = scenario(
-        [vehicle(presence=0.5), vehicle((0, 3, 0), presence=0.5, motion=constant([0.5, 0, 0]), pace_spread=0.3)],
-        landmark_groups=GROUPS,
-        randomisation={"camera_range": [0.5, 1.0]},
-    )
-    world, other = start(made, range(5)), start(made, range(50, 55))
-    world.set_parameters({"slip": np.full(5, 2.0), "difficulty": np.full(5, 0.9)}, np.ones(5, bool))
-    saved = world.get_state()
-    other.set_state(saved)
-    for w in (world, other):
-        w.advance(30)
-        reset(w)
-        w.advance(30)
-    for name, value in world.get_state().items():
-        assert_array_equal(value, other.get_state()[name], err_msg=name)
-
-
 def test_data_of_groups_is_kept_through_json() -> None:
     """As recordings keep a scenario: its groups do not draw their landmarks twice."""
     made = scenario([vehicle()], landmark_groups=GROUPS)

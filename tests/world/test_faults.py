@@ -198,25 +198,6 @@ def test_others_go_on_as_if_there_were_no_fault() -> None:
     assert (plain["restart_tick"] == -1).all() and (plain["lie_tick"] == -1).all() and not plain["clock"].any()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_a_world_has_the_same_faults_alone_and_in_a_batch(dtype: str) -> None:
-    faults = {
-        "clock_offset": 0.1,
-        "restart": {"chance": 0.5, "time_spread": 0.5},
-        "corruption": {"probability": 0.3},
-        "lie": {"kind": "jump", "chance": 0.5, "start_spread": 0.5},
-    }
-    made = fleet({}, faults=faults)
-    many, one = start(made, range(5), dtype), start(made, [3], dtype)
-    for world in (many, one):
-        world.advance(6)
-        world.advance(6)
-    left, right = many.get_state(), one.get_state()
-    drawn = ("clock", "restart_tick", "lie_tick", "lie_vector", "broadcast_shift")
-    for name in (*drawn, "inbox_stamp", "estimate_position"):
-        assert same_bits(left[name][3:4], right[name]), name
-
-
 def test_vehicles_have_faults_of_their_own() -> None:
     made = fleet({1: {"lie": {"kind": "replay", "age": 0.5}}}, faults={"lie": {"offset": 7.0}, "clock_offset": 0.1})
     own = made.all_faults

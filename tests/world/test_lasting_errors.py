@@ -166,16 +166,6 @@ def test_off_draws_nothing() -> None:
     assert same_bits(silent["increment_rotation"], default["increment_rotation"])
 
 
-def test_a_world_has_the_same_errors_alone_and_in_a_batch() -> None:
-    made = scenario([vehicle(motion=TURNING), vehicle((1, 1, 0.5), motion=TURNING)], noise=ALL, camera=MISPLACED)
-    many, one = start(made, [3, 4, 5]), start(made, [4])
-    for world in (many, one):
-        world.advance(60)
-    for name in (*LASTING_ERRORS, "odometry_velocity", "bearing", "estimate_position"):
-        assert same_bits(many.get_state()[name][1:2], one.get_state()[name]), name
-    assert not np.isclose(*one.get_state()["odometry_scale"][0])  # two vehicles, two errors
-
-
 def test_truth_of_them_is_told_as_such() -> None:
     env = CooperativeLocalisationEnv(scenario([vehicle(motion=TURNING)], noise=ALL, camera=MISPLACED), "test")
     _, infos = env.reset(seed=1)

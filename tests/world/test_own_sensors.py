@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
@@ -61,9 +62,9 @@ def test_cameras_of_their_own_see_differently() -> None:
     """Three vehicles in nearly one place: one sees as far as it goes, the others 2 m, the second to its left."""
     places = {"A": [5.0, 0.1, 0.5], "B": [1.5, 0.0, 0.5], "C": [0.0, 1.0, 0.5]}
     landmarks = [{"name": name, "position": place} for name, place in places.items()]
-    quarter = [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]
+    turned = Rotation.from_euler("z", 90.0, degrees=True) * Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
     pinhole = {"model": "pinhole", "orientation": "forward"}
-    forward_turned = {"range": 2.0, "orientation": _product(quarter, [0.5, -0.5, 0.5, -0.5])}
+    forward_turned = {"range": 2.0, "orientation": turned.as_quat(scalar_first=True).tolist()}
     made = scenario(
         [vehicle(), vehicle(NEAR, camera=forward_turned), vehicle(NEARER, camera={"range": 2.0})],
         landmarks=landmarks,
@@ -74,12 +75,6 @@ def test_cameras_of_their_own_see_differently() -> None:
     seen = state["sight"][0, :, :3] == Sight.VISIBLE
     assert seen.tolist() == [[True, True, False], [False, False, True], [False, True, False]]
     assert_allclose(state["bearing"][0, 1, 2], [0.0, 0.0, 1.0], atol=1e-2)  # in the middle of its image
-
-
-def _product(a: list[float], b: list[float]) -> list[float]:
-    w, x, y, z = a
-    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
-    return (np.array(rows) @ b).tolist()
 
 
 def test_observers_know_their_own_camera_and_noise() -> None:

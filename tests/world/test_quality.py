@@ -10,9 +10,14 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from coopenv.api.engine import Engine
+from coopenv.base.errors import ScenarioError
 from coopenv.estimation import metrics, poses
+from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import left_covariance
+from coopenv.scenario import load_scenario
 from coopenv.world import quality
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES, Calls
 
 COUNT = 300
@@ -102,37 +107,6 @@ def test_position_variance_is_that_of_left_coordinates_at_any_attitude(dtype: st
     assert_allclose(call(quality.position_variance, dtype, P, p_hat), expected, rtol=tolerance)
 
 
-def test_position_variance_is_that_of_sampled_position_errors() -> None:
-    """Truths drawn about an estimate as NEES assumes them lie about it with this mean square distance in the map."""
-    rng = np.random.default_rng(8)
-    samples = 40_000
-    for angle in (1e-3, 0.03):  # m per m of lever, and m
-        A = rng.normal(size=(6, 6))
-        scale = np.array([angle] * 3 + [0.05] * 3)
-        P = (A @ A.T / 6 + 0.1 * np.eye(6)) * scale * scale[:, None]
-        R_hat, p_hat = Rotation.random(1, rng).as_matrix()[0], rng.uniform(-8, 8, 3)
-        e = rng.multivariate_normal(np.zeros(6), P, samples)
-        half = e[:, :3] / 2  # the vector part of the quaternion of Rtilde = Rhat^T R
-        turn = Rotation.from_quat(np.column_stack([half, np.sqrt(1 - np.sum(half**2, axis=1))]))
-        truth = turn.apply(p_hat + e[:, 3:]) @ R_hat.T  # R p = Rhat Rtilde (phat + e2)
-        squares = np.sum((truth - R_hat @ p_hat) ** 2, axis=1)
-        variance = call(quality.position_variance, "float64", P[None], p_hat[None])[0]
-        assert abs(squares.mean() - variance) < 4 * squares.std() / np.sqrt(samples) + 1e-3 * variance
-
-
-def test_nees_of_consistent_draws_has_mean_six() -> None:
-    P = covariances(np.random.default_rng(3))
-    P[:, :3] *= 1e-2
-    P[:, :, :3] *= 1e-2  # small turns, so that 2 lambda is the rotation vector
-    rng = np.random.default_rng(4)
-    e = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(COUNT, 6)))
-    small = np.linalg.norm(e[:, :3], axis=1) < 0.3
-    R_hat = Rotation.from_rotvec(-e[:, :3]).as_matrix()
-    value = call(judged, "float64", P, np.eye(3)[None], np.zeros((1, 3)), R_hat, -e[:, 3:])[2][small]
-    assert small.sum() > 250
-    assert abs(value.mean() - 6.0) < 4 * np.sqrt(12.0 / len(value)) + 0.05
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_nothing_is_wrong_with_a_perfect_estimate(dtype: str) -> None:
     R, position, _, _ = draws(5, None)
@@ -143,3 +117,81 @@ def test_nothing_is_wrong_with_a_perfect_estimate(dtype: str) -> None:
     assert np.abs(e1).max() < tolerance
     assert np.abs(e2).max() < tolerance
     assert (value >= 0.0).all()
+
+
+# The sliding Gramian: what was seen over the last metres, however long they took
+
+
+SEEN = {"camera.range": 30.0, "camera.miss_probability": 0.0, "topology.acyclic": True, "obstacles": []}
+
+
+def engine_of(**changes: object) -> Engine:
+    names = {key.replace("__", "."): value for key, value in changes.items()}
+    engine = Engine(load_scenario(FOUR_WAY, {**SEEN, **names}), 1, "float64")
+    engine.reset([0])
+    return engine
+
+
+def expected(samples: list[tuple[float, float, np.ndarray]], length: float) -> float:
+    """Return the smallest eigenvalue of samples (way before, way behind, C^T C), in ten blocks of a window."""
+    block = length / 10
+    newest = int(samples[-1][1] / block)
+    kept = [(end - begin, G) for begin, end, G in samples if int(end / block) > newest - 10]
+    return float(np.linalg.eigvalsh(sum(w * G for w, G in kept) / sum(w for w, _ in kept))[0])
+
+
+def test_it_is_the_mean_over_the_last_metres() -> None:
+    engine = engine_of(observer__gramian_distance=1.0)
+    landmarks = engine.world.model.landmarks
+    camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # to body
+    rng, samples, way = np.random.default_rng(0), [], 0.0
+    compared = 0
+    for tick in range(1, 241):
+        engine.step(np.array([[[rng.uniform(-1, 1), 0.2]] * 4]) if tick % 6 == 1 else None, ticks=1)
+        if tick % 3:
+            continue
+        now = float(engine.view("distance_driven")[0, 0])
+        if now > way:
+            R = engine.view("estimate_rotation")[0, 0]
+            G = np.zeros((6, 6))
+            for n in np.flatnonzero(engine.view("sight")[0, 0, :landmarks] == Sight.VISIBLE):
+                b = R @ camera @ engine.view("bearing")[0, 0, n]
+                z = engine.view("position")[0, n]
+                cross = np.array([[0, -z[2], z[1]], [z[2], 0, -z[0]], [-z[1], z[0], 0]])
+                C = (np.eye(3) - np.outer(b, b)) @ np.hstack([-cross, np.eye(3)])
+                G += C.T @ C
+            samples.append((way, now, G))
+            way = now
+        if samples:
+            engine.refresh()
+            compared += 1
+            found = engine.view("gramian_min_eigenvalue")[0, 0]
+            assert found == pytest.approx(expected(samples, 1.0), rel=1e-6, abs=1e-9)
+    assert way > 1.5 and compared > 60
+
+
+def test_standing_neither_adds_nor_forgets() -> None:
+    engine = engine_of(observer__gramian_distance=1.0, noise__enabled=False)
+    for _ in range(20):
+        engine.step(np.array([[[1.0, 0.0]] * 4]))
+    for _ in range(15):  # the speed fades
+        engine.step(np.array([[[-1.0, 0.0]] * 4]))
+    before = engine.view("gramian_min_eigenvalue").copy()
+    for _ in range(20):
+        engine.step(np.array([[[-1.0, 0.0]] * 4]))
+    assert (before > 0).any()
+    np.testing.assert_allclose(engine.view("gramian_min_eigenvalue"), before, rtol=1e-4)
+
+
+def test_a_fast_vehicle_forgets_the_blocks_that_it_skips() -> None:
+    """What it sees lasts for no more than the window, though a sample is longer than a block."""
+    engine = engine_of(observer__gramian_distance=0.1)  # blocks of 1 cm, samples of up to 5 cm
+    for _ in range(20):
+        engine.step(np.array([[[1.0, 0.0]] * 4]))
+    kept = engine.view("gramian_time")[0].sum(axis=-1)
+    assert (kept > 0.04).all() and (kept < 0.16).all()
+
+
+def test_a_distance_is_positive() -> None:
+    with pytest.raises(ScenarioError, match=r"observer\.gramian_distance: "):
+        load_scenario(FOUR_WAY, {"observer.gramian_distance": 0.0})

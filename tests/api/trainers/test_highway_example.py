@@ -13,14 +13,14 @@ pytest.importorskip("highway_env", reason="needs the extra 'highway'")
 
 import torch
 
-from tests.helpers import examples
+from tests.helpers import four_way
 
 pytestmark = pytest.mark.train
 
 
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
-    return examples.example("highway_policy")
+    return four_way.example("highway_policy")
 
 
 def test_it_prints_what_error_costs(

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file
 
 import coopenv
-from tests.helpers import examples
+from tests.helpers import four_way
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
@@ -27,7 +27,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="module")
 def ppo() -> ModuleType:
-    return examples.example("train_ppo")
+    return four_way.example("train_ppo")
 
 
 FEW = f"--env {FOUR_WAY} --num-worlds 4 --rollout 16 --total-steps 1024 --minibatches 2 --epochs 2"

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import socket
+import tracemalloc
+from collections.abc import Iterator
 from contextlib import closing
+from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -12,11 +16,14 @@ from typer.testing import CliRunner, Result
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
+from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.fake.fleet import FakesError, fakes, free_port
-from coopenv.cars.profile import presence_of
+from coopenv.cars.profile import SVEA, Role, presence_of
+from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
+from coopenv.cli.svea import next_status
 from tests.helpers.processes import ROOT, mentioning, wait_until
 from tests.helpers.wire import free_endpoint, seen_by
 
@@ -99,3 +106,44 @@ def test_real_cars_have_no_fakes(tmp_path: Path) -> None:
     file.write_text(OVERTAKING.read_text().replace("fakes = true", "fakes = false"))
     with pytest.raises(CoopenvError, match=r"cars\.toml: fakes = true is missing"):
         fakes(file).__enter__()
+
+
+# Listening to a gate: what is no message of a gate fills no memory and hides none
+
+
+TOPIC = SVEA.topic_of("svea7", Role.GATE)
+
+
+class Crowded:
+    """A network on which all comes at once as soon as somebody listens."""
+
+    def __init__(self, payloads: Iterator[bytes]) -> None:
+        self._payloads = payloads
+
+    def subscribe(self, pattern: str, callback: Any) -> None:
+        for payload in self._payloads:
+            callback(Arrival(pattern, payload, 0))
+
+
+def status_message() -> bytes:
+    return encode(make(SVEA.topics[Role.GATE].type))
+
+
+def first_status(payloads: Iterator[bytes]) -> Any:
+    return next_status(Crowded(payloads), TOPIC, 0.2)  # type: ignore[arg-type]
+
+
+def test_the_first_word_of_a_gate_is_found_among_others() -> None:
+    good = status_message()
+    assert first_status(iter([b"", b"nonsense", good + bytes(MOST_BYTES), good, b"nonsense"])).state == ""
+
+
+@pytest.mark.parametrize("size", [60_000, MOST_BYTES + 1, 1_000_000])
+def test_a_flood_fills_no_memory(size: int) -> None:
+    first_status(iter([status_message()]))  # what is loaded at the first time does not count
+    tracemalloc.start()
+    try:
+        assert first_status(b"\xff" * size for _ in repeat(None, 300)) is None
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()

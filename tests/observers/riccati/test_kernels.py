@@ -12,8 +12,10 @@ from numpy.testing import assert_allclose
 from coopenv.api.engine import Engine
 from coopenv.estimation.poses import position_covariance
 from coopenv.observers import registry
+from coopenv.observers import run as run_observer
 from coopenv.observers.single_frame import DeadReckoning
-from coopenv.scenario import load_scenario
+from coopenv.runs.recorder import record
+from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import (
     constant,
@@ -27,6 +29,8 @@ from tests.helpers.builders import (
     vehicle,
 )
 from tests.oracles import continuous, splitting
+from tests.oracles.batch import small_errors
+from tests.oracles.riccati import Riccati
 
 LEVER = (0.3, -0.1, 0.2)
 
@@ -238,3 +242,41 @@ def test_prediction_does_not_look_at_the_truth() -> None:
         found.append(world.get_state())
     for name in ("estimate_rotation", "estimate_position", "covariance"):
         assert same_bits(found[0][name], found[1][name])
+
+
+# On the host
+
+
+def embedded(scenario: Scenario, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    engine = Engine(scenario, 1, "float64")
+    engine.reset([seed])
+    rows = []
+    for _ in range(scenario.horizon_ticks):
+        engine.step(ticks=1)
+        names = ("estimate_rotation", "estimate_position", "covariance", "nees")
+        rows.append([engine.view(name)[0].copy() for name in names])
+    return tuple(np.array(column) for column in zip(*rows, strict=True))  # type: ignore[return-value]
+
+
+def test_it_is_the_embedded_observer_with_camera_and_markers_off_centre() -> None:
+    """Other cases are in tests/api/test_plugins.py."""
+    scenario = small_errors({"horizon": 2.0, "noise.bearing.scale": 0.003}, size=0.5)
+    R, p, P, nees = embedded(scenario, 5)
+    recording = record(scenario, 5)
+    for observer in ("riccati", Riccati):
+        result = run_observer(observer, recording)
+        assert not result.failure
+        assert_allclose(result.rotation[1:], R, atol=1e-9)
+        assert_allclose(result.position[1:], (R @ p[..., None])[..., 0], atol=1e-9)
+        assert_allclose(result.covariance[1:], P, atol=1e-9)
+        assert_allclose(result.nees[1:], nees, rtol=1e-6, atol=1e-9)
+        assert (result.bytes_per_second == 24.0 / recording.dt / recording.period).all()
+
+
+def test_hamel_samson_is_the_riccati_observer_without_neighbours() -> None:
+    """Vehicle 1 sees landmarks only; for the others it must not change with what neighbours say."""
+    recording = record(load_scenario("busy_intersection", {"horizon": 1.0}), 0)
+    alone, together = run_observer("hamel_samson", recording), run_observer("riccati", recording)
+    assert_allclose(alone.position[:, 0], together.position[:, 0], rtol=0, atol=1e-12)
+    assert np.abs(alone.position[-1, 1:] - together.position[-1, 1:]).max(axis=1).min() > 0.01
+    assert (alone.bytes_per_second == 0).all()

@@ -63,5 +63,6 @@ def test_no_vehicle_knows_more_than_there_is(name: str) -> None:
             least = eigvalsh(result.covariance[k, i], bound.covariance[k, i])[0]
             assert least > 0.9, (k, i, least)
     assert not result.failure
+    assert (result.bytes_per_second * recording.period * recording.dt <= 8 * 28 * 1.001).all()  # in the mean
     size = [np.trace(P[-60:, :, 3:, 3:], axis1=2, axis2=3).mean(axis=0) for P in (result.covariance, bound.covariance)]
     assert (size[0] < 2.5 * size[1]).all(), size[0] / size[1]

@@ -35,6 +35,7 @@ def test_nobody_depends_on_who_is_not_heard() -> None:
     world.advance(60)
     memory: Any = world.memory
     assert (memory.belief.numpy()["depends_on"] == 0).all()
+    assert np.isfinite(world.view("estimate_position")).all() and np.isfinite(world.view("covariance")).all()
 
 
 def test_nobody_in_a_lane_is_met_again() -> None:

@@ -13,7 +13,7 @@ from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.replays import replayed
+from tests.helpers.recordings import replayed
 
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029, "horizon": 4.0}

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.robust.p3p import solve_p3p
-from tests.helpers.p3p import solve_one
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -21,6 +20,12 @@ def scene(seed: int, spread: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.n
     R, c = Rotation.random(None, rng).as_matrix(), rng.uniform(-5, 5, 3)
     z = rng.uniform(-spread, spread, (3, 3))
     return R, c, z, seen(R, c, z)
+
+
+def solve_one(bearings: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations (n, 3, 3) and camera positions (n, 3), n = 0..4, for bearings and positions (3, 3)."""
+    R, c, mask = solve_p3p(np.asarray(bearings)[None], np.asarray(positions)[None])
+    return R[0, mask[0]], c[0, mask[0]]
 
 
 def seen(R: np.ndarray, c: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -7,8 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from coopenv.cars.transport.base import Transport
+from coopenv.cars.transport.base import Transport, matcher
 from coopenv.cars.transport.nats import open_nats
 from coopenv.cars.transport.ros1 import open_ros1
 from coopenv.cars.transport.zenoh import open_zenoh
@@ -132,3 +134,16 @@ def test_a_closed_connection_is_silent(connect: Connect) -> None:
     wait_until(lambda: heard)
     assert [arrival.payload for arrival in heard] == [b"open"]
     assert not unheard
+
+
+PARTS = st.sampled_from(["fleet", "svea7", "a.b", "*", "**"])
+
+
+@given(
+    pattern=st.lists(PARTS, min_size=1, max_size=5),
+    topic=st.lists(st.sampled_from(["fleet", "svea7", "a.b", "axb"]), min_size=1, max_size=5),
+)
+def test_patterns_match_as_in_zenoh(pattern: list[str], topic: list[str]) -> None:
+    keys = pytest.importorskip("zenoh", reason="needs the extra 'svea'").KeyExpr
+    meant = keys.autocanonize("/".join(pattern)).includes(keys("/".join(topic)))
+    assert matcher("/".join(pattern))("/".join(topic)) == meant
