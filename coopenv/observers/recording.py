@@ -162,10 +162,10 @@ class Recording(Measurements):
 
     @property
     def on_a_plane(self) -> bool:
-        """Whether recorded robots, and all that they measure, are on the plane z = 0, so that errors out of it vanish."""
+        """Whether recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
         if all(setup.planar for setup in self.setups):
             return True
-        return self.scenario is None and not (self.landmarks[..., 2].any() or self.bearings[self.visible, 2].any())
+        return self.scenario is None and not (np.nan_to_num(self.truth.position).any(axis=(0, 1))[2])
 
     @property
     def observer_init(self) -> ObserverInit:

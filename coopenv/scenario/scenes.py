@@ -175,9 +175,7 @@ def _options(kind: str, text: str) -> dict[str, float]:
             raise UnknownEnvironmentError(f"scene {kind}: {key} is given twice")
         number = known[key].value(value)
         if number is None:
-            raise UnknownEnvironmentError(
-                f"scene {kind}: {key} = {shown(value)}, allowed are {known[key].allowed}"
-            )
+            raise UnknownEnvironmentError(f"scene {kind}: {key} = {shown(value)}, allowed are {known[key].allowed}")
         given[key] = number
     return {name: given.get(name, option.default) for name, option in known.items()}
 

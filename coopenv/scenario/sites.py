@@ -91,9 +91,7 @@ def road(vehicles: int, speed: float, lanes: int) -> Site:
     for n in range(vehicles):
         lane = n % lanes
         y = (lane - (lanes - 1) / 2) * LANE
-        placed.append(
-            PlacedVehicle((-gap * n / lanes, y, 0.0), 0.0, ((speed, fastest)[lane], 0.0), 0.0, size=_size(n))
-        )
+        placed.append(PlacedVehicle((-gap * n / lanes, y, 0.0), 0.0, ((speed, fastest)[lane], 0.0), 0.0, size=_size(n)))
     first, last = math.floor(-gap * vehicles / lanes / POSTS) - 1, math.ceil(fastest * HORIZON / POSTS) + 1
     side = lanes * LANE / 2 + 2.5
     landmarks = {}

@@ -22,7 +22,6 @@ from coopenv.scenario.scenes import MOST_VEHICLES, SCENES, scene_rows, scene_tex
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.training.settings import environment_file
 
-
 ROADS = ("road", "crossroad")
 
 

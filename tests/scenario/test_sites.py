@@ -1,4 +1,4 @@
-"""Roads of any number of vehicles at any speed, against plain geometry: collisions, headways, landmarks, lines of sight."""
+"""Roads with any number of vehicles, against plain geometry: collisions, headways, landmarks, lines of sight."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_vehicles_never_touch(name: str) -> None:
 
 @pytest.mark.parametrize("kind", ["road", "crossroad"])
 def test_separations_grow_with_speed(kind: str) -> None:
-    """A vehicle never starts less than the headway behind the one ahead of it in its lane, and drives as fast or less."""
+    """Of two vehicles in a lane, the gap is at least the headway of 1.5 s, and both are as fast."""
     for speed in (2.0, 10.0, 25.0, 50.0):
         traffic, pairs = Traffic.of(f"{kind}:12,speed={speed}"), 0
         for i, j in np.argwhere(~np.eye(12, dtype=bool)):
@@ -103,7 +103,7 @@ def sights(name: str, ticks: NDArray[np.int64]) -> tuple[Recording, dict[bool, i
     for k in ticks:
         p, R = r.truth.position[k], r.truth.rotation[k]
         cars = [(p[n] + [0, 0, size[n, 2] / 2], np.abs(R[n] @ size[n]) / 2) for n in range(N)]
-        targets = np.concatenate([r.landmarks[k], p + [0.0, 0.0, 1.0]])
+        targets = np.concatenate([r.landmarks[k], p + np.array([0.0, 0.0, 1.0])])
         for i in range(N):
             eye = p[i] + R[i] @ [0.5, 0.0, 1.3]
             for n in range(L + i):

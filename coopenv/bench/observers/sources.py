@@ -145,7 +145,7 @@ class Robots(RecordSource):
     windowed: ClassVar[bool] = False
     friendly: ClassVar[str] = (
         "Friendly: robots start at their true pose and are judged from t = 0 on; who is seen is known from barcodes, "
-        "their own left out; planar_robust's wheels were fitted to these robots; all hear all, 10 Hz, no loss."
+        "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
     )
     """What tables of recorded robots are to be read with."""
 
