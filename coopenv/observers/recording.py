@@ -165,7 +165,7 @@ class Recording(Measurements):
         """Whether recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
         if all(setup.planar for setup in self.setups):
             return True
-        return self.scenario is None and not (np.nan_to_num(self.truth.position).any(axis=(0, 1))[2])
+        return self.scenario is None and not np.nan_to_num(self.truth.position[..., 2]).any()
 
     @property
     def observer_init(self) -> ObserverInit:
