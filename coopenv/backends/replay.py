@@ -168,8 +168,7 @@ class Replay(TickGenerator):
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""
-        planar = any(setup.planar for setup in self.recording.setups)
-        observer = find_embedded(self.scenario.observer.name, planar) or HOST
+        observer = find_embedded(self.scenario.observer.name, self.recording.on_a_plane) or HOST
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 

@@ -29,7 +29,7 @@ BAG_SUFFIXES = (".bag", ".db3")
 DRIVE = "coopenv-drive"
 OURS = {"coopenv", DRIVE}
 """Names of the metadata of MCAP files that are no bags of others."""
-DATASETS = re.compile(r"mrclam_\d+")
+DATASETS = re.compile(r"mrclam_\d+(_space)?")
 
 
 IMPORT = "coopenv import {} --map topics.toml --out FILE.mcap"
@@ -85,7 +85,7 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
     """Read a recording.
 
     Args:
-        name: path of an MCAP file, or `mrclam_1` .. `mrclam_9`.
+        name: path of an MCAP file, or `mrclam_1` .. `mrclam_9`, with `_space` for observers in space.
         data: folder of the data sets (None: that of COOPENV_DATA).
         variant: of a data set: "landmarks", "landmarks+robots" (as recorded, the default) or "blind".
 
@@ -104,10 +104,12 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
     if kind is not SourceKind.DATASET:
         raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
     from coopenv.backends.mrclam import load_dataset, recording_of
+    from coopenv.backends.mrclam.dataset import IN_SPACE
     from coopenv.backends.mrclam.recording import check_variant
 
     chosen = check_variant(variant or "landmarks+robots")  # before much is read
-    return recording_of(load_dataset(str(name), data), chosen)
+    in_space = str(name).endswith(IN_SPACE)
+    return recording_of(load_dataset(str(name).removesuffix(IN_SPACE), data), chosen, in_space)
 
 
 def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:

@@ -20,7 +20,7 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError, UnknownEnvironmentError, error_text, shortened, shown, suggest
 
-SCENES = ("lane", "roots", "tree", "random", "ring")
+SCENES = ("lane", "roots", "tree", "random", "ring", "road", "crossroad")
 """Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
 
 EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"

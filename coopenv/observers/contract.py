@@ -5,7 +5,7 @@ in the BODY frame (the paper's g_ij is the negative).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from operator import index
 from typing import Any, Protocol, runtime_checkable
@@ -46,6 +46,21 @@ class SensorNoise:
     camera_position: float = 0.0  # m per axis
     focal_length: float = 0.0  # relative
     clock_offset: float = 0.0  # s, of the vehicle's clock, by which its messages are dated
+    velocity_by_speed: float = 0.0  # m/s per m/s
+    angular_velocity_by: tuple[float, float] = (0.0, 0.0)  # rad/s per m/s, and rad/s per rad/s
+    """What a moving vehicle's odometry samples have in addition: for odometry whose noise is proportional to motion."""
+
+    def moving(self, velocity: Array, angular_velocity: Array) -> "SensorNoise":
+        """Return the noise of a sample at a velocity (3,) in m/s and an angular velocity (3,) in rad/s."""
+        by_speed, by_turning = self.angular_velocity_by
+        if not (self.velocity_by_speed or by_speed or by_turning):
+            return self
+        speed, rate = float(np.linalg.norm(velocity)), float(np.linalg.norm(angular_velocity))
+        return replace(
+            self,
+            velocity=self.velocity + self.velocity_by_speed * speed,
+            angular_velocity=self.angular_velocity + by_speed * speed + by_turning * rate,
+        )
 
     def odometry(self, dt: float) -> Array:
         """Return the variances (6,) of (rotation, translation) of the increment over dt.
@@ -175,7 +190,7 @@ class Tick:
     landmarks: Array  # (L, 3) known positions of the landmarks now, map frame, m
     messages: Mapping[int, Received]  # by target index
     lever_arm: Array  # (3,) the camera's place in the body, m
-    noise: SensorNoise  # standard deviations, those of the setup
+    noise: SensorNoise  # standard deviations, those of the setup at the velocity of this tick
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:

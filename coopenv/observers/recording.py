@@ -101,7 +101,7 @@ class Sensed(Measurements):
             landmarks=self.landmarks,
             messages=messages,
             lever_arm=sealed(setup.lever_arm[:]),
-            noise=setup.noise,
+            noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),
             due=self.due,
         )
 
@@ -159,6 +159,13 @@ class Recording(Measurements):
         arrived = np.diff(self.inbox_tick, axis=0, prepend=-1) > 0
         lag = np.arange(self.ticks)[:, None, None] - self.inbox_tick
         return int(lag[arrived].max(initial=0))
+
+    @property
+    def on_a_plane(self) -> bool:
+        """Whether recorded robots drive on the plane z = 0, so that errors out of it vanish and are not judged."""
+        if all(setup.planar for setup in self.setups):
+            return True
+        return self.scenario is None and not np.nan_to_num(self.truth.position[..., 2]).any()
 
     @property
     def observer_init(self) -> ObserverInit:

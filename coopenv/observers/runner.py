@@ -109,7 +109,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     except ObserverError as error:  # the comparison goes on with the next observer
         failure = str(error)
     coordinates = group.coordinates or Coordinates.LEFT
-    states = PLANAR_STATES if all(setup.planar for setup in r.setups) else tuple(range(6))
+    states = PLANAR_STATES if r.on_a_plane else tuple(range(6))
     position_error, orientation_error, nees = _errors(r.truth, R, p, P, coordinates, states)
     timed = [column[np.isfinite(column)] for column in elapsed[1:].T]
     return Run(

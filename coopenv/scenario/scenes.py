@@ -1,32 +1,17 @@
-"""Parametric scenes: lanes, trees, random graphs and rings of any number of vehicles."""
+"""Parametric scenes: lanes, trees, random graphs, rings and roads of any number of vehicles."""
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from coopenv.base.errors import UnknownEnvironmentError, check_one_of, shown
-
-LANDMARKS = {"SL1": (-4.0, 5.0, 3.0), "SL2": (4.0, 4.0, 5.0), "SL3": (4.0, -3.0, 4.0)}
-"""Name to position, m; as in busy_intersection."""
+from coopenv.scenario.sites import HORIZON, LANDMARKS, PlacedVehicle, Site, crossroad, road, site_of
 
 TARGETS = 3
 """Bearings with which a pose is observable; a vehicle with fewer neighbours measures landmarks besides."""
-
-
-class PlacedVehicle(NamedTuple):
-    """One vehicle."""
-
-    position: tuple[float, float, float]
-    """m"""
-    yaw: float
-    """rad"""
-    velocity: tuple[float, float]
-    """m/s, along x and y of the body: to and fro, or forwards on a circle."""
-    turn: float
-    """rad/s, to the left; 0: it drives to and fro."""
-    neighbours: tuple[str, ...]
 
 
 def _filled(vehicles: Sequence[int], first: int = 0) -> tuple[str, ...]:
@@ -101,18 +86,34 @@ MOST_VEHICLES = 64
 
 
 class Option(NamedTuple):
-    """A whole number that a scene takes."""
+    """A number that a scene takes, a whole one unless its default is a float."""
 
     least: int
     most: int
-    default: int
+    default: float
+
+    def value(self, text: str) -> float | None:
+        """Return the number of a text; None: it is not allowed."""
+        whole = isinstance(self.default, int)
+        if not (WHOLE if whole else DECIMAL).fullmatch(text):
+            return None
+        value = int(text) if whole else float(text)
+        return value if self.least <= value <= self.most else None
+
+    @property
+    def allowed(self) -> str:
+        """The allowed numbers in words."""
+        return f"{'whole ' if isinstance(self.default, int) else ''}numbers {self.least} to {self.most}"
+
+
+WHOLE, DECIMAL = re.compile(r"[0-9]{1,11}"), re.compile(r"[0-9]{1,11}(\.[0-9]{1,11})?")
 
 
 class Scene(NamedTuple):
     """A kind of scene."""
 
     about: str
-    build: Callable[..., Iterator[PlacedVehicle]]
+    build: Callable[..., Site | Iterator[PlacedVehicle]]
     """Takes the options by name."""
     options: Mapping[str, Option]
 
@@ -137,6 +138,16 @@ SCENES: Mapping[str, Scene] = {
         ring,
         {"vehicles": Option(3, MOST_VEHICLES, 5), "seen": Option(1, 2, 1)},
     ),
+    "road": Scene(
+        "A road at speed, with posts and signs.",
+        road,
+        {"vehicles": Option(2, MOST_VEHICLES, 8), "speed": Option(1, 50, 25.0), "lanes": Option(1, 2, 2)},
+    ),
+    "crossroad": Scene(
+        "Two roads that cross between buildings.",
+        crossroad,
+        {"vehicles": Option(2, MOST_VEHICLES, 8), "speed": Option(1, 50, 10.0)},
+    ),
 }
 """By name."""
 
@@ -150,7 +161,7 @@ def scene_rows() -> list[dict[str, str]]:
     return rows
 
 
-def _options(kind: str, text: str) -> dict[str, int]:
+def _options(kind: str, text: str) -> dict[str, float]:
     """Return every option of a scene as it is given behind the colon; missing ones have their defaults."""
     known, given = SCENES[kind].options, {}
     for place, word in enumerate(text.split(",") if text.strip() else ()):
@@ -162,13 +173,10 @@ def _options(kind: str, text: str) -> dict[str, int]:
             raise UnknownEnvironmentError(f"scene {kind}: unknown option {shown(key)}; allowed: {allowed}")
         if key in given:
             raise UnknownEnvironmentError(f"scene {kind}: {key} is given twice")
-        least, most, _ = known[key]
-        whole = value.isascii() and value.isdigit() and len(value) < 12
-        if not whole or not least <= int(value) <= most:
-            raise UnknownEnvironmentError(
-                f"scene {kind}: {key} = {shown(value)}, allowed are whole numbers {least} to {most}"
-            )
-        given[key] = int(value)
+        number = known[key].value(value)
+        if number is None:
+            raise UnknownEnvironmentError(f"scene {kind}: {key} = {shown(value)}, allowed are {known[key].allowed}")
+        given[key] = number
     return {name: given.get(name, option.default) for name, option in known.items()}
 
 
@@ -182,16 +190,9 @@ description = \"\"\"
 {about}
 Starts are up to 10 deg and 1 m off; bearings have the noise of busy_intersection_tracking.\"\"\"
 source = "made by: coopenv scene {name}"
-horizon = 50.0 # of at most {longest:g} s, after which vehicles that drive to and fro stand still
+horizon = {horizon:.1f} # {after}
 
-[rates]
-camera = 60.0
-odometry = 60.0
-decision = 10.0
-
-[camera]
-model = "omnidirectional"
-orientation = "body"
+{sensors}
 
 [noise]
 velocity = 0.1          # m/s
@@ -202,7 +203,7 @@ bearing.scale = 0.002886751345948129 # rad: 0.005 / sqrt(3)
 bearing.rate = "sample"
 
 [topology]
-mode = "fixed"
+mode = "{mode}"
 acyclic = {acyclic}
 
 [observer]
@@ -213,9 +214,31 @@ P0 = [1.0, 100.0]
 
 [observation]
 position_scale = {scale:.0f}.0
-velocity_scale = 2.0
+velocity_scale = {velocity:.1f}
 angular_velocity_scale = 1.0
 """
+
+FIXED = """\
+[rates]
+camera = 60.0
+odometry = 60.0
+decision = 10.0
+
+[camera]
+model = "omnidirectional"
+orientation = "body\""""
+
+SENSED = """\
+[rates]
+camera = 10.0
+odometry = 100.0
+decision = 10.0
+
+[camera]
+model = "omnidirectional"
+orientation = "body"
+position = [0.5, 0.0, 1.3] # m, behind the windscreen
+range = {range}"""
 
 DEFAULTS = """
 [vehicle_defaults]
@@ -233,33 +256,58 @@ def scene_text(name: str) -> str:
     kind, _, rest = name.partition(":")
     check_one_of("unknown scene", kind, SCENES, UnknownEnvironmentError)
     scene, options = SCENES[kind], _options(kind, rest)
-    placed = [*scene.build(**options)]
+    site = site_of(scene.build(**options))
+    given = ",".join(f"{key}={value:g}" for key, value in options.items())
     head = HEAD.format(
-        title=f"{kind.capitalize()}: {', '.join(f'{key} {value}' for key, value in options.items())}",
+        title=f"{kind.capitalize()}: {given.replace('=', ' ').replace(',', ', ')}",
         about=scene.about,
-        name=f"{kind}:{','.join(f'{key}={value}' for key, value in options.items())}",
-        longest=LONGEST,
+        name=f"{kind}:{given}",
+        horizon=HORIZON,
+        after=f"of at most {LONGEST:g} s, after which vehicles that drive to and fro stand still"
+        if site.range is None
+        else "after which the landmarks end",
+        sensors=FIXED if site.range is None else SENSED.format(range=site.range),
+        mode="fixed" if site.range is None else "sensed",
         acyclic=str(kind != "ring").lower(),
-        scale=max(40.0, *(abs(x) for vehicle in placed for x in vehicle.position)),
+        scale=max(40.0, *(abs(x) for vehicle in site.vehicles for x in vehicle.position)),
+        velocity=max(2.0, *(math.hypot(*vehicle.velocity) for vehicle in site.vehicles)),
     )
-    landmarks = "".join(f'\n[[landmarks]]\nname = "{n}"\nposition = {_vector(*p)}\n' for n, p in LANDMARKS.items())
-    return head + landmarks + DEFAULTS + "".join(map(_vehicle, placed))
+    return head + "".join(_surroundings(site)) + DEFAULTS + "".join(map(_vehicle, site.vehicles))
+
+
+def _surroundings(site: Site) -> Iterator[str]:
+    """Yield map origin, roads, buildings and landmarks."""
+    if any(site.origin):
+        yield f"\n[map]\norigin = {_vector(*site.origin, 0.0)}\n"
+    for start, end in site.roads:
+        yield f"\n[[roads]]\nstart = {_vector(*start)}\nend = {_vector(*end)}\nwidth = 8.0\n"
+    for n, (center, size) in enumerate(site.buildings, 1):
+        middle = _vector(*center, size[2] / 2)
+        yield f'\n[[obstacles]]\nname = "building_{n}"\ncenter = {middle}\nsize = {_vector(*size)}\n'
+    for name, position in site.landmarks.items():
+        yield f'\n[[landmarks]]\nname = "{name}"\nposition = {_vector(*position)}\n'
 
 
 def _vehicle(placed: PlacedVehicle) -> str:
     names = ", ".join(f'"{name}"' for name in placed.neighbours)
+    neighbours = f"neighbours = [{names}]\n" if placed.neighbours else ""
     yaw = f"initial_pose.yaw = {placed.yaw:.6g}\n" if placed.yaw else ""
     vx, vy = placed.velocity
-    if placed.turn:
-        turn = f"linear = {_vector(vx, vy, 0.0)}, angular = [0.0, 0.0, {placed.turn:.6g}]"
-        motion = f'{{ kind = "constant", {turn} }}'
+    body = ""
+    if placed.size is not None:
+        _, _, height = placed.size
+        body = f"body = {{ size = {_vector(*placed.size)}, center = {_vector(0.0, 0.0, height / 2)} }}\n"
+        body += f"marker = {_vector(0.0, 0.0, 1.0)}\n"
+    if placed.turn or placed.size:
+        turn = f", angular = [0.0, 0.0, {placed.turn:.6g}]" if placed.turn else ""
+        motion = f'{{ kind = "constant", linear = {_vector(vx, vy, 0.0)}{turn} }}'
     else:
         legs = [_vector(vx * (-1) ** n, vy * (-1) ** n, 0.0) for n in range(round(LONGEST / LEG))]
         rows = ",\n".join(f"  {{ duration = {LEG}, linear = {leg} }}" for leg in legs)
         motion = f'{{ kind = "segments", segments = [\n{rows},\n] }}'
     return (
         f"\n[[vehicles]]\ninitial_pose.position = {_vector(*placed.position)}\n{yaw}"
-        f"motion = {motion}\nneighbours = [{names}]\n"
+        f"{body}motion = {motion}\n{neighbours}"
     )
 
 

@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.dataset import MotionCapture
 from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, recording_of
+from coopenv.backends.sources import open_recording
 from coopenv.base.errors import DataError
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
-from tests.helpers.mrclam_files import LANDMARKS, pose, real_folder, write
+from tests.helpers.mrclam_files import LANDMARKS, command, pose, real_folder, write
 
 REAL = real_folder()
 ORIGIN_S = 0.1  # of the synthetic files: the first odometry sample
@@ -140,6 +141,89 @@ def test_the_zoo_runs(dataset, observer):
     result = run(observer, recording_of(dataset, "landmarks+robots"))
     assert not result.failure
     assert (result.position_rmse() < 0.1).all()
+
+
+@pytest.fixture(scope="module")
+def spatial(dataset):
+    return recording_of(dataset, "landmarks+robots", in_space=True)
+
+
+class TestInSpace:
+    def test_the_name_opens_it(self, spatial, dataset, tmp_path):
+        opened = open_recording("mrclam_6_space", write(tmp_path))
+        np.testing.assert_array_equal(opened.translation, spatial.translation)
+        assert opened.setups[0].target_names == spatial.setups[0].target_names
+        with pytest.raises(DataError, match="unknown data set 'mrclam_0'"):
+            open_recording("mrclam_0_space", tmp_path)
+
+    def test_measurements_are_those_of_the_plane_and_the_zenith(self, recording, spatial):
+        L = len(LANDMARKS)
+        names = list(spatial.setups[0].target_names)
+        assert names.pop(L) == "zenith" and tuple(names) == recording.setups[0].target_names
+        np.testing.assert_array_equal(np.delete(spatial.bearings, L, axis=2), recording.bearings)
+        np.testing.assert_array_equal(np.delete(spatial.visible, L, axis=2), recording.visible)
+        np.testing.assert_array_equal(spatial.inbox_tick, recording.inbox_tick)
+        assert spatial.visible[:, 3, L].sum() == math.ceil((spatial.ticks - 1) * TICK_S / 2.0)
+        assert (spatial.bearings[spatial.visible[:, 3, L], 3, L] == (0.0, 0.0, 1.0)).all()
+        for i, setup in enumerate(spatial.setups):
+            assert not setup.planar and setup.targets.tolist() == np.delete(np.arange(L + 6), L + 1 + i).tolist()
+
+    def test_odometry_is_what_the_wheels_make_of_commands(self, spatial):
+        """Once a command has been held for a while, with the gain at its curvature."""
+        for i in range(5):
+            v, w = command(i + 1)
+            gain = np.interp(abs(w - 0.005) / v, [0.35, 0.8, 1.6], [1.3, 0.88, 0.84])
+            turn, speed = 0.936 * gain * (w - 0.005), v + 0.004 - v * abs(w)
+            assert spatial.angular_velocity[200, i, 2] == pytest.approx(turn, rel=1e-6)
+            assert spatial.velocity[200, i, 0] == pytest.approx(speed, rel=1e-6)
+            turned = Rotation.from_matrix(spatial.rotation[200, i]).as_rotvec()
+            np.testing.assert_allclose(turned, [0, 0, turn * TICK_S], atol=1e-9)
+            chord = 2 * speed / turn * math.sin(turn * TICK_S / 2)
+            half = turn * TICK_S / 2
+            np.testing.assert_allclose(
+                spatial.translation[200, i], [chord * math.cos(half), chord * math.sin(half), 0.0], atol=1e-9
+            )
+
+    def test_wheels_are_late(self, dataset):
+        """A robot that is sent off at 5 s starts 0.175 s later, and is at its speed 0.4 s after that."""
+        robots = list(dataset.robots)
+        odometry = robots[0].odometry.copy()
+        odometry[odometry[:, 0] < 5.0, 1:] = 0.0
+        robots[0] = replace(robots[0], odometry=odometry)
+        r = recording_of(replace(dataset, robots=tuple(robots)), "landmarks", in_space=True)
+        assert not r.translation[r.t < 5.15, 0].any() and r.translation[r.t > 5.25, 0, 0].min() > 0.0
+        late = r.velocity[r.t > 5.65, 0, 0]
+        assert np.ptp(late) < 1e-9 < late[0] - r.velocity[r.t < 5.45, 0, 0].max()
+
+    def test_noise_is_in_proportion_to_motion(self, spatial):
+        """Before the first detection, the variance of a position grows by the square of the speed's noise."""
+        v, noise = spatial.velocity[:, 4, 0], spatial.setups[4].noise
+        still, moving = (noise.moving(np.array([x, 0.0, 0.0]), np.zeros(3)) for x in (0.0, 0.15))
+        assert still == replace(noise) and moving.velocity == pytest.approx(0.02 / math.sqrt(TICK_S), rel=1e-6)
+        assert moving.angular_velocity == pytest.approx(0.023 / math.sqrt(TICK_S), rel=1e-6)
+        k = int(np.flatnonzero(spatial.visible[:, 4, :5].any(axis=1))[0]) - 1
+        expected = START_STD[1] ** 2 + float(((0.002 + 0.12 * v[1 : k + 1]) ** 2).sum()) * TICK_S
+        assert k * TICK_S == pytest.approx(0.95, abs=0.06)
+        for observer in ("robust", "mekf_covariance", "dead_reckoning"):
+            covariance = run(observer, spatial).covariance
+            assert covariance[k, 4, 3, 3] == pytest.approx(expected, rel=0.05), observer
+
+    def test_estimates_stay_on_the_plane_and_are_judged_there(self, spatial, recording):
+        """The robots of the files are no Creates: odometry that turns 12 % too little is off by a decimetre."""
+        assert spatial.on_a_plane and recording.on_a_plane
+        for observer in ("robust", "schmidt_kalman", "centralised"):
+            result = run(observer, spatial)
+            assert not result.failure and result.nees_dof == 3
+            assert (result.position_rmse() < 0.15).all(), observer
+            assert np.abs(result.position[..., 2]).max() < 1e-3
+            assert np.abs(result.rotation[..., 2, :2]).max() < 1e-3
+
+    def test_roll_and_pitch_are_known_without_detections(self, dataset):
+        """After 38 s the heading's variance has grown far beyond those of roll and pitch."""
+        alone = tuple(replace(robot, detections=robot.detections[:0]) for robot in dataset.robots)
+        r = recording_of(replace(dataset, robots=alone), "blind", in_space=True)
+        std = np.sqrt(np.diagonal(run("robust", r).covariance[-1, 3], axis1=0, axis2=1))
+        assert std[0] < 0.06 and std[1] < 0.06 and std[2] > 0.15
 
 
 @pytest.mark.skipif(REAL is None, reason="no MRCLAM_Dataset6 (name its parent in COOPENV_DATA)")

@@ -16,6 +16,8 @@ from coopenv.base.errors import DataError, DataWarning, suggest
 from coopenv.estimation.poses import Array
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
+IN_SPACE = "_space"
+"""Behind a name: the robots as vehicles in space, with odometry by their wheels."""
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 
 MAX_PAUSE_S = 3600.0  # between two rows; more is a broken time stamp
@@ -330,7 +332,7 @@ class HeldCommands:
         k = np.searchsorted(self._t, t, side="right") - 1
         start, dt = self._at_samples[k], t - self._t[k]
         turn = self._omega[k] * dt
-        moved = start[:, :2] + _arc(start[:, 2], self._v[k] * dt, turn)
+        moved = start[:, :2] + arc(start[:, 2], self._v[k] * dt, turn)
         return np.where((k < 0)[:, None], 0.0, np.column_stack([moved, start[:, 2] + turn]))
 
     @cached_property
@@ -339,11 +341,11 @@ class HeldCommands:
         dt = np.diff(self._t)
         turn, path = self._omega[:-1] * dt, self._v[:-1] * dt
         heading = np.concatenate([[0.0], np.cumsum(turn)])
-        steps = _arc(heading[:-1], path, turn)
+        steps = arc(heading[:-1], path, turn)
         return np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), heading])
 
 
-def _arc(heading: Array, path: Array, turn: Array) -> Array:
+def arc(heading: Array, path: Array, turn: Array) -> Array:
     """Return the displacement (K, 2) along arcs that begin at a heading: a chord at half the turn."""
     chord, middle = path * np.sinc(turn / (2 * np.pi)), heading + turn / 2
     return np.stack([chord * np.cos(middle), chord * np.sin(middle)], axis=-1)

@@ -158,7 +158,7 @@ def compare(
 
     Args:
         observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
-        environment: name, TOML file, recorded robots (`mrclam_1` to `mrclam_9`), MCAP file or ROS bag.
+        environment: name, TOML file, recorded robots (`mrclam_1`, `mrclam_1_space`, ...), MCAP file or ROS bag.
         seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
@@ -213,7 +213,9 @@ class Plan:
         numbers = tuple(dict.fromkeys(map(checked_seed, given)))
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
-        edges = checked_edges(windows) if windows is not None else () if source.planar else EDGES
+        edges = (
+            checked_edges(windows) if windows is not None else EDGES if source.windowed and not source.planar else ()
+        )
         obstacles = {} if observers is not None else {name: obstacle(name) for name in observer_names()}
         if ALL in ([variants] if isinstance(variants, str) else variants or ()):
             obstacles |= {name: source.obstacle(name) for name in source.variants}

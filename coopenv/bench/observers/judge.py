@@ -129,7 +129,7 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
     windows = windows_of(edges, steady_from, float(recording.t[-1]))
     within = np.full((len(BOUNDS), len(names), len(windows)), np.nan)
     bound, gramians = np.full((len(kept), len(names)), np.nan), np.full((2, len(names)), np.nan)
-    if known and not any(setup.planar for setup in recording.setups):
+    if known and not recording.on_a_plane:
         bounds = _bounds(recording)
         bound = bounds[0].position[kept]
         ticks = [window.ticks(recording.t) for window in windows]

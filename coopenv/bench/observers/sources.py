@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from coopenv.backends.base import Backend
+from coopenv.backends.mrclam.dataset import IN_SPACE
 from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
 from coopenv.bench.observers.faults import (
@@ -36,10 +37,6 @@ already_warned = partial(warnings.catch_warnings, action="ignore", category=Data
 """Silences the warnings on recorded data that `Source.check` has given."""
 
 
-def _is_planar(recording: Recording) -> bool:
-    return all(setup.planar for setup in recording.setups)
-
-
 @dataclass(frozen=True)
 class RecordSource(ABC):
     """Records of one environment in several variants; by default with faults, and of vehicles in space.
@@ -57,6 +54,8 @@ class RecordSource(ABC):
     """Those that are run unless others are asked for."""
     seeded: ClassVar[bool] = False
     """Whether another seed gives another record."""
+    windowed: ClassVar[bool] = True
+    """Whether windows of time from the start on are judged by default: of robots on a plane they are not."""
 
     @property
     def variants(self) -> dict[str, str]:
@@ -80,7 +79,7 @@ class RecordSource(ABC):
     def planar(self) -> bool:
         """Whether its vehicles are robots on a plane; observers suit either these or vehicles in space."""
         world = self.world()
-        return isinstance(world, Recording) and _is_planar(world)
+        return isinstance(world, Recording) and all(setup.planar for setup in world.setups)
 
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""
@@ -104,7 +103,7 @@ class RecordSource(ABC):
         """
         if given is not None and not 0.0 <= given < math.inf:
             raise CoopenvError(f"start of the steady state at {given:g} s: not within the run")
-        if recording is None or (given is None and _is_planar(recording)):
+        if recording is None or (given is None and recording.on_a_plane):
             return given or 0.0
         return steady_start(given, float(recording.t[-1]))
 
@@ -143,16 +142,17 @@ class Robots(RecordSource):
     """The folder with the data; None: the environment variable COOPENV_DATA."""
     named: ClassVar[Mapping[str, str]] = ROBOT_VARIANTS
     usual: ClassVar[tuple[str, ...]] = tuple(ROBOT_VARIANTS)
+    windowed: ClassVar[bool] = False
     friendly: ClassVar[str] = (
         "Friendly: robots start at their true pose and are judged from t = 0 on; who is seen is known from barcodes, "
-        "their own left out; planar_robust's wheels were fitted to these robots; all hear all, 10 Hz, no loss."
+        "their own left out; the wheels' response was fitted to these robots; all receive from all, 10 Hz, no loss."
     )
     """What tables of recorded robots are to be read with."""
 
     @property
     def planar(self) -> bool:
-        """Its robots drive on a plane."""
-        return True
+        """Whether observers get commands on a plane, or odometry in space."""
+        return not self.name.endswith(IN_SPACE)
 
     def world(self) -> Recording:
         """Return the robots' record."""
