@@ -94,13 +94,13 @@ LINES_AND_FILES = {
     "cli": (2050, 7),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (10940, 45),
+    "observers": (11000, 45),
     "policies": (1270, 7),
     "runs": (3060, 13),
-    "scenario": (3020, 12),
+    "scenario": (3040, 12),
     "training": (1160, 5),
     "viz": (4410, 17),
-    "world": (4140, 17),
+    "world": (4170, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

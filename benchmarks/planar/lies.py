@@ -27,7 +27,7 @@ class Drifting:
             return message
         off = (self.jump + self.drift * (self._now - self.since)) * np.array([0.6, 0.8, 0.0])
         lie = replace(message, position=message.position + off, covariance=1e-4 * np.eye(3))
-        return observer.tampered(lie)  # type: ignore[no-any-return]
+        return observer.tampered(lie, message)  # type: ignore[no-any-return]
 
 
 class Replaying:

@@ -127,7 +127,7 @@ class ObserverGroup:
         self.mail.expect_as(vehicle, message)
         if interference is not None:
             shift, turn, std = interference.shift[vehicle], interference.turn[vehicle], interference.std[vehicle]
-            message = altered(observer, message, shift, turn, float(std))
+            message = altered(observer, message, shift, turn, float(std), bool(interference.consistent[vehicle]))
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
         if tamper is not None and tamper.applies(vehicle, k * self.observer_init.dt):
             message = tamper.broadcast(observer, message)

@@ -154,6 +154,10 @@ class KernelObserver:
         self._run("send_one", self._now[0])
         return cast(Message, self._messages.write(self))
 
+    def tampered(self, made: Message, honest: Message) -> Message:
+        """Return a false message whose other entries agree with its pose."""
+        return cast(Message, self._messages.tampered(made, honest))
+
     def _sense(self, tick: Tick, now: int) -> None:
         s = self.state
         for name in ("velocity", "angular_velocity"):

@@ -209,16 +209,25 @@ class Interference:
     clock: NDArray[np.int64]  # (N,) ticks by which its clock is ahead
     restarts: NDArray[np.bool_]  # (..., N) whether its observer starts anew before this tick
     kept: NDArray[np.int64]  # (N,) ticks for which it keeps its messages to replay them
+    consistent: NDArray[np.bool_]  # (N,) whether the other entries of its messages agree with a false pose
 
     def at(self, k: int) -> "Interference":
         """Return the faults at tick k."""
         return replace(self, **{name: getattr(self, name)[k] for name in PER_TICK})
 
 
-def altered(observer: Any, message: Message, shift: Array, turn: Array | None = None, std: float = 0.0) -> Message:
+def altered(
+    observer: Any,
+    message: Message,
+    shift: Array,
+    turn: Array | None = None,
+    std: float = 0.0,
+    consistent: bool = True,
+) -> Message:
     """Return a message that states another pose, and a covariance std^2 I of whatever size (std 0: its own).
 
-    Other entries are changed by the observer: its method `tampered(message)`, if it has one, makes them agree.
+    Other entries of a consistent one are changed by the observer: its method `tampered(false message, honest message)`,
+    if it has one, makes them agree.
     """
     position, R, P = message.position, message.rotation, message.covariance
     turned = turn is not None and bool(np.any(turn))
@@ -231,7 +240,7 @@ def altered(observer: Any, message: Message, shift: Array, turn: Array | None = 
         covariance=P if P is None or std == 0.0 else std**2 * np.eye(len(P), dtype=P.dtype),
     )
     tampered = getattr(observer, "tampered", None)
-    return made if tampered is None else tampered(made)
+    return made if tampered is None or not consistent else tampered(made, message)
 
 
 def interference_of(
@@ -252,6 +261,7 @@ def interference_of(
         clock=view("clock")[world].astype(np.int64),
         restarts=view("restart_tick")[world] == k,
         kept=old,
+        consistent=fault["lie_consistent"].astype(bool),
     )
 
 

@@ -267,8 +267,12 @@ class Lie(Section):
     """From when on, s."""
     start_spread: NonNegative = 0.0
     """So much later at most, drawn uniformly (once for all that collude), s."""
-    offset: Positive = 5.0
+    offset: NonNegative = 5.0
     """Of `jump` and `collude`, m."""
+    turn: NonNegative = 0.0
+    """Of `jump` and `collude`: about its own z axis, added to its attitude, rad."""
+    odometry: Literal["consistent", "honest"] = "consistent"
+    """Whether the odometry in its messages, if they have one, leads where the lie does or where the vehicle drives."""
     speed: Positive = 0.05
     """Of `drift`, m/s."""
     age: Annotated[float, Field(gt=0.0, le=LONGEST_REPLAY)] = 1.0

@@ -119,6 +119,8 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
         "lie_replay": scenario.ticks_of_replay(lie.age),
         "lie_direction": direction,
         "lie_std": lie.std or 0.0,
+        "lie_turn": lie.turn,
+        "lie_consistent": int(lie.odometry == "consistent"),
     }
 
 

@@ -62,6 +62,8 @@ class Messages:
     read: Callable[[Any, int, Any, int], None]
     """(KernelObserver, sender, Message, sent): put a message into the observer's inbox; `sent` is
     when, in the kernels' time. Raises ValueError or a CoopenvError where the message is malformed."""
+    tampered: Callable[[Any, Any], Any] = lambda made, honest: made
+    """(false Message, honest Message): return the false one with all entries in agreement with its pose."""
 
 
 @dataclass(frozen=True)

@@ -270,6 +270,8 @@ def model_struct(p: Precision) -> Any:
         lie_replay: wp.int32  # ticks by which messages are old
         lie_direction: vec3  # of length 1; zero: drawn
         lie_std: scalar  # claimed, rad and m; 0: honest
+        lie_turn: scalar  # rad
+        lie_consistent: wp.int32  # whether the odometry in messages leads where the lie does
 
     @wp.struct
     class ObserverValues:

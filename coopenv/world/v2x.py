@@ -108,6 +108,7 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if is_lying(state, world, vehicle, tick):
         if fault.lie == JUMP or fault.lie == COLLUDE:
             shift = state.lie_vector[world, vehicle]
+            turn[2] = fault.lie_turn
         if fault.lie == DRIFT:
             since = wp.float64(tick - state.lie_tick[world, vehicle]) * model.camera_period
             shift = state.lie_vector[world, vehicle] * shift.dtype(since)
@@ -133,6 +134,22 @@ def as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, posit
         if wp.length_sq(turn) > turn.dtype(0.0):
             sent_R = R * exp_so3(turn)
     return sent_R, sent_position
+
+
+@wp.func
+def odometry_as_broadcast(model: Any, state: Any, world: int, vehicle: int, R: Any, R_odometry: Any, p_odometry: Any):
+    """Return the dead reckoning that a vehicle broadcasts for (R_odometry, p_odometry), at the attitude R.
+
+    That of a consistent liar leads where its poses do.
+    """
+    sent_R = R_odometry
+    sent_p = p_odometry
+    if model.alters == 1 and model.fault[vehicle].lie_consistent == 1:
+        sent_p = p_odometry + R_odometry * wp.transpose(R) * type(p_odometry)(state.broadcast_shift[world, vehicle])
+        turn = type(p_odometry)(state.broadcast_turn[world, vehicle])
+        if wp.length_sq(turn) > turn.dtype(0.0):
+            sent_R = R_odometry * exp_so3(turn)
+    return sent_R, sent_p
 
 
 @wp.func

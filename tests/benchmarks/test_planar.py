@@ -53,8 +53,8 @@ def test_sightings_are_hidden_misread_and_late(data):
 
 
 class Speaker:
-    def tampered(self, message):
-        return message
+    def tampered(self, made, honest):
+        return made
 
 
 def test_messages_of_lying_senders():

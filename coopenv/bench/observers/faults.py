@@ -85,7 +85,11 @@ def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
     lying = since >= 0
     none = (np.zeros((K, N, 3)), np.zeros((K, N, 3)), np.zeros((K, N)), np.zeros((K, N), np.int64))
     false = deepcopy(recording.interference) or Interference(
-        *none, clock=np.zeros(N, np.int64), restarts=np.zeros((K, N), bool), kept=np.zeros(N, np.int64)
+        *none,
+        clock=np.zeros(N, np.int64),
+        restarts=np.zeros((K, N), bool),
+        kept=np.zeros(N, np.int64),
+        consistent=np.ones(N, bool),
     )
     for sender in senders:
         if fault.word == "replay":
@@ -94,6 +98,8 @@ def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
         else:
             size = fault.value * (since * recording.dt if fault.word == "drift" else np.ones(K))
             false.shift[lying, sender] += (size[:, None] * DIRECTION)[lying]
+            false.turn[lying, sender, 2] += fault.options.get("turn", 0.0)
+        false.consistent[sender] = fault.options.get("honest_odometry", 0.0) == 0.0
         if "std" in fault.options:
             false.std[lying, sender] = fault.options["std"]
     return replace(recording, interference=false)
@@ -170,7 +176,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "a vehicle broadcasts another pose: jump or collude (m), drift (m/s), replay (s)",
         words={"jump": 5.0, "drift": 0.05, "replay": 1.0, "collude": 5.0},
         start=True,
-        options=("std",),
+        options=("std", "turn", "honest_odometry"),
         vehicles=True,
         change=with_lie,
     ),

@@ -193,13 +193,13 @@ class PlanarRobust(PlanarEkf):
         }
         return replace(super().message(), extra=extra)
 
-    def tampered(self, message: Message) -> Message:
+    def tampered(self, made: Message, honest: Message) -> Message:
         """Return a message with a changed position whose sightings agree with it."""
-        if message.position is None or "from" not in message.extra:
-            return message
-        by = np.array(message.extra["from"])
-        by[:2] += (message.position[:2] - self.filter.state[:2]).astype(by.dtype)
-        return replace(message, extra={**message.extra, "from": by})
+        if made.position is None or honest.position is None or "from" not in made.extra:
+            return made
+        by = np.array(made.extra["from"])
+        by[:2] += (made.position[:2] - honest.position[:2]).astype(by.dtype)
+        return replace(made, extra={**made.extra, "from": by})
 
     def _advance(self, dt: float, turn: float, path: float) -> None:
         step = self.filter.advance(dt, turn, path)

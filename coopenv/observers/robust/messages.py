@@ -69,6 +69,16 @@ def _others(observer: Any, sender: int, message: Message, name: str, most: int) 
     return others
 
 
+def lead_along(made: Message, honest: Message) -> Message:
+    """Return a false message whose odometry leads where its pose does, as the honest message's leads to that one's."""
+    if made.position is None or "odometry" not in honest.extra:
+        return made
+    R, p = from_six(np.asarray(honest.extra["odometry"], np.float64))
+    back = R @ np.asarray(honest.rotation).T
+    led = np.concatenate([log_so3(back @ made.rotation), p + back @ (made.position - honest.position)])
+    return replace(made, extra={**made.extra, "odometry": led.astype(honest.extra["odometry"].dtype)})
+
+
 def check_pose(message: Message) -> None:
     """Refuse a message without a valid pose and a covariance that can be inverted."""
     if message.position is None or message.rotation is None or message.covariance is None:
@@ -119,4 +129,4 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
         kept[n] = vehicle, sent - observer.units(age), matrix
 
 
-ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast)
+ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast, lead_along)

@@ -16,7 +16,7 @@ from coopenv.estimation.linalg import sheared, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
-from coopenv.world.v2x import as_broadcast, claimed_std
+from coopenv.world.v2x import as_broadcast, claimed_std, odometry_as_broadcast
 from coopenv.world.warp_internals import device_function
 
 
@@ -43,7 +43,7 @@ def marker_jacobian(marker: Any):
 def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Return the report that a vehicle broadcasts: empty while its pose is not known.
 
-    It holds pose, covariance and odometry at the marker, with the changes of a `lie` fault, see `[faults]`.
+    It holds pose, covariance and odometry at the marker, with the changes of a `lie` fault, see `[faults.lie]`.
     """
     report = SenderReport()
     report.tick = tick
@@ -58,10 +58,12 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
         pose = memory.member[world, i, 0].pose
         R, p = as_broadcast(model, state, world, i, pose.R, pose.p + pose.R * marker)
         odometry = memory.belief[world, i].odometry
+        place = odometry.p + odometry.R * marker
+        odometry_R, odometry_p = odometry_as_broadcast(model, state, world, i, pose.R, odometry.R, place)
         report.valid = 1
         report.pose = Pose(R, p)
         report.P = mat66f(P)
-        report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
+        report.odometry = Pose(odometry_R, odometry_p)
         report.depends_on = memory.belief[world, i].depends_on
     return report
 

@@ -319,11 +319,12 @@ def test_lies_on_a_recording_are_those_of_a_scenario(word: str, keys: dict[str, 
 
 def test_an_observer_adapts_its_own_entries_to_a_lie() -> None:
     class Own:
-        def tampered(self, message: Message) -> Message:
-            return replace(message, extra={"twice": 2.0 * message.position})
+        def tampered(self, made: Message, honest: Message) -> Message:
+            return replace(made, extra={"twice": made.position + honest.position})
 
     shift = np.array([3.0, 4.0, 0.0])
-    assert_array_equal(altered(Own(), Message(position=np.ones(3)), shift).extra["twice"], [8.0, 10.0, 2.0])
+    assert_array_equal(altered(Own(), Message(position=np.ones(3)), shift).extra["twice"], [5.0, 6.0, 2.0])
+    assert not altered(Own(), Message(position=np.ones(3)), shift, consistent=False).extra
     bare = Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32))
     bare = altered(object(), bare, shift, std=0.01)
     assert bare.covariance is not None and bare.covariance.shape == (6, 6) and bare.rotation is None

@@ -17,15 +17,21 @@ from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_sources import scene
 from tests.helpers.robust_worlds import position_errors
 
+HONEST = {"odometry": "honest"}
 LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
-    "the first from its first word, 5 m": ((0,), {"kind": "jump"}),
-    "the second from its first word, 5 m": ((1,), {"kind": "jump"}),
-    "the second from 15 s on, 5 m": ((1,), {"kind": "jump", "start": 15.0}),
-    "the second drifts at 5 cm/s from 15 s on": ((1,), {"kind": "drift", "start": 15.0}),
-    "the third drifts at 5 cm/s from 15 s on": ((2,), {"kind": "drift", "start": 15.0}),
+    "the first from its first word, 5 m": ((0,), {"kind": "jump", **HONEST}),
+    "the second from its first word, 5 m": ((1,), {"kind": "jump", **HONEST}),
+    "the second from 15 s on, 5 m": ((1,), {"kind": "jump", "start": 15.0, **HONEST}),
+    "the second from 15 s on, 5 m, consistent": ((1,), {"kind": "jump", "start": 15.0}),
+    "the second turns by 30 deg from 15 s on": ((1,), {"kind": "jump", "start": 15.0, "offset": 0.0, "turn": 0.52}),
+    "the second drifts at 5 cm/s from 15 s on": ((1,), {"kind": "drift", "start": 15.0, **HONEST}),
+    "the second drifts at 5 cm/s from 15 s on, consistent": ((1,), {"kind": "drift", "start": 15.0}),
+    "the third drifts at 5 cm/s from 15 s on": ((2,), {"kind": "drift", "start": 15.0, **HONEST}),
     "the second repeats itself 1 s late from 15 s on": ((1,), {"kind": "replay", "start": 15.0}),
-    "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0}),
+    "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0, **HONEST}),
+    "the first two collude from 15 s on, 5 m, consistent": ((0, 1), {"kind": "collude", "start": 15.0}),
 }
+"""Without HONEST, the odometry in messages agrees with the lie."""
 
 
 def mean_errors(made: Scenario, seeds: range, seconds: int, start: float) -> np.ndarray:
@@ -57,8 +63,10 @@ def costs(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, np.ndarray
 
 
 MOST = {
+    "the second drifts at 5 cm/s from 15 s on, consistent": 9.0,
     "the second repeats itself 1 s late from 15 s on": 8.0,
     "the first two collude from 15 s on, 5 m": 4.5,
+    "the first two collude from 15 s on, 5 m, consistent": 5.5,
 }
 """Where the median over worlds is not below 3."""
 
