@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (130, 2),
-    "api": (3850, 19),
+    "api": (3880, 19),
     "backends": (3230, 17),
     "base": (1390, 9),
     "bench": (4190, 17),
@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2050, 7),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (10850, 44),
+    "observers": (10960, 45),
     "policies": (1270, 7),
     "runs": (3060, 13),
     "scenario": (2840, 11),
