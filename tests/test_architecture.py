@@ -99,7 +99,7 @@ LINES_AND_FILES = {
     "runs": (3060, 13),
     "scenario": (2840, 11),
     "training": (1160, 5),
-    "viz": (4410, 17),
+    "viz": (4450, 17),
     "world": (4140, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -236,18 +236,19 @@ def level_measures(error: Array, result: Run) -> dict[str, Array]:
     which it is unknown; and the median known level over the 95th percentile of the horizontal error in the same ticks.
     """
     level, angle = result.protection_level, np.radians(result.orientation_error)
-    stated = ~np.isnan(level).any(axis=-1)
+    stated = np.asarray(~np.isnan(level).any(axis=-1))
     known = result.judged & stated & np.isfinite(level[..., 0])
     ratio = np.full(known.shape[1], np.nan)
     for i in np.flatnonzero(known.any(axis=0)):
         reached = float(np.quantile(error[known[:, i], i], 0.95))
         ratio[i] = np.median(level[known[:, i], i, 0]) / reached if reached > 0.0 else np.nan
-    return {
-        "level_exceeded": result.mean(error > level[..., 0], stated),
-        "angle_level_exceeded": result.mean(angle > level[..., 1], stated),
-        "level_unknown": result.mean(~np.isfinite(level).all(axis=-1), stated),
-        "level_over_e95": ratio,
+    counted = {
+        "level_exceeded": error > level[..., 0],
+        "angle_level_exceeded": angle > level[..., 1],
+        "level_unknown": ~np.isfinite(level).all(axis=-1),
     }
+    shares = {name: result.mean(np.asarray(ticks, float), stated) for name, ticks in counted.items()}
+    return {**shares, "level_over_e95": ratio}
 
 
 def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dict[str, Array]:

@@ -245,7 +245,7 @@ def level_figures(board: Leaderboard, variant: str) -> dict[str, list[Measured]]
         values = np.array([[sample.measured(column) for column in LEVELS] for sample in own])  # (S, 4, N)
         if np.isfinite(values[:, 0]).any():
             seeds = np.array([[mean_or_nan(of) for of in one] for one in values]) * [100.0, 100.0, 100.0, 1.0]
-            found[name] = [Measured(mean_or_nan(of), standard_error(of)) for of in seeds.T]
+            found[name] = [Measured(float(mean_or_nan(of)), standard_error(of)) for of in seeds.T]
     return found
 
 
