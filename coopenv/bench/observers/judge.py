@@ -218,8 +218,8 @@ def sample_of(variant: str, observer: str, scene: RecordProperties, recording: R
         series = Series(result.position_error[kept], std, result.nees[kept])
         error, level = horizontal_error(recording, result), result.protection_level[..., 0]
         counted = result.judged & np.isfinite(level)
-        within = [np.clip(values[counted], *LEVEL_BINS[[0, -1]]) for values in (error, level)]
-        stanford = np.histogram2d(*within, bins=LEVEL_BINS)[0]
+        error, level = (np.clip(values[counted], LEVEL_BINS[0], LEVEL_BINS[-1]) for values in (error, level))
+        stanford = np.histogram2d(error, level, bins=[LEVEL_BINS, LEVEL_BINS])[0]
     return JudgedRun(variant, observer, scene, measures, result.nees_dof, result.failure, series, stanford)
 
 

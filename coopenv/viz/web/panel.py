@@ -318,11 +318,11 @@ def swatch(colour: str) -> str:
 def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
     """Return the table of errors as HTML."""
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
-    heads = ("error [m]", "[deg]", sigma, "sees", "level [m]")
-    level = [fixed(value, 2) if np.isfinite(value) else "-" for value in frame.protection_level[:, 0]]
-    table = [(*values, bound) for values, bound in zip(frame.table(), level, strict=True)]
-    if level == ["-"] * len(level):
-        heads, table = heads[:-1], frame.table()
+    level = frame.protection_level[:, 0]
+    words = [[fixed(value, 2) if np.isfinite(value) else "-"] for value in level]
+    stated = bool(np.isfinite(level).any())
+    heads = ["error [m]", "[deg]", sigma, "sees", *["level [m]"] * stated]
+    table = [(*values, *word * stated) for values, word in zip(frame.table(), words, strict=True)]
     cells = "".join(f'<th style="{_CELL}">{name}</th>' for name in heads)
     rows = []
     for i, values in enumerate(table):
