@@ -86,10 +86,10 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (130, 2),
-    "api": (3850, 19),
+    "api": (3880, 19),
     "backends": (3275, 17),
     "base": (1390, 9),
-    "bench": (4190, 17),
+    "bench": (4340, 17),
     "cars": (7090, 35),
     "cli": (2050, 7),
     "estimation": (1720, 8),
@@ -99,7 +99,7 @@ LINES_AND_FILES = {
     "runs": (3060, 13),
     "scenario": (3040, 12),
     "training": (1160, 5),
-    "viz": (4410, 17),
+    "viz": (4450, 17),
     "world": (4170, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

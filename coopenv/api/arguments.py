@@ -99,8 +99,11 @@ def host_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     return values.reshape(shape)
 
 
-QUALITIES = ("position_error", "orientation_error", "nees", "log_determinant", "position_std", "gramian_min_eigenvalue")
-"""Fields of an engine with a number for every vehicle, which infos hold, too."""
+QUALITIES = (
+    *("position_error", "orientation_error", "nees", "log_determinant", "position_std", "gramian_min_eigenvalue"),
+    "protection_level",
+)
+"""Fields of an engine with a number for every vehicle, or two, which infos hold, too."""
 FLAGS = ("alive", "terminated", "truncated", "ended")
 FIELDS = ("observation", "action", "reward", *FLAGS, *QUALITIES, "targets_in_view")
 """Fields of an engine under the same name."""
@@ -112,6 +115,8 @@ class Step:
 
     - `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `position_std` (m),
       `gramian_min_eigenvalue`, `targets_in_view`: (W, N);
+    - `protection_level`: (W, N, 2), bounds of the horizontal error (m) and of the angle (rad) that the observer states;
+      infinite: unknown, or none stated;
     - `truth`: position (m, map frame), velocity and angular_velocity (m/s, rad/s, body frame), each (W, N, 3), and
       rotation (W, N, 3, 3), body to map; `estimate`: position, rotation, and covariance (W, N, 6, 6);
     - `visible`: (W, N, T), the targets measured in this frame; `time`: (W, 1), s since the reset;

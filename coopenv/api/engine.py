@@ -33,7 +33,7 @@ from coopenv.viz.scene import Frame
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import device_memory
-from coopenv.world.state import allocate, has_begun, overwrite, size_of, state_fields
+from coopenv.world.state import allocate, has_begun, overwrite, size_of
 from coopenv.world.world import Keys
 
 if TYPE_CHECKING:
@@ -80,7 +80,6 @@ class Engine:
         self.reward_terms = tuple(scenario.reward.by_name)
         """Names of the reward terms, in the order of the field `terms`."""
         self._views: dict[str, np.ndarray] = {}
-        self._state_fields = set(state_fields(self.world.precision))
         worlds, device, results = self.world.worlds, self.world.device, results_struct(self.world.precision)
         sizes = {"W": worlds, "N": self.world.model.vehicles, "D": self.layout.size, "K": len(self.reward_terms)}
         check_memory(size_of(results, sizes), f"results of {worlds} worlds", device_memory(device))
@@ -216,10 +215,10 @@ class Engine:
         return view
 
     def array(self, name: str) -> Any:
-        """Return the Warp array of a field of the step results or the state, or the actions."""
+        """Return the Warp array of a field of the step results, or else of the state, or the actions."""
         if name == "actions":
             return self.world.actions
-        return getattr(self.world.state if name in self._state_fields else self.results, name)
+        return getattr(self.results if hasattr(self.results, name) else self.world.state, name)
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -433,6 +432,7 @@ class PlugIns:
             view("covariance")[w, vehicle] = riccati_covariance(
                 estimate.coordinates, estimate.rotation, estimate.position, estimate.covariance
             )
+        view("protection_level")[w, vehicle] = 0.0 if estimate.protection_level is None else estimate.protection_level
 
     def get_state(self) -> list[dict[str, Any]]:
         """Return a deep copy of every observer and message.

@@ -52,10 +52,11 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     driven one parks where it is, a prescribed motion goes on.
 
     Info: `truth`, `estimate`, `position_error` (m), `orientation_error` (deg), `visible` (target names), `nees`,
-    `log_determinant`, `position_std` (m), `gramian_min_eigenvalue`, `reward_terms`, `time` (s), `outcome`, and of the
-    camera ticks of this step `late_ticks`, which came late, and `missing_ticks`, in which nothing came from the
-    vehicle: it has gone on with its last odometry. Truth that the backend does not know is NaN, and so is what follows
-    from it.
+    `log_determinant`, `position_std` (m), `gramian_min_eigenvalue`, `protection_level` (the observer's bounds of the
+    horizontal error, m, and of the angle, rad; infinite: unknown, or none stated), `reward_terms`, `time` (s),
+    `outcome`, and of the camera ticks of this step `late_ticks`, which came late, and `missing_ticks`, in which nothing
+    came from the vehicle: it has gone on with its last odometry. Truth that the backend does not know is NaN, and so is
+    what follows from it.
     """
 
     def __init__(

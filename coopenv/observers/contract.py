@@ -289,8 +289,10 @@ def check_estimate(estimate: Estimate) -> None:
         _check_covariance(_checked_array("covariance", estimate.covariance, LARGEST**2, COVARIANCE))
     if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
         raise CoopenvError("nis is not finite, or nis_dof negative")
-    if estimate.protection_level is not None and not all(level >= 0.0 for level in estimate.protection_level):
-        raise CoopenvError("protection_level is not at least 0")
+    if estimate.protection_level is not None:
+        level = np.array(estimate.protection_level)
+        if level.shape != (2,) or level.dtype.kind not in "fiu" or not (level >= 0.0).all():
+            raise CoopenvError("protection_level is not two numbers from 0 to infinity")
 
 
 def check_message(message: Message) -> None:

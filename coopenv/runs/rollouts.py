@@ -24,7 +24,7 @@ from coopenv.scenario import Scenario, load_scenario
 
 RECORDED = (
     *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),
-    *("covariance", "position_error", "orientation_error", "nees", "sight", "terms", "ended"),
+    *("covariance", "position_error", "orientation_error", "nees", "protection_level", "sight", "terms", "ended"),
 )
 """Views of the engine that are kept of every camera tick."""
 
@@ -119,7 +119,8 @@ class Rollout:
             vehicles=np.array(self.scenario.vehicle_names),
             targets=np.array(self.scenario.target_names),
             target_moving=np.array([*moving, *(True for _ in self.scenario.vehicles)]),
-            **{name: recorded(name) for name in ("position_error", "orientation_error", "covariance", "nees")},
+            **{name: recorded(name) for name in ("position_error", "orientation_error", "nees")},
+            **{name: recorded(name) for name in ("covariance", "protection_level")},
             **{name: recorded(name)[:, L:] for name in ("position", "rotation", "velocity", "angular_velocity")},
         )
 

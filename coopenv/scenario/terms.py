@@ -78,6 +78,14 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("soft_observability", "vehicle", 1, "log10", 2.5, -1,
          "log10 of (floor + smallest eigenvalue of the sliding observability Gramian)", None, -2.5),
     ],
+    "protection": [
+        ("protection_position", "vehicle", 1, "log10 m", 1.5, -1,
+         "log10 of the observer's bound of the horizontal error; 1: at least 10 m, unknown, or none stated",
+         None, -0.5),
+        ("protection_angle", "vehicle", 1, "log10 rad", 1.5, -1,
+         "log10 of the observer's bound of the angle of the error; 1: at least 1 rad, unknown, or none stated",
+         None, -1.5),
+    ],
     "sightings": [
         ("sighting", "neighbour", 3, "1", 1, -1,
          "unit vector camera to neighbour, body frame (x ahead, y left; `bearings`: optical frame); 0: never seen", XY),

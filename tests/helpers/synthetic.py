@@ -63,6 +63,7 @@ def make_trajectory(ticks: int = 3001, dt: float = 1 / 60, noise: float = 0.0, y
         orientation_error=np.degrees(np.sqrt((axis_angle**2).sum(-1))),
         covariance=covariance,
         nees=(coordinates**2 / np.repeat(sigma**2, 3, axis=-1)).sum(-1),
+        protection_level=np.full((*shape, 2), np.inf),
         velocity=_body(rotation, np.broadcast_to(VELOCITY, position.shape)),
         angular_velocity=np.broadcast_to([0.0, 0.0, yaw_rate], position.shape).copy(),
         target_position=target_position,

@@ -15,6 +15,7 @@ from coopenv.observers import Estimate, Message
 from coopenv.observers.contract import check_estimate, check_message
 
 POSE: dict[str, Any] = {"rotation": np.eye(3), "position": np.zeros(3)}
+NO_LEVELS: list[Any] = [(np.nan, 1.0), (1.0, np.nan), (-1e-9, 1.0), (1.0, -np.inf), (1.0,), np.ones(3), "ab", (1j, 1.0)]
 LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
 
 
@@ -39,6 +40,7 @@ LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
         ({"position": np.full(3, 2**62)}, "with numbers up to"),
         ({"nis": float("nan"), "nis_dof": 2}, "nis is not finite"),
         ({"nis": 1.0, "nis_dof": -2}, "nis_dof negative"),
+        *(({"protection_level": level}, "protection_level is not two numbers") for level in NO_LEVELS),
     ],
 )
 def test_what_is_no_estimate(fields: dict[str, Any], said: str) -> None:
@@ -52,6 +54,7 @@ def test_rotations_and_covariances_of_any_rank_and_size_are_estimates(seed: int,
     root = 10.0**size * generator.standard_normal((6, rank))
     R = Rotation.random(None, generator).as_matrix()
     check_estimate(Estimate(R, generator.standard_normal(3), root @ root.T))
+    check_estimate(Estimate(R, np.zeros(3), protection_level=(np.inf, 10.0**size)))
     check_estimate(Estimate(R.astype(np.float32), [1, 2, 3]))  # type: ignore[arg-type]
 
 

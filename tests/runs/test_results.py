@@ -94,6 +94,9 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
     ):
         np.savez(tmp_path / "other" / "trajectory.npz", allow_pickle=True, **{**arrays, **change})
         assert why in said("other")
+    arrays.pop("protection_level")  # as of older versions
+    np.savez(tmp_path / "other" / "trajectory.npz", **arrays)
+    assert "trajectory.npz: not a trajectory, missing: protection_level" in said("other")
     (tmp_path / "other" / "trajectory.npz").unlink()
     assert "trajectory.npz: not a readable trajectory (No such file or directory)" in said("other")
     shutil.copy(folder / "trajectory.npz", tmp_path / "other")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,10 @@ from coopenv.api.engine import Engine
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.stage import Stage
-from coopenv.viz.web.ground import linear, placed, spacing_of
+from coopenv.viz.web.ground import Look, linear, placed, spacing_of
 from coopenv.viz.web.page import write_replay
-from coopenv.viz.web.panel import GAIN
-from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, levels
+from coopenv.viz.web.panel import GAIN, table_html
+from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, first_look, level_lines, levels
 
 msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
 zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
@@ -28,6 +29,11 @@ zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
 def scene(name: str, **overrides: Any) -> SceneRecord:
     scenario = coopenv.load_scenario(name, {"horizon": 4.0, **overrides})
     return scene_of(Engine(scenario), Origin.of(name, scenario, seed=1))
+
+
+@pytest.fixture(scope="module")
+def overtaking() -> SceneRecord:
+    return scene("overtaking", horizon=0.5)
 
 
 def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
@@ -111,3 +117,30 @@ def test_small_ellipsoids_are_magnified() -> None:
     for share, factor in ((0.02, 1.0), (0.002, 10.0), (0.0002, 100.0), (np.nan, 1.0)):
         assert first_look(np.array([share * stage.side, np.nan]), stage, source).magnification == factor
     assert first_look(np.array([2e-4]), stage, source.model_copy(update={"honest": False})).magnification == 1.0
+
+
+def test_circles_of_protection_levels(overtaking: SceneRecord) -> None:
+    """Of the picked vehicle, or of all; neither unknown levels nor circles beyond the scene are drawn."""
+    frame = overtaking.frame(len(overtaking) - 1)
+    n = len(frame.estimate_position)
+    level = np.full((n, 2), np.inf)
+    level[0], level[1] = (2.0, 0.1), (1e3, 0.1)
+    frame = replace(frame, protection_level=level, estimate_position=np.arange(3.0 * n).reshape(n, 3))
+    colours = np.arange(3 * n, dtype=np.uint8).reshape(n, 3)
+    for look in (Look(picked=0), Look(levels=True)):
+        points, shades = level_lines(frame, colours, look, 50.0, 0.5)
+        assert points.shape == (32, 2, 3) and (shades == colours[0]).all() and (points[..., 2] == 0.5).all()
+        np.testing.assert_allclose(np.linalg.norm(points[..., :2] - [0.0, 1.0], axis=-1), 2.0)
+    assert not len(level_lines(frame, colours, Look(picked=1), 50.0, 0.5)[0])
+    assert not len(level_lines(frame, colours, Look(), 50.0, 0.5)[0])
+
+
+def test_table_with_protection_levels(overtaking: SceneRecord) -> None:
+    frame = overtaking.frame(0)
+    level = np.full((len(frame.estimate_position), 2), np.inf)
+    assert "level" not in table_html(
+        Stage(overtaking.scenario), overtaking.source, replace(frame, protection_level=level)
+    )
+    level[0] = 1.25, 0.1
+    text = table_html(Stage(overtaking.scenario), overtaking.source, replace(frame, protection_level=level))
+    assert "level [m]" in text and ">1.25</td>" in text and text.count(">-</td>") >= len(level) - 1

@@ -140,6 +140,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     for axis in range(3):
         ego.axis_std[axis] = wp.float32(wp.sqrt(wp.max(spread[axis, axis], p.dtype(0.0))))
     ego.heading_std = wp.float32(wp.sqrt(wp.max(state.covariance[world, vehicle][2, 2], p.dtype(0.0))))
+    ego.protection_level = wp.vec2(results.protection_level[world, vehicle])
     ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
     ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
     s, offset, along, progress = estimate_on_route(state, world, vehicle)

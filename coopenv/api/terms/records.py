@@ -39,6 +39,7 @@ class Ego:
     position_std: wp.float32  # m, sqrt of the trace of the position's covariance in the map
     axis_std: wp.vec3  # m, of the position along the estimated body's axes
     heading_std: wp.float32  # rad, of the turn about the body's z axis
+    protection_level: wp.vec2  # m and rad, bounds that the observer states; inf: unknown, or none stated
     uncertainty_threshold: wp.float32  # m, of [reward]
     uncertainty_cap: wp.float32  # m, of [reward]
     metres_gained: wp.float32  # of its route in this decision, beyond the furthest point so far, by the estimate
@@ -203,6 +204,8 @@ def vehicle_values(ego: Ego) -> VehicleValues:
         log10_of_std(std[0]), log10_of_std(std[1]), log10_of_std(std[2]),  # axis_std
         log10_of_std(ego.heading_std),  # heading_std
         ego.soft_observability,
+        log10_of_std(ego.protection_level[0]),  # protection_position
+        log10_of_std(ego.protection_level[1]),  # protection_angle
         ego.route_offset, ego.route_heading, ego.route_left,
         ahead[0], ahead[1], ahead[2], ahead[3],  # route_ahead
         ego.steering,

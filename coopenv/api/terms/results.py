@@ -73,6 +73,7 @@ def results_struct(p: Precision) -> Any:
         nees: array("WN", scalar)
         log_determinant: array("WN", scalar)  # of P
         position_std: array("WN", scalar)  # m, sqrt of the trace of the position's covariance in the map
+        protection_level: array("WN", wp.vec2d)  # m and rad, bounds that the observer states; inf: unknown, or none
         gramian_min_eigenvalue: array("WN", scalar)
         targets_in_view: array("WN", wp.int32)
         last_remaining: array("WN", scalar)  # m of the route to the goal, at the last step
@@ -191,6 +192,10 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
     results.log_determinant[world, vehicle] = log_determinant(I11, I22)
     results.position_std[world, vehicle] = wp.sqrt(position_variance(state.covariance[world, vehicle], p_hat))
+    level = state.protection_level[world, vehicle]
+    if level[0] == wp.float64(0.0):  # none is stated
+        level = wp.vec2d(wp.float64(wp.inf))
+    results.protection_level[world, vehicle] = level
     results.gramian_min_eigenvalue[world, vehicle] = gramian_smallest_eigenvalue(model, state, world, vehicle)
     results.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
 

@@ -22,9 +22,17 @@ from coopenv.bench.executors import Executor
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.convergence import RADIUS, basin_failures, study_basin
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file
+from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file, stanford_figure
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard, Row, spread
-from coopenv.bench.observers.tables import csv_text, environment, failures, headline, honest_line, quality
+from coopenv.bench.observers.tables import (
+    csv_text,
+    environment,
+    failures,
+    headline,
+    honest_line,
+    level_figures,
+    quality,
+)
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
@@ -106,7 +114,8 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
     if form not in FORMATS:
         raise CoopenvError(f"--figures {form}: known are {', '.join(FORMATS)}")
     stems = {v: re.sub(r"[^A-Za-z0-9._+=-]", "_", v) for v in variants}  # which any system takes as a file's name
-    drawn = {f"{kind}-{stem}.{form}": (kind, v) for v, stem in stems.items() for kind in ("errors", "consistency")}
+    kinds = ("errors", "consistency", "protection")
+    drawn = {f"{kind}-{stem}.{form}": (kind, v) for v, stem in stems.items() for kind in kinds}
     return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
 
 
@@ -171,6 +180,8 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
         "bounds": {BOUNDS[column]: values for column, values in board.bounds_in(name).items()},
         "paper_noise": board.samples[0].scene.paper_noise,
         "observers": {observer: quality(board, name, observer) for observer in board.ranked},
+        "levels": level_figures(board, name),
+        "stanford": "" if (drawn := stanford_figure(board, name)) is None else _svg(drawn),
     }
 
 

@@ -88,8 +88,9 @@ class Comparison(Leaderboard):
         """Draw a figure, and write it where a path is given.
 
         Args:
-            kind: "errors" or "consistency" over time, "variants" (a map of errors) or "cost" (error against time).
-            variant: of errors, consistency and cost; None: the first one.
+            kind: "errors" or "consistency" over time, "variants" (a map of errors), "cost" (error against time) or
+                "protection" (Stanford diagrams).
+            variant: of all but variants; None: the first one.
             width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figure then has, such as "ieee1", or
                 inches; None: a page's.
             path: file to write.

@@ -23,9 +23,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 from coopenv.base.format import jsonable, number
 from coopenv.bench.observers.convergence import ANGLE_BINS, RADIUS, Draw, by_angle
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import JudgedRun
+from coopenv.bench.observers.judge import LEVEL_BINS, JudgedRun
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard
-from coopenv.bench.observers.tables import FAILED, mean_of, short_name
+from coopenv.bench.observers.tables import FAILED, level_figures, mean_of, short_name
 from coopenv.estimation.metrics import mean_bounds, wilson_interval
 from coopenv.estimation.poses import Array
 from coopenv.viz import style
@@ -232,6 +232,57 @@ def cost_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     return figure
 
 
+def stanford_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
+    """Draw Stanford diagrams: vehicle ticks by horizontal error and protection level, a panel per observer.
+
+    None where no observer states a level that is known.
+    """
+    figures = level_figures(board, variant)
+    counts = {name: np.sum([s.stanford for s in board.groups[variant, name]], axis=0) for name in figures}
+    counts = {name: of for name, of in counts.items() if of.any()}
+    if not counts:
+        return None
+    columns = style.fitting(width or style.PAGE, _SQUARE, min(3, len(counts)))
+    rows = -(-len(counts) // columns)
+    figure, inches = style.canvas(width or min(style.PAGE, 1.6 + 4.0 * columns), 1.0, f"{board.title}, {variant}")
+    figure.set_figheight(_FRAME + rows * (inches - 1.3) / columns)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in axes[len(counts) :]:
+        unused.set_visible(False)
+    used = np.flatnonzero(np.sum([of + of.T for of in counts.values()], axis=0).any(axis=0))
+    low, high = (float(10.0**ends) for ends in (np.floor(_DECADE[used[0]]), np.ceil(_DECADE[used[-1] + 1])))
+    norm = LogNorm(1.0, max(10.0, *(float(of.max()) for of in counts.values())))
+    ends = np.array([low, high])
+    for n, (ax, (name, of)) in enumerate(zip(axes, counts.items(), strict=False)):
+        exceeded, _, unknown, _ = figures[name]
+        below, left = n + columns >= len(counts), n % columns == 0
+        style.tidy(ax, x_label="horizontal error [m]" * below, y_label="protection level [m]" * left)
+        ax.fill_between(ends, low, ends, color=VERMILION, alpha=0.14, linewidth=0, zorder=0)
+        image = ax.pcolormesh(LEVEL_BINS, LEVEL_BINS, np.where(of > 0, of, np.nan).T, norm=norm, cmap="viridis_r")
+        ax.plot(ends, ends, color=INK, linewidth=1.0)
+        ax.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal")
+        words = f"{name}\nexceeded {_share(exceeded.value)} %, unknown {_share(unknown.value)} %"
+        ax.set_title(words, fontsize=SMALL + 0.5, color=INK, pad=3)
+    bar = figure.colorbar(image, ax=axes.tolist(), fraction=0.05, aspect=30, pad=0.01)
+    bar.set_label("vehicle ticks", fontsize=SMALL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, colors=INK)
+    handles = [
+        Line2D([], [], color=INK, lw=1.0, label="error = protection level"),
+        Patch(facecolor=VERMILION, alpha=0.14, label="level exceeded"),
+    ]
+    style.legend_above(figure, handles)
+    return figure
+
+
+_SQUARE = 3.2  # inches, least side of a Stanford diagram with its labels
+_DECADE = np.log10(LEVEL_BINS).round(6)
+
+
+def _share(percent: float) -> str:
+    """Return a share in % with two digits; a plain zero where there is none."""
+    return number(percent, 2) if percent else "0"
+
+
 def _plain(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -244,6 +295,7 @@ KINDS: dict[str, Callable[[Leaderboard, str, float | None], Figure | None]] = {
     "consistency": nees_figure,
     "variants": variant_figure,
     "cost": cost_figure,
+    "protection": stanford_figure,
 }
 """Each of a board, one of its variants and a width in inches (None: a page's); None where nothing is to draw."""
 

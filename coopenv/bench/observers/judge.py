@@ -103,6 +103,8 @@ class JudgedRun:
     nees_dof: int
     failure: str
     series: Series
+    stanford: Array
+    """(B, B) vehicle ticks by horizontal error and protection level, both in bins of `LEVEL_BINS`; level known."""
 
     def measured(self, name: str) -> Array:
         """Return what was measured of the vehicles; NaN where the observer failed, which has diverged."""
@@ -113,6 +115,8 @@ class JudgedRun:
 
 
 IN_WINDOWS = ("position_mse", "anees")
+LEVEL_BINS = np.logspace(-3.0, 2.0, 51)
+"""m; errors and protection levels beyond either end count in the outermost bin."""
 SERIES_TICKS = 250  # instants that are kept for figures
 MOST_KEPT = 2  # bounds of records; those of many vehicles take minutes, and often every seed has the same
 
@@ -206,12 +210,45 @@ def sample_of(variant: str, observer: str, scene: RecordProperties, recording: R
     """Judge one run. Where it failed, everything but its costs is NaN."""
     series = Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
     measures = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
+    stanford = np.zeros((len(LEVEL_BINS) - 1,) * 2)
     if not result.failure:
         kept = kept_ticks(recording)
         std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
         measures |= _measures(scene, recording, result)
         series = Series(result.position_error[kept], std, result.nees[kept])
-    return JudgedRun(variant, observer, scene, measures, result.nees_dof, result.failure, series)
+        error, level = horizontal_error(recording, result), result.protection_level[..., 0]
+        counted = result.judged & np.isfinite(level)
+        error, level = (np.clip(values[counted], LEVEL_BINS[0], LEVEL_BINS[-1]) for values in (error, level))
+        stanford = np.histogram2d(error, level, bins=[LEVEL_BINS, LEVEL_BINS])[0]
+    return JudgedRun(variant, observer, scene, measures, result.nees_dof, result.failure, series, stanford)
+
+
+def horizontal_error(recording: Recording, result: Run) -> Array:
+    """Return (K, N) the horizontal distance of the estimates from the truth, m."""
+    offset = (result.position - recording.truth.position)[..., :2]
+    return np.asarray(np.linalg.norm(offset, axis=-1))
+
+
+def level_measures(error: Array, result: Run) -> dict[str, Array]:
+    """Return what protection levels are worth (N,), over the whole run; NaN where none is stated.
+
+    Shares of the ticks with a stated level in which the horizontal `error` (K, N), m, and the angle exceed it, and in
+    which it is unknown; and the median known level over the 95th percentile of the horizontal error in the same ticks.
+    """
+    level, angle = result.protection_level, np.radians(result.orientation_error)
+    stated = np.asarray(~np.isnan(level).any(axis=-1))
+    known = result.judged & stated & np.isfinite(level[..., 0])
+    ratio = np.full(known.shape[1], np.nan)
+    for i in np.flatnonzero(known.any(axis=0)):
+        reached = float(np.quantile(error[known[:, i], i], 0.95))
+        ratio[i] = np.median(level[known[:, i], i, 0]) / reached if reached > 0.0 else np.nan
+    counted = {
+        "level_exceeded": error > level[..., 0],
+        "angle_level_exceeded": angle > level[..., 1],
+        "level_unknown": ~np.isfinite(level).all(axis=-1),
+    }
+    shares = {name: result.mean(np.asarray(ticks, float), stated) for name, ticks in counted.items()}
+    return {**shares, "level_over_e95": ratio}
 
 
 def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dict[str, Array]:
@@ -226,6 +263,7 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
         "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": dof.sum(axis=0).astype(float),
         "diverged": diverged(*map(_last, errors)),
+        **level_measures(horizontal_error(recording, result), result),
     }
     single = [_vehicle_measures(recording, result, i) for i in range(len(scene.vehicles))]
     return figures | {name: np.array([found[name] for found in single]) for name in single[0]}

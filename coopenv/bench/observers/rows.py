@@ -148,6 +148,14 @@ class Row:
         "smallest eigenvalue over the run of the observability Gramian over 1 s, about the map origin; mixed units"
     )
     gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
+    level_exceeded_fraction: float = _column(
+        "share of the run's ticks in which the horizontal error exceeds the protection level; empty: none is stated"
+    )
+    angle_level_exceeded_fraction: float = _column("the same of the angle")
+    level_unknown_fraction: float = _column("share of the run's ticks in which the protection level is infinite")
+    level_over_e95: float = _column(
+        "median over seeds of each run's median known protection level over the 95 % quantile of the horizontal error"
+    )
 
 
 ERRORS = {
@@ -219,6 +227,10 @@ def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedR
         nis_high=consistent.high,
         gramian_min_eigenvalue=float(np.min([sample.scene.gramians[0, i] for sample in own])),
         gramian_local_eigenvalue=float(np.min([sample.scene.gramians[1, i] for sample in own])),
+        level_exceeded_fraction=float(np.mean(seeds("level_exceeded"))),
+        angle_level_exceeded_fraction=float(np.mean(seeds("angle_level_exceeded"))),
+        level_unknown_fraction=float(np.mean(seeds("level_unknown"))),
+        level_over_e95=_median(seeds("level_over_e95")),
     )
 
 

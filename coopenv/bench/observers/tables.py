@@ -25,7 +25,7 @@ from coopenv.bench.observers.rows import (
     standard_error,
 )
 from coopenv.bench.observers.sources import Robots
-from coopenv.estimation.metrics import SETTLED
+from coopenv.estimation.metrics import SETTLED, mean_or_nan
 from coopenv.estimation.poses import Array
 from coopenv.runs.console import number_table
 
@@ -126,6 +126,9 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
         yield quality_table(board, variant)
         if line := honest_line(board.rows):
             yield line
+        if (levels := level_table(board, variant)).row_count:
+            yield ""
+            yield levels
         yield from window_tables(board, variant, width)
     if set(variants) <= set(Robots.named):
         yield f"\n{Robots.friendly}"
@@ -224,6 +227,34 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
         ]
 
     return _add_observers(number_table(["observer"], headings, gap=0), board, variant, cells)
+
+
+LEVELS = {
+    "level_exceeded": "exceeded\n[%]",
+    "angle_level_exceeded": "angle\n[%]",
+    "level_unknown": "unknown\n[%]",
+    "level_over_e95": "level\n/ e95",
+}
+"""Measure of protection levels to its heading."""
+
+
+def level_figures(board: Leaderboard, variant: str) -> dict[str, list[Measured]]:
+    """Return the figures of `LEVELS` over all vehicles of every observer that states protection levels; shares in %."""
+    found = {}
+    for name, own in board.samples_in(variant).items():
+        values = np.array([[sample.measured(column) for column in LEVELS] for sample in own])  # (S, 4, N)
+        if np.isfinite(values[:, 0]).any():
+            seeds = np.array([[mean_or_nan(of) for of in one] for one in values]) * [100.0, 100.0, 100.0, 1.0]
+            found[name] = [Measured(float(mean_or_nan(of)), standard_error(of)) for of in seeds.T]
+    return found
+
+
+def level_table(board: Leaderboard, variant: str) -> Table:
+    """Return, of one variant over all vehicles, how protection levels compare with errors; empty: none are stated."""
+    table = number_table(["protection level"], [*LEVELS.values()], gap=0)
+    for name, measured in level_figures(board, variant).items():
+        table.add_row(short_name(name), *(compact(*one) if one.value else "0" for one in measured))
+    return table
 
 
 MOST_OBSERVERS = 4  # with a column per vehicle

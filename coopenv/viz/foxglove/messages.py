@@ -46,6 +46,8 @@ _NUMBERS = {
     "position_error_m": "norm of the difference of true and estimated position, m",
     "orientation_error_deg": "angle between true and estimated orientation, deg",
     "three_sigma_m": "three times the largest standard deviation of the position that the observer states, m",
+    "protection_level_m": "bound of the horizontal error that the observer states, m",
+    "protection_level_deg": "bound of the angle that the observer states, deg",
     "nees": "e^T P^-1 e; its mean is the number of states for a consistent observer",
 }
 _ERROR_SCHEMA = json.dumps(
@@ -249,7 +251,9 @@ def _errors(view: RunView, vehicle: int) -> Messages:
     for k in view.ticks:
         sigma = np.nan if view.gain else view.semi[k, vehicle, -1]
         nees = run.nees[k, vehicle] if np.isfinite(sigma) else np.nan
-        values = run.position_error[k, vehicle], run.orientation_error[k, vehicle], sigma, nees
+        level, turn = run.protection_level[k, vehicle]
+        errors = run.position_error[k, vehicle], run.orientation_error[k, vehicle]
+        values = *errors, sigma, level, np.degrees(turn), nees
         row = {name: float(f"{value:.6g}") for name, value in zip(_NUMBERS, values, strict=True)}
         yield k, json.dumps(jsonable(row), separators=(",", ":")).encode()
 

@@ -27,6 +27,8 @@ class Look:
     views: bool = True
     """Fields of view."""
     messages: bool = True
+    levels: bool = False
+    """Circles of the protection levels of all vehicles; that of the picked one is drawn in any case."""
     trails: bool = True
     names: bool = True
     picked: int | None = None

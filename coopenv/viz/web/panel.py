@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import shown
+from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Stage
-from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, vehicle_colour
+from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, VERMILION, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import Look
 
@@ -22,6 +23,9 @@ LONGEST = 600
 """Frames in a plot."""
 _LEAST = 1e-4  # on a logarithmic axis
 _MOST_TERMS = 6
+UNKNOWN_LEVEL = 100.0
+"""m, at which an unknown protection level is plotted."""
+_DASHES = {"3σ": [5, 4], "from": [5, 4], "to": [5, 4], "level": [2, 3]}
 _LOOK: dict[str, Any] = {
     "legend": {"show": False},
     "height": 170,
@@ -37,8 +41,8 @@ class Plots:
         """Add them, empty."""
         named = list(zip(source.terms, VEHICLE_COLOURS[:_MOST_TERMS], strict=False))
         self._terms = len(named)
-        title = f"Position error [m]; dashed: {'3σ' if source.honest else 'P, a gain'}"
-        self._error = _plot(gui, title, ("error", BLUE), ("3σ", GREY))
+        title = f"Position error [m]; dashed: {'3σ' if source.honest else 'P, a gain'}; dotted: protection level"
+        self._error = _plot(gui, title, ("error", BLUE), ("3σ", GREY), ("level", VERMILION))
         title = "NEES; dashed: 95 % if consistent"
         self._nees = _plot(gui, title, ("NEES", BLUE), ("from", GREY), ("to", GREY))
         if named:
@@ -55,7 +59,10 @@ class Plots:
         error, nees = (
             np.array([getattr(frame, name)[vehicle] for frame in frames]) for name in ("position_error", "nees")
         )
-        self._error.data = (time, _positive(error), _positive(sigma))
+        level = np.array([frame.protection_level[vehicle, 0] for frame in frames])
+        # Observers that state no level have a curve as well: it lies on that of 3 sigma.
+        level = np.minimum(level, UNKNOWN_LEVEL) if np.isfinite(level).any() else sigma
+        self._error.data = (time, *map(_positive, (error, sigma, level)))
         self._nees.data = (time, _positive(nees), *(np.full(len(time), bound) for bound in NEES_BOUNDS))
         if self._terms:
             terms = np.nan_to_num([frame.terms[vehicle, : self._terms] for frame in frames])
@@ -66,7 +73,7 @@ def _plot(gui: Any, title: str, *named: tuple[str, str], log: bool = True) -> An
     """Add an empty chart of curves, given by label and colour."""
     rows: list[dict[str, Any]] = [{"label": "t [s]"}]
     for label, colour in named:
-        dashes = {"dash": [5, 4]} if label in ("3σ", "from", "to") else {}
+        dashes = {"dash": _DASHES[label]} if label in _DASHES else {}
         rows.append({"label": label, "stroke": colour, "width": 2, "points": {"show": False}, **dashes})
     scales: dict[str, Any] = {"x": {"time": False, "auto": True}}
     if log:
@@ -116,6 +123,7 @@ _SWITCHES = {
     "sight": "Lines of sight",
     "views": "Fields of view",
     "messages": "V2X messages",
+    "levels": "Protection levels of all",
     "trails": "Trails",
     "names": "Names",
     "alone": "Lines of the picked vehicle alone",
@@ -215,7 +223,7 @@ class Panel:
 
     def update_legend(self) -> None:
         """Update the legend."""
-        legend = legend_html(self._stage, self._source, self._look.magnification)
+        legend = legend_html(self._stage, self._source, self._look.magnification, live=True)
         self._legend.content = f'<div style="font-size:12px;padding:4px 14px">{legend}</div>'
 
     def set_status(self, words: str) -> None:
@@ -268,8 +276,8 @@ _DRAWINGS = {
 }
 
 
-def legend_html(stage: Stage, source: Origin, magnification: float) -> str:
-    """Return the legend of the marks that can occur as HTML."""
+def legend_html(stage: Stage, source: Origin, magnification: float, live: bool = False) -> str:
+    """Return the legend of the marks that can occur as HTML; `live`: a vehicle can be picked."""
     s = stage.scenario
     sensed = s.topology.mode == "sensed"
     goals = any(vehicle.goal_radius > 0 for vehicle in s.vehicles)
@@ -279,6 +287,7 @@ def legend_html(stage: Stage, source: Origin, magnification: float) -> str:
         (True, "block", BLUE, 1.0, "vehicle, true"),
         (True, "block", BLUE, 0.3, "its estimate; a dashed line joins both"),
         (True, "disc", BLUE, 0.25, ellipsoid),
+        (live, "ring", BLUE, None, "protection level of the picked vehicle, if its observer states one"),
         (stage.sees_a_part, "block", BLUE, 0.15, "field of view"),
         (True, "line", BLUE, "none", "sees (colour of the observing vehicle)"),
         (sensed and s.obstacles, "line", GREY, "none", "hidden by a building, where the line ends"),
@@ -309,16 +318,20 @@ def swatch(colour: str) -> str:
 def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
     """Return the table of errors as HTML."""
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
-    heads = ("error [m]", "[deg]", sigma, "sees")
+    level = frame.protection_level[:, 0]
+    words = [[fixed(value, 2) if np.isfinite(value) else "-"] for value in level]
+    stated = bool(np.isfinite(level).any())
+    heads = ["error [m]", "[deg]", sigma, "sees", *["level [m]"] * stated]
+    table = [(*values, *word * stated) for values, word in zip(frame.table(), words, strict=True)]
     cells = "".join(f'<th style="{_CELL}">{name}</th>' for name in heads)
     rows = []
-    for i, values in enumerate(frame.table()):
+    for i, values in enumerate(table):
         numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
         mark = f"{swatch(vehicle_colour(i))} <b>{stage.short_name(stage.landmarks + i)}</b>"
         rows.append(f'<tr><td style="white-space:nowrap">{mark}</td>{numbers}</tr>')
     style = "width:100%;font:12px/1.3 ui-monospace,monospace;border-collapse:collapse"
-    table = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
-    return f'<div style="padding:2px 14px;max-height:260px;overflow:auto">{table}</div>'
+    whole = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
+    return f'<div style="padding:2px 14px;max-height:260px;overflow:auto">{whole}</div>'
 
 
 def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:

@@ -106,6 +106,8 @@ class Actors:
             self._boxes.put(placed(R, fine(center, step), size))
 
 
+_ANGLE = np.linspace(0.0, 2 * np.pi, 33)
+_CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE), np.zeros(33)], axis=-1)
 _DOTS, _DASHES = 16, 9  # of a line to a target that was missed, and to an estimate
 _TRAIL, _TRAIL_STEP = 36, 0.2  # points, and s between them
 
@@ -144,13 +146,11 @@ def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
 
 def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Coloured:
     """Return the routes that are drawn, and rings about the goals, at a height."""
-    angle = np.linspace(0.0, 2 * np.pi, 33)
-    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(33)], axis=-1)
     parts = [NOTHING]
     for i, vehicle in enumerate(stage.scenario.vehicles):
         points = frame.route[i, : int(frame.route_count[i])].copy()
         points[:, 2:] = z
-        ring = vehicle.goal_radius * circle + [*frame.goal[i, :2], z]
+        ring = vehicle.goal_radius * _CIRCLE + [*frame.goal[i, :2], z]
         pale = 0.45 * colours[i] + 0.55 * 255.0
         for path, colour, drawn in (
             (points, pale, frame.route_drawn[i] >= 0),
@@ -159,6 +159,16 @@ def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Colo
             if drawn and len(path) > 1:
                 parts.append((np.stack([path[:-1], path[1:]], axis=1), np.tile(colour, (len(path) - 1, 1))))
     return _joined(parts)
+
+
+def level_lines(frame: Frame, colours: np.ndarray, look: Look, largest: float, z: float) -> Coloured:
+    """Return circles of the protection levels, up to a radius, about the estimates at a height."""
+    radius = frame.protection_level[:, 0]
+    drawn = (look.levels | (np.arange(len(radius)) == look.picked)) & (radius <= largest)
+    points = frame.estimate_position[drawn, None] + radius[drawn, None, None] * _CIRCLE
+    points[..., 2] = z
+    segments = np.stack([points[:, :-1], points[:, 1:]], axis=2)  # (drawn, 32, 2, 3)
+    return segments.reshape(-1, 2, 3), np.repeat(colours[drawn], segments.shape[1], axis=0)
 
 
 class Trails:
@@ -322,7 +332,7 @@ class Picture:
         self._trails = Trails()
         self._lines = {
             name: Segments(scene, f"{ROOT}/{name}", thickness, self.ground.step)
-            for name, thickness in (("sight", 2.0), ("errors", 1.5), ("ways", 2.0), ("trails", 3.0))
+            for name, thickness in (("sight", 2.0), ("errors", 1.5), ("ways", 2.0), ("trails", 3.0), ("levels", 2.0))
         }
         self._views: list[Any] = []
         self._drawn_ways: tuple[bytes, ...] = ()
@@ -345,6 +355,8 @@ class Picture:
         self._lines["sight"].show(sight)
         errors = dashes(frame.vehicle_position, frame.estimate_position, _DASHES, 0.6)
         self._lines["errors"].show((errors, np.tile(self._colours, (_DASHES, 1))) if look.estimates else NOTHING)
+        circles = level_lines(frame, self._colours, look, _LARGEST * side, self.ground.z + 2e-3 * side)
+        self._lines["levels"].show(circles)
         ways = (frame.goal.tobytes(), frame.route_count.tobytes(), frame.route_drawn.tobytes(), frame.route.tobytes())
         if ways != self._drawn_ways:
             self._drawn_ways = ways

@@ -275,7 +275,7 @@ def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch:
         assert main([*words, "--figures", form, "--jobs", jobs]) == 0
         tables = {"leaderboard.json", "leaderboard.csv", "windows.csv", "leaderboard.tex", "report.html"}
         figures = {path.name for path in Path("board").iterdir()} - tables
-        assert figures == {*figure_files(["nominal"], form)} - {f"variants.{form}"}
+        assert figures == {*figure_files(["nominal"], form)} - {f"variants.{form}", f"protection-nominal.{form}"}
         assert all((Path("board") / name).read_bytes().startswith(start) for name in figures)
     board = json.loads(Path("board/leaderboard.json").read_text())
     assert board["seeds"] == [7, 8] and "--observers mine.py:Mine,dead_reckoning" in board["command"]

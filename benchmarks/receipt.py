@@ -1,0 +1,271 @@
+"""`python -m benchmarks.receipt`: what each part of `robust` buys, and how much its numbers matter.
+
+Without arguments it leaves out one part after the other, and all monitors together. Columns: false exclusions per
+hour of a vehicle in worlds without a fault; median time from a fault to the exclusion of its source; mean position
+RMSE of honest vehicles by case; CPU time. With `--constants` it halves and doubles each number of constants.py.
+Every variant runs in a process of its own, in which functions or constants are replaced before the kernels are
+compiled; compilation takes half a minute per variant, once per machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from coopenv.base.format import in_parentheses
+from coopenv.runs.console import Progress, number_table
+
+LIAR = 1
+"""The vehicle that lies."""
+AT = 12.0
+"""s, from when on there is a fault, but for one of the map."""
+CASES = ("nominal", "landmark", "bias", "random", "jump", "drift")
+"""In busy_intersection_tracking and on the road of `benchmarks.evidence`; the last two are lies, in the first scene."""
+
+
+def replace_functions(part: str) -> None:
+    """Replace what a part consists of, by name of the part."""
+    import warp as wp
+
+    from coopenv.observers.robust import constants, correlated_fusion, fault_hypotheses, measurements, observer
+    from coopenv.observers.robust.memory import SENDER_SLOTS
+    from coopenv.world.warp_internals import device_function
+
+    whole_block, slot = fault_hypotheses.end_block, measurements.take_slot
+
+    @device_function
+    def no_landmark(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any) -> int:
+        if landmark:
+            return -1
+        return slot(memory, world, i, target, tick, landmark, period)
+
+    @device_function
+    def no_offsets(memory: Any, world: int, i: int, time: Any) -> int:
+        count = whole_block(memory, world, i, time)
+        for q in range(1, 1 + SENDER_SLOTS):
+            memory.source[world, i, q].ratio = wp.float64(0.0)
+        return count
+
+    @device_function
+    def no_drift(memory: Any, world: int, i: int, landmarks: int) -> bool:
+        return False
+
+    @device_function
+    def not_several(memory: Any, world: int, i: int, count: int):  # type: ignore[no-untyped-def]
+        return wp.float64(0.0), 0
+
+    @device_function
+    def no_doubt(memory: Any, world: int, i: int, most: Any, total: Any):  # type: ignore[no-untyped-def]
+        pass
+
+    @device_function
+    def no_readmission(frame: Any, memory: Any, world: int, i: int, n: int, q: int):  # type: ignore[no-untyped-def]
+        pass
+
+    @device_function
+    def no_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):  # type: ignore[no-untyped-def]
+        pass
+
+    changes: dict[str, list[tuple[Any, str, Any]]] = {
+        "nothing": [],
+        "all monitors": [(constants, "FAULT_GATE", 1e30)],
+        "monitor of odometry": [(constants, "ODOMETRY_FAULT", 1e-9)],
+        "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
+        "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
+        "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
+        "several senders at once": [(fault_hypotheses, "judge_senders", not_several)],
+        "covariance of likely faults": [(fault_hypotheses, "set_doubt", no_doubt)],
+        "readmission": [(observer, "test_excluded", no_readmission)],
+        "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
+        "gyro bias": [(constants, "GYRO_BIAS", 1e-6), (constants, "GYRO_BIAS_WALK", 0.0)],
+        "senders' increments": [(correlated_fusion, "apply_sender_increment", no_increment)],
+        "linearisation variance": [
+            (constants, "LINEARISATION_TIME", 0.0),
+            (constants, "CONSIDERED_LINEARISATION_TIME", 0.0),
+        ],
+        "inflation of senders": [(constants, "MIN_INFLATION", 0.0)],
+    }
+    for module, name, value in changes[part]:
+        setattr(module, name, value)
+
+
+PARTS = (
+    "nothing",
+    "all monitors",
+    "monitor of odometry",
+    "monitors of landmarks",
+    "senders' offsets",
+    "senders' drifts",
+    "several senders at once",
+    "covariance of likely faults",
+    "readmission",
+    "all bearings when lost",
+    "gyro bias",
+    "senders' increments",
+    "linearisation variance",
+    "inflation of senders",
+)
+
+
+def numbers() -> list[str]:
+    """Return the names of the observer's numbers that are no counts or bounds of rounding."""
+    from coopenv.observers.robust import constants
+
+    return [n for n, value in vars(constants).items() if n.isupper() and isinstance(value, float) and n != "THIRD"]
+
+
+def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
+    """Return, for a part that is left out or CONSTANT*FACTOR, the values by case of every seed."""
+    if "*" in variant:
+        from coopenv.observers.robust import constants
+
+        name, factor = variant.split("*")
+        setattr(constants, name, getattr(constants, name) * float(factor))
+    else:
+        replace_functions(variant)
+    from benchmarks import evidence
+    from coopenv.bench.observers.faults import variant_of
+    from coopenv.observers import run
+    from coopenv.observers.robust.observer import robust
+    from coopenv.runs import record
+
+    changes: dict[str, Callable[..., Any]] = {
+        "nominal": evidence.unchanged,
+        "landmark": evidence.landmark_moved(3.0),
+        "bias": evidence.bias_step(np.radians(1.0)),
+        "random": evidence.random_bearings(0.1),
+    }
+    lies = {"jump": f"lie=jump:1@{AT:g}", "drift": f"lie=drift:0.2@{AT:g},honest_odometry=1"}
+    found: dict[str, Any] = {"exclusions": 0.0, "hours": 0.0, "delay": [], "rmse": {}}
+    begin = time.process_time()
+    for scene, made in (("tracking", evidence.tracking()), ("road", evidence.road())):
+        for seed in seeds:
+            recording = record(made, seed)
+            names = [setup.name for setup in recording.setups]
+            for case in CASES if scene == "tracking" else CASES[:4]:
+                watched: list[Any] = []
+
+                def factory(setup: Any, watched: list[Any] = watched) -> Any:
+                    watched.append(Watched(robust(setup)))
+                    return watched[-1]
+
+                if case in lies:
+                    changed = variant_of(f"{names[LIAR]}:{lies[case]}").applied(recording, seed)
+                else:
+                    changed = changes[case](recording, np.random.default_rng(seed))
+                result = run(factory, changed)
+                honest = np.arange(len(names)) != LIAR if case in lies else np.full(len(names), True)
+                error = result.position_rmse(evidence.JUDGED_FROM)[honest].mean()
+                found["rmse"].setdefault(f"{scene} {case}", []).append(float(error))
+                if case == "nominal":
+                    found["exclusions"] += sum(len(observer.times) for observer in watched)
+                    found["hours"] += len(names) * float(recording.t[-1]) / 3600.0
+                if case in lies:
+                    target = len(recording.landmarks[0]) + LIAR
+                    first = [next((t for t, q in w.times if q == target), np.inf) for w in watched]
+                    found["delay"] += [t - AT for w, t in zip(watched, first, strict=True) if w.sees(target)]
+    found["seconds"] = time.process_time() - begin
+    return found
+
+
+class Watched:
+    """An observer of which the times of exclusions are noted."""
+
+    def __init__(self, observer: Any) -> None:
+        self.observer, self.times, self._known = observer, [], np.zeros(len(observer.memory.source), int)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.observer, name)
+
+    def sees(self, target: int) -> bool:
+        """Return whether a target is a neighbour of the vehicle."""
+        return target in self.observer.setup.targets
+
+    def update(self, tick: Any) -> Any:
+        """Take a tick, and note what has been excluded."""
+        estimate = self.observer.update(tick)
+        source = self.observer.memory.source
+        for q in np.flatnonzero(source["exclusions"] > self._known):
+            self.times.append((float(tick.time), int(source["target"][q])))
+        self._known = source["exclusions"].copy()
+        return estimate
+
+
+def part_table(results: dict[str, dict[str, Any]]) -> Any:
+    """Return the table of the parts that are left out."""
+    cases = list(results["nothing"]["rmse"])
+    table = number_table(
+        ["\n\nleft out"],
+        ["false\nexcl.\n[1/h]", "time to\nexclude\n[s]", *(c.replace(" ", "\n") + "\n[m]" for c in cases)],
+    )
+    for part, found in results.items():
+        delay = float(np.median(found["delay"]))
+        rate = found["exclusions"] / found["hours"]
+        table.add_row(
+            part, f"{rate:.1f}", f"{delay:.1f}" if np.isfinite(delay) else "-", *map(_mean, found["rmse"].values())
+        )
+    return table
+
+
+def constant_table(results: dict[str, dict[str, Any]]) -> Any:
+    """Return the table of the numbers: ratio of the RMSE to that with all as they are, nominal and over the faults."""
+    base = results.pop("nothing")["rmse"]
+    table = number_table(
+        ["\nnumber", "\ntimes"], ["without\nfault", "faults,\nmean", "faults,\nworst", "false excl.\n[1/h]"]
+    )
+    for variant, found in results.items():
+        ratio = {case: float(np.mean(values) / np.mean(base[case])) for case, values in found["rmse"].items()}
+        nominal = [r for case, r in ratio.items() if case.endswith("nominal")]
+        faults = [r for case, r in ratio.items() if not case.endswith("nominal")]
+        cells = (f"{np.mean(nominal):.2f}", f"{np.mean(faults):.2f}", f"{max(faults):.2f}")
+        table.add_row(*variant.split("*"), *cells, f"{found['exclusions'] / found['hours']:.1f}")
+    return table
+
+
+def _mean(values: Sequence[float]) -> str:
+    spread = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+    return in_parentheses(float(np.mean(values)), spread)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure every variant in a process of its own and print the table; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.receipt", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=8, help="number of seeds (default: 8)")
+    parser.add_argument("--first", type=int, default=7000, help="the first seed (default: 7000)")
+    parser.add_argument("--constants", nargs="*", help="names of constants; none: all")
+    parser.add_argument("--variant", help=argparse.SUPPRESS)
+    asked = parser.parse_args(arguments)
+    seeds = range(asked.first, asked.first + asked.seeds)
+    if asked.variant:
+        print(json.dumps(measure(asked.variant, seeds)))
+        return 0
+    variants = list(PARTS)
+    if asked.constants is not None:
+        unknown = sorted(set(asked.constants) - set(numbers()))
+        if unknown:
+            print(f"error: unknown constants {', '.join(unknown)}; known: {', '.join(numbers())}", file=sys.stderr)
+            return 2
+        variants = ["nothing", *(f"{name}*{by:g}" for name in asked.constants or numbers() for by in (0.5, 2.0))]
+    results = {}
+    with Progress(Console(stderr=True), "measuring variants", total=len(variants)) as progress:
+        for done, variant in enumerate(variants):
+            progress.update(done)
+            options = ["--seeds", str(asked.seeds), "--first", str(asked.first), "--variant", variant]
+            command = [sys.executable, "-m", "benchmarks.receipt", *options]
+            result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            results[variant] = json.loads(result.stdout.splitlines()[-1])
+    table = part_table(results) if asked.constants is None else constant_table(results)
+    Console(markup=False, highlight=False).print(table, f"{asked.seeds} seeds from {asked.first} on.", sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
