@@ -46,14 +46,18 @@ def _docstring(file: str) -> str:
     return ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
 
 
+def _class(entry: ZooEntry) -> object:
+    """Return the class or function of an observer, None for one that needs an extra."""
+    return None if entry.needs else resolve_name(f"{PACKAGE}.{entry.plugin}")
+
+
 def _where(entry: ZooEntry) -> str:
     """Return the sentence that says where an observer is computed."""
     if entry.kernels:
         return "Runs inside the kernels of a batch, on the CPU and on a GPU."
-    if not entry.needs:
-        made = resolve_name(f"{PACKAGE}.{entry.plugin}")
-        if isinstance(made, type) and issubclass(made, KernelObserver):
-            return "Runs in kernels on the CPU that the host calls, a vehicle at a time; not in those of a batch."
+    made = _class(entry)
+    if isinstance(made, type) and issubclass(made, KernelObserver):
+        return "Runs in kernels on the CPU that the host calls, a vehicle at a time; not in those of a batch."
     return "Runs in Python on the host."
 
 
@@ -71,7 +75,8 @@ def _page(name: str, entry: ZooEntry, about: str, sends: str) -> str:
     facts += [] if entry.on_a_plane else ["Only for vehicles in space, not for recorded robots on a plane."]
     facts += [f"Needs `{entry.needs}`: `pip install '.[bench]'`."] if entry.needs else []
     use = f'import coopenv\n\nenv = coopenv.parallel_env("busy_intersection_tracking", observer="{name}")'
-    shown = [] if name in ("centralised",) or not entry.in_space else ["## In an environment", f"```python\n{use}\n```"]
+    joint = getattr(_class(entry), "joint", False)
+    shown = [] if joint or not entry.in_space else ["## In an environment", f"```python\n{use}\n```"]
     return (
         "\n\n".join(
             [

@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2050, 7),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (11000, 45),
+    "observers": (11960, 49),
     "policies": (1270, 7),
     "runs": (3060, 13),
     "scenario": (3040, 12),

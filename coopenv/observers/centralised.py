@@ -36,6 +36,7 @@ class Centralised:
     """
 
     joint = True
+    halfway = True  # whether corrections are linearised half way, else at the prediction
 
     def __init__(self, setups: Sequence[Setup]) -> None:
         """Take the setups of all."""
@@ -65,10 +66,11 @@ class Centralised:
         odometry = [np.concatenate([tick.angular_velocity, tick.velocity]) for tick in ticks]
         bearings = [tick.bearings[tick.valid] for tick in ticks]
         self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
-        return [
-            UncertainPose(LEFT, R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
-            for i, (R, p) in enumerate(self.poses)
-        ]
+        return [UncertainPose(LEFT, R, p, self.covariance(i)).estimate() for i, (R, p) in enumerate(self.poses)]
+
+    def covariance(self, i: int) -> Array:
+        """Return the covariance (6, 6) of the left error of vehicle i."""
+        return self.P[self.block(i), self.block(i)].copy()
 
     def predict(self, ticks: Sequence[Tick]) -> None:
         """Carry every pose and the joint covariance through one tick of odometry."""
@@ -93,14 +95,15 @@ class Centralised:
         for i, mask in seen.items():
             seen[i] = mask.copy()
             seen[i][mask] = kept[i]
-        _, dx, _ = gain(P, H, N, residual)
-        at = 0.5 * dx
-        self.poses = moved(before, at)
-        residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
-        H = H.dot(recentring(at))
-        K, dx, _ = gain(P, H, N, residual + H.dot(at))
-        G = recentring(dx)
-        self.poses, self.P = moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
+        K, dx, _ = gain(P, H, N, residual)
+        if self.halfway:
+            at = 0.5 * dx
+            self.poses = self.moved(before, at)
+            residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
+            H = H.dot(self.recentring(at))
+            K, dx, _ = gain(P, H, N, residual + H.dot(at))
+        G = self.recentring(dx)
+        self.poses, self.P = self.moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
     def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
@@ -127,22 +130,22 @@ class Centralised:
         marker: Array = p + R.dot(self.markers[target - self.landmarks])
         return marker
 
+    @staticmethod
+    def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, Array]]:
+        """Return poses moved by their errors (6N,)."""
+        return [(R.dot(exp_so3(e[:3])), p + R.dot(e[3:])) for (R, p), e in zip(poses, dx.reshape(-1, 6), strict=True)]
+
+    @staticmethod
+    def recentring(dx: Array) -> Array:
+        """Return (6N, 6N) what `bearing_measurements.recentring` returns, of every pose."""
+        G = np.zeros((len(dx), len(dx)))
+        for n in range(0, len(dx), 6):
+            G[n : n + 6, n : n + 6] = bearing_measurements.recentring(LEFT, dx[n : n + 6])
+        return G
+
     def messages(self) -> list[Message]:
         """Return the raw measurements of this tick: odometry and bearings."""
         return self.sent
-
-
-def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, Array]]:
-    """Return poses moved by their errors (6N,)."""
-    return [(R.dot(exp_so3(e[:3])), p + R.dot(e[3:])) for (R, p), e in zip(poses, dx.reshape(-1, 6), strict=True)]
-
-
-def recentring(dx: Array) -> Array:
-    """Return (6N, 6N) what `bearing_measurements.recentring` returns, of every pose."""
-    G = np.zeros((len(dx), len(dx)))
-    for n in range(0, len(dx), 6):
-        G[n : n + 6, n : n + 6] = bearing_measurements.recentring(LEFT, dx[n : n + 6])
-    return G
 
 
 def _stacked(linear: Sequence[LinearisedBearings]) -> Stacked:

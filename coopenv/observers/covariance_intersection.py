@@ -31,6 +31,7 @@ from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled,
 from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import (
     FRAME,
+    RIGHT,
     BearingMeasurements,
     Frame,
     LinearisedBearings,
@@ -119,6 +120,18 @@ class CovarianceIntersection(Mekf):
             inflated = one._replace(covariances=one.covariances / (1.0 - w))
             *pose, _ = updated(*state[:3], state.P / w, frame_of(tick, inflated))
             self.state = UncertainPose(self.kind, *pose)
+
+
+class DistributedInvariant(CovarianceIntersection):
+    """Invariant filter, right error; neighbours by covariance intersection.
+
+    Source: Zhou, Liu, Zhu and Wang, Distributed invariant Kalman filter for cooperative localization using matrix Lie
+    groups, arXiv 2405.04000: propagation on the group, absolute measurements by a Kalman update, relative ones by
+    covariance intersection with the sender's covariance. There a robot has an inertial unit and measures relative
+    positions; here it has odometry and measures bearings.
+    """
+
+    kind = RIGHT
 
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])

@@ -77,6 +77,10 @@ ZOO = {
     "right_invariant": ZooEntry(
         "error_state_filters:RightInvariant", "Invariant filter, right error; sends covariances"
     ),
+    "distributed_invariant": ZooEntry(
+        "covariance_intersection:DistributedInvariant",
+        "Invariant filter, right error; neighbours by covariance intersection",
+    ),
     "ukf": ZooEntry("error_state_filters:Ukf", "Unscented (sigma-point) filter; sends covariances"),
     "factor_graph": ZooEntry(
         "factor_graph:FactorGraph", "Factor graph smoothed at key frames; sends covariances", needs="gtsam"
@@ -94,6 +98,24 @@ ZOO = {
         on_a_plane=False,
     ),
     "centralised": ZooEntry("centralised:Centralised", "One filter over all vehicles and all measurements"),
+    "first_estimates_ekf": ZooEntry(
+        "consistent_ekf:FirstEstimatesEkf", "Centralised filter that linearises at first estimates"
+    ),
+    "observability_constrained_ekf": ZooEntry(
+        "consistent_ekf:ObservabilityConstrainedEkf",
+        "Centralised filter with Jacobians projected onto the observable directions",
+    ),
+    "belief_propagation": ZooEntry(
+        "belief_propagation:BeliefPropagation",
+        "Gaussian belief propagation over the last frames, with robust factors",
+        on_a_plane=False,
+    ),
+    "smoother": ZooEntry(
+        "smoother:Smoother", "Robust smoother of all vehicles over the whole window", on_a_plane=False
+    ),
+    "fixed_lag_smoother": ZooEntry(
+        "smoother:FixedLagSmoother", "Robust smoother of all vehicles over the last half second", on_a_plane=False
+    ),
 }
 """By name."""
 

@@ -163,6 +163,7 @@ LEADERS = [
     "mekf_covariance_ungated",
     "right_invariant",
     "covariance_intersection",
+    "distributed_invariant",
     "split_covariance_intersection",
     "pairwise",
     "schmidt_kalman",
@@ -197,8 +198,9 @@ def test_leader_is_at_the_most_probable_trajectory(name: str) -> None:
     assert_most_probable(name, [0])
 
 
-def test_centralised_filter_is_at_the_most_probable_trajectory_of_all() -> None:
-    assert_most_probable("centralised", range(5))
+@pytest.mark.parametrize("name", ["centralised", "first_estimates_ekf", "observability_constrained_ekf"])
+def test_joint_filter_is_at_the_most_probable_trajectory_of_all(name: str) -> None:
+    assert_most_probable(name, range(5))
 
 
 def test_covariance_intersection_covers_every_correlation() -> None:

@@ -1,0 +1,296 @@
+"""Factor graph of the poses of all vehicles, for the smoothers and for Gaussian belief propagation.
+
+Source: Dellaert and Kaess, Factor graphs for robot perception, Foundations and Trends in Robotics 6, 2017. Variables
+are the poses of all vehicles at every camera frame. Factors are the initial estimates, odometry and bearings, as in
+bearing_measurements.py and centralised.py. Every error is a left one: R = Rhat Exp(theta), p = phat + Rhat rho.
+
+Frames cannot be combined to fewer: odometry is as precise over one frame as bearings are, so that its noise between two
+variables is not negligible. Where vehicles follow each other in a lane, this decides about the range.
+
+Robust loss: Agarwal, Tipaldi, Spinello, Stachniss and Burgard, Robust map optimization using dynamic covariance
+scaling, ICRA 2013. The information of a bearing of normalised squared residual x is multiplied by s^2, where
+s = min(1, 2 PHI / (PHI + x)). A vehicle of which most bearings would be scaled has a wrong pose. Its bearings count
+fully until most of them fit. New bearings pass the gate of the other filters first (correction.py).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from coopenv.estimation.compiled import (
+    MATRICES,
+    MATRIX,
+    VECTOR,
+    compiled,
+    cross_matrix,
+    product,
+    transformed,
+)
+from coopenv.estimation.poses import Array, orthonormalise
+from coopenv.observers.bearing_measurements import (
+    LEFT,
+    BearingMeasurements,
+    UncertainPose,
+    across,
+    ahead,
+    increment,
+    linearised,
+    moved,
+    put_derivative,
+)
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.correction import LARGEST, PLACES, InnovationGate
+
+LEAST_STD = 1e-6  # rad and m, of an odometry increment: without noise its information would be infinite
+PHI = LARGEST  # squared residual at which the loss begins to differ from least squares
+MOST_SCALED = 0.5  # share of a vehicle's bearings that may be scaled
+
+FLAGS = types.Array(types.boolean, 1, "A", readonly=True)
+STACK = types.Array(types.float64, 4, "A", readonly=True)
+
+
+class FrameGraph:
+    """Poses, odometry and bearings of N vehicles at K frames, in arrays that grow."""
+
+    FRAME_ARRAYS = ("R", "p", "turn", "shift", "variance")
+    BEARING_ARRAYS = ("observer", "target", "bearing", "point")
+
+    def __init__(self, setups: Sequence[Setup], R: Array, p: Array) -> None:
+        """Start with one frame at poses R (N, 3, 3) and p (N, 3), map, m."""
+        N = len(p)
+        self.landmarks = setups[0].landmarks
+        self.markers = np.array([setup.marker for setup in setups], float)
+        self.cameras = np.array([setup.lever_arm for setup in setups], float)
+        self.noise = np.array([setup.noise.bearing_std**2 for setup in setups])  # (N,) rad^2
+        self.frames = 1
+        self.R, self.p = R[None].copy(), p[None].copy()  # where factors are linearised
+        self.turn, self.shift = np.zeros((1, N, 3, 3)), np.zeros((1, N, 3))  # odometry since the last frame, m
+        self.variance = np.ones((1, N, 6))  # of it, rad^2 and m^2
+        self.begin = np.zeros(2, np.int64)  # first bearing of each frame, and of the next one
+        self.observer = np.zeros(1, np.int64)  # vehicle of the camera
+        self.target = np.zeros(1, np.int64)  # vehicle, -1: landmark
+        self.bearing, self.point = np.zeros((1, 3)), np.zeros((1, 3))  # body frame; the landmark's position, map, m
+
+    def append(self, ticks: Sequence[Tick]) -> None:
+        """Add a frame without bearings, at the poses that odometry predicts."""
+        k = self.frames
+        self._grow(self.FRAME_ARRAYS, k + 1)
+        self._grow(("begin",), k + 2)
+        for i, tick in enumerate(ticks):
+            self.turn[k, i], self.shift[k, i] = increment(tick)
+            self.variance[k, i] = tick.noise.odometry(tick.dt) + LEAST_STD**2
+            R, p = self.R[k - 1, i], self.p[k - 1, i]
+            self.R[k, i], self.p[k, i] = orthonormalise(R.dot(self.turn[k, i])), p + R.dot(self.shift[k, i])
+        self.frames, self.begin[k + 1] = k + 1, self.begin[k]
+
+    def add(self, vehicle: int, targets: NDArray[np.int64], bearings: Array, points: Array) -> None:
+        """Add m bearings (m, 3) of a vehicle to the last frame; points (m, 3) are those of landmarks, map, m."""
+        first = int(self.begin[self.frames])
+        end = first + len(targets)
+        self._grow(self.BEARING_ARRAYS, end)
+        self.observer[first:end], self.target[first:end] = vehicle, np.maximum(targets - self.landmarks, -1)
+        self.bearing[first:end], self.point[first:end] = bearings, points
+        self.begin[self.frames] = end
+
+    def _grow(self, names: Sequence[str], length: int) -> None:
+        for name in names:
+            values = getattr(self, name)
+            if len(values) < length:
+                grown = np.zeros((2 * length, *values.shape[1:]), values.dtype)
+                grown[: len(values)] = values
+                setattr(self, name, grown)
+
+    def move(self, first: int, dx: Array) -> None:
+        """Move the poses from a frame on by their errors (F, N, 6)."""
+        moved_poses(self.R[first : first + len(dx)], self.p[first : first + len(dx)], dx)
+
+    def pairs(self, frame: int, scaled: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        """Return the information of the bearings of a frame; `scaled` (N,): vehicles with the robust loss.
+
+        Returns:
+            (N, N, 12, 12) information about the errors of observer and target, (N, N, 12) information times error, and
+            (N, 2) the bearings of each vehicle and how many of them do not fit. At [i, i] the first six are those of
+            the bearings to landmarks.
+        """
+        of = slice(self.begin[frame], self.begin[frame + 1])
+        L, eta, count = pair_information(
+            self.R[frame],
+            self.p[frame],
+            self.observer[of],
+            self.target[of],
+            self.bearing[of],
+            self.point[of],
+            self.cameras,
+            self.markers,
+            self.noise,
+            scaled,
+        )
+        return L, eta, count
+
+    def odometry(self, frame: int) -> tuple[Array, Array]:
+        """Return F (N, 6, 6) and u (N, 6): the error at a frame is F e + u + noise, of e (N, 6) at the frame before."""
+        k = frame
+        F, u = motion(self.R[k - 1], self.p[k - 1], self.R[k], self.p[k], self.turn[k], self.shift[k])
+        return F, u
+
+
+class GraphEstimator:
+    """Base of joint estimators over a frame graph. Subclasses define `begin` and `correct`."""
+
+    joint = True
+
+    def __init__(self, setups: Sequence[Setup]) -> None:
+        """Take the setups of all vehicles."""
+        self.setups = tuple(setups)
+
+    def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
+        """Start with independent errors."""
+        R, p = (np.array(values, float) for values in zip(*initial_poses, strict=True))
+        self.graph = FrameGraph(self.setups, R, p)
+        self.P = np.array(initial_covariances, float)  # (N, 6, 6) at the last tick
+        self.gates = [InnovationGate() for _ in self.setups]
+        self.scaled = np.zeros(len(p), np.bool_)  # vehicles whose bearings have the robust loss
+        self.sent = [Message() for _ in self.setups]
+        self.begin(self.P)
+
+    def begin(self, P: Array) -> None:
+        """Start at the first frame with covariances P (N, 6, 6)."""
+        raise NotImplementedError
+
+    def correct(self, ticks: Sequence[Tick]) -> Array:
+        """Estimate the poses of the last frame, which is new: move it, and return the covariances (N, 6, 6)."""
+        raise NotImplementedError
+
+    def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
+        """Append a tick of every vehicle and estimate the poses."""
+        self.graph.append(ticks)
+        for i, tick in enumerate(ticks):
+            if tick.due and tick.valid.any():
+                self.receive(i, tick)
+        self.P = P = self.correct(ticks)
+        self.sent = self.broadcast(ticks)
+        R, p = self.graph.R[self.graph.frames - 1], self.graph.p[self.graph.frames - 1]
+        return [Estimate(R[i].copy(), p[i].copy(), P[i].copy()) for i in range(len(ticks))]
+
+    def receive(self, vehicle: int, tick: Tick) -> None:
+        """Add the bearings of a vehicle that pass its gate; correlations between vehicles are neglected there."""
+        graph, k = self.graph, self.graph.frames - 1
+        targets = tick.targets[tick.valid]
+        j, C = targets - graph.landmarks, np.zeros((len(targets), 3, 3))
+        z = np.zeros((len(targets), 3))
+        z[j < 0] = tick.landmarks[targets[j < 0]]
+        for n in np.flatnonzero(j >= 0).tolist():
+            of = UncertainPose(LEFT, graph.R[k, j[n]], graph.p[k, j[n]], self.P[j[n]])
+            z[n], C[n] = of.p + of.R.dot(graph.markers[j[n]]), of.point_covariance(graph.markers[j[n]])
+        bearings = np.asarray(tick.bearings[tick.valid], float)
+        measured = BearingMeasurements(bearings, z, C, targets, (None,) * len(targets))
+        pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
+        linear = linearised(pose, tick, measured)
+        kept = self.gates[vehicle].passed(
+            tick.time, linear.residual, linear.spread(pose.P), ahead(pose, tick, measured)
+        )
+        graph.add(vehicle, targets[kept], bearings[kept], z[kept])
+
+    def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
+        """Return the measurements of this tick, which every vehicle sends: odometry and bearings."""
+        odometry = [np.concatenate([tick.angular_velocity, tick.velocity]) for tick in ticks]
+        bearings = [tick.bearings[tick.valid] for tick in ticks]
+        return [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
+
+    def messages(self) -> list[Message]:
+        """Return what each vehicle sent for this tick."""
+        return self.sent
+
+    def judge(self, count: Array) -> None:
+        """Apply the robust loss to the vehicles most of whose bearings fit, by the counts (N, 2) of some frames."""
+        self.scaled = count[:, 1] <= MOST_SCALED * count[:, 0]
+
+
+@compiled(types.Array(types.float64, 4, "A"), types.Array(types.float64, 3, "A"), MATRICES)
+def moved_poses(R: Array, p: Array, dx: Array) -> None:
+    """Move poses R (F, N, 3, 3) and p (F, N, 3) in place by their errors dx (F, N, 6)."""
+    for k in range(len(R)):
+        for i in range(len(R[k])):
+            turned, shifted = moved(LEFT, R[k, i], p[k, i], dx[k, i])
+            R[k, i], p[k, i] = 1.5 * turned - product(0.5 * turned, product(turned.T, turned)), shifted
+
+
+@compiled(MATRIX)
+def logarithm(R: Array) -> Array:
+    """Return the rotation vector (3,) of R (3, 3), rad, to be used away from half a turn."""
+    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    angle = math.atan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    return v * (angle / sine if sine > 1e-9 else 1.0)
+
+
+@compiled(MATRICES, MATRIX, MATRICES, MATRIX, MATRICES, MATRIX)
+def motion(before_R: Array, before_p: Array, R: Array, p: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
+    """Return F and u of `FrameGraph.odometry`, without the Jacobian of the logarithm, which is 1 where u is small."""
+    N = len(R)
+    F, u = np.zeros((N, 6, 6)), np.zeros((N, 6))
+    for i in range(N):
+        E = product(R[i].T, before_R[i])
+        S = product(E, cross_matrix(-shift[i]))
+        for r in range(3):
+            for c in range(3):
+                F[i, r, c] = turn[i, c, r]
+                F[i, r + 3, c] = S[r, c]
+                F[i, r + 3, c + 3] = E[r, c]
+        u[i, :3] = logarithm(product(E, turn[i]))
+        u[i, 3:] = transformed(R[i].T, before_p[i] + transformed(before_R[i], shift[i]) - p[i])
+    return F, u
+
+
+@compiled(MATRICES, MATRIX, PLACES, PLACES, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, FLAGS)
+def pair_information(
+    R: Array,
+    p: Array,
+    observer: NDArray[np.int64],
+    target: NDArray[np.int64],
+    bearing: Array,
+    point: Array,
+    cameras: Array,
+    markers: Array,
+    variance: Array,
+    scaled: NDArray[np.bool_],
+) -> tuple[Array, Array, Array]:
+    """Return what `FrameGraph.pairs` does, from its arrays."""
+    N = len(R)
+    L, eta, count = np.zeros((N, N, 12, 12)), np.zeros((N, N, 12)), np.zeros((N, 2))
+    J, r, row = np.zeros((2, 12)), np.zeros(2), np.zeros(6)
+    for n in range(len(observer)):
+        i, j = observer[n], target[n]
+        z = point[n].copy()
+        if j >= 0:
+            z = p[j] + transformed(R[j], markers[j])
+        a = transformed(R[i].T, z - p[i])
+        d = a - cameras[i]
+        distance = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9)
+        B = across(d[0] / distance, d[1] / distance, d[2] / distance)
+        for k in range(2):
+            r[k] = B[k, 0] * bearing[n, 0] + B[k, 1] * bearing[n, 1] + B[k, 2] * bearing[n, 2]
+            put_derivative(row, B[k], a, 1.0 / distance)
+            J[k, :6] = row
+            J[k, 6:] = 0.0
+            if j >= 0:  # in the body of the target
+                put_derivative(row, transformed(R[j].T, transformed(R[i], B[k])), markers[j], -1.0 / distance)
+                J[k, 6:] = row
+        squared = (r[0] * r[0] + r[1] * r[1]) / variance[i]
+        ahead = d[0] * bearing[n, 0] + d[1] * bearing[n, 1] + d[2] * bearing[n, 2] > 0.0
+        count[i, 0] += 1.0
+        count[i, 1] += 0.0 if squared <= PHI and ahead else 1.0
+        w = 1.0 / variance[i]
+        if scaled[i]:
+            s = min(1.0, 2.0 * PHI / (PHI + squared))
+            w *= s * s if ahead else 0.0
+        b = i if j < 0 else j
+        for k in range(2):
+            for x in range(12):
+                eta[i, b, x] += w * J[k, x] * r[k]
+                for y in range(12):
+                    L[i, b, x, y] += w * J[k, x] * J[k, y]
+    return L, eta, count
