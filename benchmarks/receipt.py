@@ -1,10 +1,10 @@
 """`python -m benchmarks.receipt`: what each part of `robust` buys, and how much its numbers matter.
 
-Without arguments it leaves out one part after the other, and all monitors together. Columns: false exclusions per
-hour of a vehicle in worlds without a fault; median time from a fault to the exclusion of its source; mean position
-RMSE of honest vehicles by case; CPU time. With `--constants` it halves and doubles each number of constants.py.
-Every variant runs in a process of its own, in which functions or constants are replaced before the kernels are
-compiled; compilation takes half a minute per variant, once per machine.
+Without arguments it leaves out one part after the other, and all monitors together. Columns of the table in Markdown:
+false exclusions per hour of a vehicle in worlds without a fault; median time from a lie to the exclusion of its sender;
+CPU time; mean position RMSE of honest vehicles by case, m. With `--constants` it halves and doubles each constant.
+Every variant runs in a process of its own, in which functions or constants are replaced before compilation, which takes
+half a minute per variant, once per machine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import numpy as np
 from rich.console import Console
 
 from coopenv.base.format import in_parentheses
-from coopenv.runs.console import Progress, number_table
+from coopenv.runs.console import Progress
+from coopenv.runs.page import table
 
 LIAR = 1
 """The vehicle that lies."""
@@ -31,25 +32,26 @@ CASES = ("nominal", "landmark", "bias", "random", "jump", "drift")
 """In busy_intersection_tracking and on the road of `benchmarks.evidence`; the last two are lies, in the first scene."""
 
 
-def replace_functions(part: str) -> None:
-    """Replace what a part consists of, by name of the part."""
+def parts() -> dict[str, list[tuple[Any, str, Any]]]:
+    """Return what leaves out each part of the observer: attributes of modules, and what replaces them."""
     import warp as wp
 
     from coopenv.observers.robust import constants, correlated_fusion, fault_hypotheses, measurements, observer
     from coopenv.observers.robust.memory import SENDER_SLOTS
+    from coopenv.observers.robust.source_monitor import end_block
+    from coopenv.observers.robust.sources import take_slot
     from coopenv.world.warp_internals import device_function
-
-    whole_block, slot = fault_hypotheses.end_block, measurements.take_slot
 
     @device_function
     def no_landmark(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any) -> int:
         if landmark:
             return -1
-        return slot(memory, world, i, target, tick, landmark, period)
+        slot: int = take_slot(memory, world, i, target, tick, landmark, period)
+        return slot
 
     @device_function
     def no_offsets(memory: Any, world: int, i: int, time: Any) -> int:
-        count = whole_block(memory, world, i, time)
+        count: int = end_block(memory, world, i, time)
         for q in range(1, 1 + SENDER_SLOTS):
             memory.source[world, i, q].ratio = wp.float64(0.0)
         return count
@@ -74,7 +76,7 @@ def replace_functions(part: str) -> None:
     def no_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):  # type: ignore[no-untyped-def]
         pass
 
-    changes: dict[str, list[tuple[Any, str, Any]]] = {
+    return {
         "nothing": [],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
         "monitor of odometry": [(constants, "ODOMETRY_FAULT", 1e-9)],
@@ -93,26 +95,6 @@ def replace_functions(part: str) -> None:
         ],
         "inflation of senders": [(constants, "MIN_INFLATION", 0.0)],
     }
-    for module, name, value in changes[part]:
-        setattr(module, name, value)
-
-
-PARTS = (
-    "nothing",
-    "all monitors",
-    "monitor of odometry",
-    "monitors of landmarks",
-    "senders' offsets",
-    "senders' drifts",
-    "several senders at once",
-    "covariance of likely faults",
-    "readmission",
-    "all bearings when lost",
-    "gyro bias",
-    "senders' increments",
-    "linearisation variance",
-    "inflation of senders",
-)
 
 
 def numbers() -> list[str]:
@@ -130,7 +112,8 @@ def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
         name, factor = variant.split("*")
         setattr(constants, name, getattr(constants, name) * float(factor))
     else:
-        replace_functions(variant)
+        for module, name, value in parts()[variant]:
+            setattr(module, name, value)
     from benchmarks import evidence
     from coopenv.bench.observers.faults import variant_of
     from coopenv.observers import run
@@ -180,7 +163,8 @@ class Watched:
     """An observer of which the times of exclusions are noted."""
 
     def __init__(self, observer: Any) -> None:
-        self.observer, self.times, self._known = observer, [], np.zeros(len(observer.memory.source), int)
+        self.observer, self._known = observer, np.zeros(len(observer.memory.source), int)
+        self.times: list[tuple[float, int]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.observer, name)
@@ -199,35 +183,28 @@ class Watched:
         return estimate
 
 
-def part_table(results: dict[str, dict[str, Any]]) -> Any:
-    """Return the table of the parts that are left out."""
-    cases = list(results["nothing"]["rmse"])
-    table = number_table(
-        ["\n\nleft out"],
-        ["false\nexcl.\n[1/h]", "time to\nexclude\n[s]", *(c.replace(" ", "\n") + "\n[m]" for c in cases)],
-    )
+def part_table(results: dict[str, dict[str, Any]]) -> str:
+    """Return the table, in Markdown, of the parts that are left out."""
+    rows = []
     for part, found in results.items():
         delay = float(np.median(found["delay"]))
         rate = found["exclusions"] / found["hours"]
-        table.add_row(
-            part, f"{rate:.1f}", f"{delay:.1f}" if np.isfinite(delay) else "-", *map(_mean, found["rmse"].values())
-        )
-    return table
+        times = [f"{rate:.1f}", f"{delay:.1f}" if np.isfinite(delay) else "-", f"{found['seconds']:.0f}"]
+        rows.append([part, *times, *map(_mean, found["rmse"].values())])
+    heads = ["left out", "false exclusions, 1/h", "time to exclude, s", "CPU, s", *results["nothing"]["rmse"]]
+    return table(heads, rows)
 
 
-def constant_table(results: dict[str, dict[str, Any]]) -> Any:
+def constant_table(results: dict[str, dict[str, Any]]) -> str:
     """Return the table of the numbers: ratio of the RMSE to that with all as they are, nominal and over the faults."""
-    base = results.pop("nothing")["rmse"]
-    table = number_table(
-        ["\nnumber", "\ntimes"], ["without\nfault", "faults,\nmean", "faults,\nworst", "false excl.\n[1/h]"]
-    )
+    base, rows = results["nothing"]["rmse"], []
     for variant, found in results.items():
         ratio = {case: float(np.mean(values) / np.mean(base[case])) for case, values in found["rmse"].items()}
         nominal = [r for case, r in ratio.items() if case.endswith("nominal")]
         faults = [r for case, r in ratio.items() if not case.endswith("nominal")]
         cells = (f"{np.mean(nominal):.2f}", f"{np.mean(faults):.2f}", f"{max(faults):.2f}")
-        table.add_row(*variant.split("*"), *cells, f"{found['exclusions'] / found['hours']:.1f}")
-    return table
+        rows.append([variant, *cells, f"{found['exclusions'] / found['hours']:.1f}"])
+    return table(["number", "without fault", "faults, mean", "faults, worst", "false exclusions, 1/h"], rows)
 
 
 def _mean(values: Sequence[float]) -> str:
@@ -247,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if asked.variant:
         print(json.dumps(measure(asked.variant, seeds)))
         return 0
-    variants = list(PARTS)
+    variants = list(parts())
     if asked.constants is not None:
         unknown = sorted(set(asked.constants) - set(numbers()))
         if unknown:
@@ -262,8 +239,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             command = [sys.executable, "-m", "benchmarks.receipt", *options]
             result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             results[variant] = json.loads(result.stdout.splitlines()[-1])
-    table = part_table(results) if asked.constants is None else constant_table(results)
-    Console(markup=False, highlight=False).print(table, f"{asked.seeds} seeds from {asked.first} on.", sep="\n")
+    print(part_table(results) if asked.constants is None else constant_table(results))
+    print(f"\n{asked.seeds} seeds from {asked.first} on.")
     return 0
 
 

@@ -24,7 +24,7 @@ def read_npz(
         path: of the file.
         what: it is, as errors call it.
         table: by name of an array the kinds of its dtype and its axes, for example "f K N 3". Axes of the same letter
-            have the same length.
+            have the same length. With "f?" files of older versions may lack it; it is infinite then.
         lengths: by letter which lengths are possible; None: any.
 
     Raises:
@@ -37,10 +37,12 @@ def read_npz(
             members = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
             if sum(part.file_size for part in archive.infolist()) > MOST_UNPACKED:
                 raise DataError(f"{path}: unpacks to more than {MOST_UNPACKED >> 30} GiB")
-            if missing := [name for name in table if name not in members]:
+            if missing := [name for name, rule in table.items() if name not in members and "?" not in rule]:
                 raise DataError(f"{path}: not a {what}, missing: {', '.join(missing)}")
             found = {}
             for name, rule in table.items():
+                if name not in members:
+                    continue
                 with archive.open(members[name]) as stream:
                     shape, _, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
                 if not _fits(shape, dtype, rule, possible):
@@ -51,6 +53,9 @@ def read_npz(
                     raise EOFError
                 with archive.open(members[name]) as stream:
                     found[name] = np.lib.format.read_array(stream, allow_pickle=False)
+            for name in table.keys() - found.keys():
+                axes = table[name].split()[1:]
+                found[name] = np.full([int(axis) if axis.isdigit() else possible[axis][0] for axis in axes], np.inf)
             return found
     except CoopenvError:
         raise

@@ -80,7 +80,7 @@ class Trajectory(RecordedGeometry):
     orientation_error: Annotated[np.ndarray, "f K N"]  # deg, geodesic
     covariance: Annotated[np.ndarray, "f K N 6 6"]  # rad^2, rad m, m^2
     nees: Annotated[np.ndarray, "f K N"]
-    protection_level: Annotated[np.ndarray, "f K N 2"]  # m, rad; infinite: unknown, or none is stated
+    protection_level: Annotated[np.ndarray, "f? K N 2"]  # m, rad; infinite: unknown, or none is stated
     velocity: Annotated[np.ndarray, "f K N 3"]  # m/s, truth
     angular_velocity: Annotated[np.ndarray, "f K N 3"]  # rad/s, truth
     sight: Annotated[np.ndarray, "iu K N T"]  # uint8, values of `Sight`

@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.cli import main
+from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import Results
 from coopenv.runs.recorder import write_tum
 from coopenv.viz import FIGURE_NAMES
@@ -95,8 +96,11 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
         np.savez(tmp_path / "other" / "trajectory.npz", allow_pickle=True, **{**arrays, **change})
         assert why in said("other")
     arrays.pop("protection_level")  # as of older versions
+    np.savez(tmp_path / "older.npz", **arrays)
+    assert np.isinf(Trajectory.load(tmp_path / "older.npz").protection_level).all()
+    arrays.pop("nees")
     np.savez(tmp_path / "other" / "trajectory.npz", **arrays)
-    assert "trajectory.npz: not a trajectory, missing: protection_level" in said("other")
+    assert "trajectory.npz: not a trajectory, missing: nees" in said("other")
     (tmp_path / "other" / "trajectory.npz").unlink()
     assert "trajectory.npz: not a readable trajectory (No such file or directory)" in said("other")
     shutil.copy(folder / "trajectory.npz", tmp_path / "other")
