@@ -156,4 +156,4 @@ def test_completion_is_offered_by_the_program() -> None:
     asked = {"_COOPENV_COMPLETE": "complete_bash", "COMP_WORDS": "coopenv run cross", "COMP_CWORD": "2"}
     command = [sys.executable, "-c", "from coopenv.cli import app; app(prog_name='coopenv')"]
     result = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
-    assert result.stdout.split() == ["crossing_path"]
+    assert result.stdout.split() == ["crossing_path", "crossroad:"]

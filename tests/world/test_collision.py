@@ -13,7 +13,7 @@ from coopenv.scenario.routes import Boxes
 from coopenv.world import dynamics
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
-from tests.scenario.test_boxes import depth as overlap
+from tests.scenario.test_routes import depth as overlap
 
 call = Calls(__name__, {dynamics.boxes_touch: "3 33 3 3 33 3 > b"})
 
