@@ -14,6 +14,7 @@ fully until most of them fit. New bearings pass the gate of the other filters fi
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -137,7 +138,7 @@ class FrameGraph:
         return F, u
 
 
-class GraphEstimator:
+class GraphEstimator(ABC):
     """Base of joint estimators over a frame graph. Subclasses define `begin` and `correct`."""
 
     joint = True
@@ -156,13 +157,13 @@ class GraphEstimator:
         self.sent = [Message() for _ in self.setups]
         self.begin(self.P)
 
+    @abstractmethod
     def begin(self, P: Array) -> None:
         """Start at the first frame with covariances P (N, 6, 6)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def correct(self, ticks: Sequence[Tick]) -> Array:
         """Estimate the poses of the last frame, which is new: move it, and return the covariances (N, 6, 6)."""
-        raise NotImplementedError
 
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
         """Append a tick of every vehicle and estimate the poses."""

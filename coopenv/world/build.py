@@ -120,7 +120,7 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
         "lie_direction": direction,
         "lie_std": lie.std or 0.0,
         "lie_turn": lie.turn,
-        "lie_consistent": int(lie.odometry == "consistent"),
+        "lie_consistent": int(lie.kind != "none" and lie.odometry == "consistent"),
     }
 
 

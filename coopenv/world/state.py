@@ -307,8 +307,8 @@ def state_struct(p: Precision) -> Any:
         covariance: array("WN", mat66, COVARIANCE)  # P over (2 lambda, p)
         corrected_tick: array("WN", wp.int32, whole(0, "tick"))  # tick of the observer's last correction
         nis: array("WN", wp.float64, numbers(LARGEST**3))  # normalised innovation squared of its last tick, if given
-        protection_level: array("WN", wp.vec2d, LEVELS)  # horizontal, m, and angular, rad; inf: unknown, 0: not given
         nis_dof: array("WN", wp.int32, whole(0, 10**6))  # degrees of freedom; 0: no correction, or not given
+        protection_level: array("WN", wp.vec2d, LEVELS)  # horizontal, m, and angular, rad; inf: unknown, 0: not given
 
         gramian_11: array("WNB", mat33, numbers(LARGEST**3))  # block sums of int C^T C dt, map axes
         gramian_12: array("WNB", mat33, numbers(LARGEST**3))

@@ -89,7 +89,7 @@ def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
         clock=np.zeros(N, np.int64),
         restarts=np.zeros((K, N), bool),
         kept=np.zeros(N, np.int64),
-        consistent=np.ones(N, bool),
+        consistent=np.zeros(N, bool),
     )
     for sender in senders:
         if fault.word == "replay":

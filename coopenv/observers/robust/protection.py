@@ -14,7 +14,7 @@ import warp as wp
 
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import is_known
-from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d
+from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d, vec6d
 from coopenv.observers.robust.sources import is_active
 from coopenv.world.warp_internals import device_function
 
@@ -48,7 +48,7 @@ def protection_level(memory: Any, world: int, i: int):
     """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown."""
     R = memory.member[world, i, 0].pose.R
     own = memory.P[world, i, 0, 0] + memory.doubt[world, i]
-    most = levels(R, own, memory.sensitivity[world, i, 0, 0] * vec3d())
+    most = levels(R, own, vec6d())
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             Phi = memory.sensitivity[world, i, q, 0]

@@ -78,6 +78,35 @@ def test_a_lie_costs_little(name: str) -> None:
     assert np.median(each) < MOST.get(name, 3.0), each
 
 
+def from_odometry_to_map(pose: np.ndarray, odometry: np.ndarray) -> np.ndarray:
+    """Return where the map has the origin of a dead reckoning, m."""
+    return np.asarray(pose["p"] - pose["R"] @ odometry["R"].T @ odometry["p"])
+
+
+@pytest.mark.parametrize(
+    ("faults", "low", "high"),
+    [
+        ({"lie": {"kind": "jump", "offset": 3.0, "turn": 0.3}}, 0.0, 0.1),
+        ({"lie": {"kind": "jump", "offset": 3.0, **HONEST}}, 2.9, 3.1),
+        ({"corruption": {"probability": 1.0, "turn": 0.0}}, 0.5, 20.0),
+    ],
+    ids=str,
+)
+def test_the_odometry_of_a_consistent_liar_leads_where_its_poses_do(
+    faults: dict[str, Any], low: float, high: float
+) -> None:
+    """That of an honest one, and of messages altered on the way, does not."""
+    world = simulate(scene(overrides={"vehicles.vehicle_2.faults": faults}), 1)
+    reset(world, [5])
+    world.advance(60)
+    belief, member = world.memory.belief.numpy()[0, 1], world.memory.member.numpy()[0, 1, 0]
+    sent = max(world.memory.outbox.numpy()[0, 1], key=lambda report: report["tick"])
+    off = from_odometry_to_map(sent["pose"], sent["odometry"]) - from_odometry_to_map(
+        member["pose"], belief["odometry"]
+    )
+    assert low <= np.linalg.norm(off) <= high, off
+
+
 def verdicts(made: Scenario, seed: int, seconds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, N) how often each vehicle has excluded each other one, and (N,) the position errors, m, in the end."""
     world = simulate(made, 1)
