@@ -1,6 +1,7 @@
 """Constants of the filter with their units; "Chosen" and "Tuned" mark those that do not follow from a model."""
 
 THIRD = 1.0 / 3.0
+MEAN_TIME = 1.0
 
 # Belief
 

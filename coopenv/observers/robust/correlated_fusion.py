@@ -47,8 +47,8 @@ def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
         return False
     v = memory.member[world, i, n].v
     dated = memory.member[world, i, n].dated_v
-    most = wp.float64(constants.SHARE_OF_CHANGE) * wp.length(dated) + wp.float64(constants.LEAST_CHANGE)
-    if wp.length(v - dated) <= most:
+    share = wp.float64(constants.SHARE_OF_CHANGE * constants.SHARE_OF_CHANGE)
+    if wp.length_sq(v - dated) <= share * wp.length_sq(dated) + memory.member[world, i, n].velocity_variance:
         return False
     memory.member[world, i, n].dated_v = v
     P = memory.P[world, i, n, n] + by_clocks(model, memory, world, i, n)

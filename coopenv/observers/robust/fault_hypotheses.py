@@ -307,8 +307,7 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)
     fits = present < wp.float64(constants.BEARING_GATE) and gain > wp.float64(constants.BEARING_GATE)
-    doublings = wp.min(memory.source[world, i, q].exclusions - 1, constants.MAX_DOUBLINGS)
-    least_time = wp.float64(constants.READMISSION_TIME) * wp.float64(1 << doublings)
+    least_time = wp.float64(constants.READMISSION_TIME) * wp.float64(memory.source[world, i, q].exclusions)
     if fits and memory.source[world, i, q].time > least_time:
         memory.source[world, i, q].excluded = 0
         clear_source(memory, world, i, q)

@@ -69,6 +69,12 @@ def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender:
 
 
 @device_function
+def possible_speed(memory: Any, world: int, i: int):
+    """Return a speed, m/s, that a vehicle of unknown twist may have: the own one and an acceleration to walking pace."""
+    return wp.length(memory.belief[world, i].mean_v) + wp.float64(constants.MAX_ACCELERATION * constants.MEAN_TIME)
+
+
+@device_function
 def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, frame: BearingFrame):
     """Return the variance per axis, m^2, of a sender's reported position, as it counts in the search.
 
@@ -76,7 +82,7 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
     """
     variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(constants.THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
-    gone = wp.float64(constants.MAX_SPEED) * age
+    gone = possible_speed(memory, world, i) * age
     factor = wp.float64(constants.CORRELATION_FACTOR)
     if memory.search[world, i].hypotheses > 0:
         factor = wp.max(factor, wp.float64(constants.CORRELATION_TIME) / frame.period)
@@ -96,8 +102,8 @@ def set_measurement_of_member(
     """Set the frame's next bearing as one to a member that has moved since its last fused report.
 
     The member is propagated by its broadcast odometry, and from there by its last twist. Before a second report its
-    twist is unknown: its bearing is then used for a resection only, with `MAX_SPEED` as in the search; the function
-    returns whether it is used. Errors that are the same in several frames count once in all of them.
+    twist is unknown: its bearing is then used for a resection only, with a `possible_speed` as in the search; the
+    function returns whether it is used. Errors that are the same in several frames count once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
     sender = memory.member[world, i, member].vehicle
@@ -118,7 +124,7 @@ def set_measurement_of_member(
         if memory.member[world, i, member].has_twist == 0:
             if frame.purpose == TRACKING:
                 return False
-            going = wp.float64(constants.MAX_SPEED) * age
+            going = possible_speed(memory, world, i) * age
             variance += going * going
         else:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)

@@ -40,7 +40,7 @@ def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
     calibration.vehicle = i
     calibration.pose.R = wp.identity(3, wp.float64)
     memory.member[world, i, n] = calibration
-    least = vec6d(wp.float64(constants.MIN_ERROR_STD * constants.MIN_ERROR_STD))
+    least = vec6d(wp.float64(constants.MIN_VARIANCE))
     memory.P[world, i, n, n] = wp.diag(wp.max(variances, least))
 
 
@@ -195,7 +195,7 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         p = p + R * (half * change_v)
         R = R * exp_so3(half * change_w)
         period = model.odometry_period
-        angular = wp.float64(constants.MAX_SMOOTH_ANGULAR_ACCELERATION)
+        angular = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
         linear = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
         noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
