@@ -43,10 +43,10 @@ def patch(share: float, time: float) -> None:
     def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):  # type: ignore[no-untyped-def]
         one = wp.float64(1.0)
         turn = correction.turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0))
-        chosen = wp.where(turn >= wp.float64(constants.RELINEARISATION_ANGLE), one, wp.float64(share))
+        chosen = wp.where(turn >= wp.float64(constants.LINEAR_ANGLE), one, wp.float64(share))
         if not first:
             turn = correction.turn_of_sight(memory, world, i, bearings, chosen, one)
-            chosen = wp.where(turn < wp.float64(constants.RELINEARISATION_ANGLE), wp.float64(0.0), chosen)
+            chosen = wp.where(turn < wp.float64(constants.LINEAR_ANGLE), wp.float64(0.0), chosen)
         return chosen
 
     correction.next_share = next_share

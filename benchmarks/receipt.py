@@ -87,7 +87,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "covariance of likely faults": [(fault_hypotheses, "set_doubt", no_doubt)],
         "readmission": [(observer, "test_excluded", no_readmission)],
         "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
-        "gyro bias": [(constants, "GYRO_BIAS", 1e-6), (constants, "GYRO_BIAS_WALK", 0.0)],
+        "gyro bias": [(constants, "GYRO_BIAS", 1e-6)],
         "senders' increments": [(correlated_fusion, "apply_sender_increment", no_increment)],
         "linearisation variance": [
             (constants, "LINEARISATION_TIME", 0.0),

@@ -25,7 +25,7 @@ from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Po
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
 
-MAX_UNSEEN_TIME = constants.FORGET_TIME + constants.SAME_TIME
+MAX_UNSEEN_TIME = constants.MEAN_TIME + constants.SAME_TIME
 
 
 @device_function

@@ -131,10 +131,10 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
     The share is 1 if the correction turns a line of sight far, else 0.5.
     """
     one = wp.float64(1.0)
-    far = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0)) >= wp.float64(constants.RELINEARISATION_ANGLE)
+    far = turn_of_sight(memory, world, i, bearings, one, wp.float64(0.0)) >= wp.float64(constants.LINEAR_ANGLE)
     share = wp.where(far, one, wp.float64(0.5))
     if not first:
-        if turn_of_sight(memory, world, i, bearings, share, one) < wp.float64(constants.RELINEARISATION_ANGLE):
+        if turn_of_sight(memory, world, i, bearings, share, one) < wp.float64(constants.LINEAR_ANGLE):
             share = wp.float64(0.0)
     return share
 
@@ -155,7 +155,7 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].open == 0, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)
-    while share > wp.float64(0.0) and step < constants.MAX_LINEARISATIONS:
+    while share > wp.float64(0.0) and step < constants.MAX_ITERATIONS:
         linearise_again(frame, memory, world, i, share)
         correct_by_bearings(memory, world, i, bearings, False, True)
         share = next_share(memory, world, i, bearings, False)

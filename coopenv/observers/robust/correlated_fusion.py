@@ -121,7 +121,7 @@ def note_step(memory: Any, world: int, i: int, n: int, d: Any, before: Any, afte
     N = block3(before - after + more, 3, 3)
     if wp.trace(N) < wp.float64(0.0):
         N = mat33d()
-    N = N + wp.float64(constants.LEAST_STEP) * block3(before, 3, 3)
+    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
     add_step(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
@@ -148,9 +148,9 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
     note_step(memory, world, i, n, d, before, after, more)
     variance = algebra.position_variance(before)
-    reach = wp.float64(constants.MAX_SENDER_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
+    reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
-        if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.STEP_GATE):
+        if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.POSE_GATE):
             apply_sender_increment(memory, world, i, n, d, N)
 
 
@@ -182,9 +182,9 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     grown = algebra.position_variance(P) - spread
     if grown > wp.float64(constants.RESET_GROWTH) * spread:
         inflate_dependents(memory, world, i, n, wp.float64(constants.THIRD) * grown)
-    if dt > wp.float64(constants.SILENCE_TIME):
+    if dt > wp.float64(constants.SHORT_TIME):
         estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-        if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
+        if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.POSE_GATE):
             inflate_dependents(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
             return True
     return False

@@ -273,7 +273,7 @@ def excess(left: Any, after: Any):
     All are 6x6, of left errors, rad and m. Only the directions that violate the bound are inflated.
     """
     more = mat66d()
-    share = wp.float64(constants.LEAST_LEFT)
+    share = wp.float64(constants.LEAST_SHARE)
     if not is_positive(left - share * after):
         X = algebra.inverse_factor(after)
         values, axes = eigen_symmetric6(symmetric_part(X * left * wp.transpose(X)))
@@ -294,7 +294,7 @@ def dependence_inflation(memory: Any, world: int, i: int, n: int):
     if depends_on == wp.uint64(0):
         return wp.float64(0.0)
     if not depends_on_own(memory, world, i, n):
-        return wp.float64(constants.MIN_INFLATION)
+        return wp.float64(constants.LEAST_SHARE)
     return wp.float64(dependents(memory, world, i))
 
 
@@ -309,7 +309,7 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
         for b in range(a + 1):
             X = mat66d(memory.P[world, i, memory.known[world, a].member, memory.known[world, b].member])
             if a == b:
-                X = algebra.inflated(X, wp.float64(constants.RELATIVE_NOISE))
+                X = algebra.inflated(X, wp.float64(constants.ROUNDING))
             for c in range(b):
                 X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
             if a == b:
@@ -348,7 +348,7 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, rec
     if count > 0:
         left = solve_for(memory, world, i, after, count)
         if sure > 0 and sure < count:
-            if not is_positive(left - wp.float64(constants.LEAST_LEFT) * after):
+            if not is_positive(left - wp.float64(constants.LEAST_SHARE) * after):
                 count = sure
                 left = solve_for(memory, world, i, after, count)
         larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one

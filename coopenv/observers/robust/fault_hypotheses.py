@@ -6,7 +6,6 @@ certain. Hypotheses that are only likely add to the covariance that is stated an
 excluded source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
 
-import math
 from typing import Any
 
 import warp as wp
@@ -36,8 +35,6 @@ from coopenv.observers.robust.source_monitor import (
 from coopenv.observers.robust.sources import ODOMETRY, clear_source, clear_steps, is_active, is_sender
 from coopenv.observers.robust.tracklets import includes
 from coopenv.world.warp_internals import device_function
-
-ODDS = -2.0 * math.log(constants.FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
 
 
 @device_function
@@ -169,7 +166,7 @@ def exclude(memory: Any, world: int, i: int, q: int):
 @device_function
 def drifts(memory: Any, world: int, i: int, q: int) -> bool:
     """Return whether a sender nearly certainly drifts from its own odometry."""
-    certain = wp.float64(constants.FAULT_GATE + ODDS)
+    certain = wp.float64(constants.FAULT_GATE + constants.ODDS)
     return is_sender(q) and is_active(memory, world, i, q) and memory.source[world, i, q].steps_ratio > certain
 
 
@@ -181,7 +178,7 @@ def is_misled(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
         vehicle = memory.source[world, i, c].target - landmarks
         if c != q and is_active(memory, world, i, c) and includes(depends_on, vehicle):
             evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].steps_ratio)
-            if evidence > wp.float64(ODDS):
+            if evidence > wp.float64(constants.ODDS):
                 return True
     return False
 
@@ -256,7 +253,7 @@ def judge_sources(memory: Any, world: int, i: int, time: Any, landmarks: int):
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             total += weight_of(memory.source[world, i, q].ratio, most)
-    if several > most + wp.float64(ODDS):
+    if several > most + wp.float64(constants.ODDS):
         exclude_senders(memory, world, i)
         forget_faults(memory, world, i)
     elif total < wp.float64(1.0 + constants.FAULT_RISK):
@@ -294,7 +291,7 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     """
     H = -(memory.derivative[world, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
     W = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
-    share = wp.min(frame.period / wp.float64(constants.READMISSION_TIME), wp.float64(1.0))
+    share = wp.min(frame.period / wp.float64(constants.LONG_TIME), wp.float64(1.0))
     HW = share * (wp.transpose(H) * W)
     kept = wp.float64(1.0) - share
     A = kept * memory.source[world, i, q].information + HW * H
@@ -307,7 +304,7 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)
     fits = present < wp.float64(constants.BEARING_GATE) and gain > wp.float64(constants.BEARING_GATE)
-    least_time = wp.float64(constants.READMISSION_TIME) * wp.float64(memory.source[world, i, q].exclusions)
+    least_time = wp.float64(constants.LONG_TIME) * wp.float64(memory.source[world, i, q].exclusions)
     if fits and memory.source[world, i, q].time > least_time:
         memory.source[world, i, q].excluded = 0
         clear_source(memory, world, i, q)

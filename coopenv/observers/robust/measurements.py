@@ -70,7 +70,7 @@ def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender:
 
 @device_function
 def possible_speed(memory: Any, world: int, i: int):
-    """Return a speed, m/s, that a vehicle of unknown twist may have: the own one and an acceleration to walking pace."""
+    """Return a speed, m/s, that a vehicle of unknown twist may have: the own one and that of a start from rest."""
     return wp.length(memory.belief[world, i].mean_v) + wp.float64(constants.MAX_ACCELERATION * constants.MEAN_TIME)
 
 
@@ -83,9 +83,9 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
     variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(constants.THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
     gone = possible_speed(memory, world, i) * age
-    factor = wp.float64(constants.CORRELATION_FACTOR)
+    factor = wp.float64(constants.PERTURBATION * constants.PERTURBATION)
     if memory.search[world, i].hypotheses > 0:
-        factor = wp.max(factor, wp.float64(constants.CORRELATION_TIME) / frame.period)
+        factor = wp.max(factor, wp.float64(constants.MEAN_TIME) / frame.period)
     return factor * (variance + gone * gone)
 
 

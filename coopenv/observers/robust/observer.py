@@ -85,6 +85,10 @@ from coopenv.world.embedded import Embedded
 from coopenv.world.v2x import start_covariance
 from coopenv.world.warp_internals import device_function
 
+ANCHOR_ANGLE_VARIANCE = (0.25 * constants.KNOWN_ANGLE) ** 2
+ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
+"""rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost."""
+
 
 @device_function
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
@@ -147,7 +151,7 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
 @device_function
 def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
     """Let all bearings count from when most fail the gate until few do; begin a search if that does not help."""
-    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
+    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.MEAN_TIME))
     missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
     memory.belief[world, i].rejected_share = missed
     if missed > wp.float64(constants.LOST_SHARE):
@@ -157,15 +161,15 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
         memory.belief[world, i].open_time = wp.float64(0.0)
     memory.belief[world, i].open_time += wp.float64(memory.belief[world, i].open) * now.period
     healthy = memory.belief[world, i].healthy_time + now.period
-    if missed >= wp.float64(constants.HEALTHY_SHARE):
+    if missed >= wp.float64(constants.FOUND_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].healthy_time = healthy
-    if memory.belief[world, i].open_time > wp.float64(constants.OPEN_TIME) and missed > wp.float64(
+    if memory.belief[world, i].open_time > wp.float64(constants.LONG_TIME) and missed > wp.float64(
         constants.LOST_SHARE
     ):
         declare_lost(model, memory, world, i, now.tick)
-    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_valid(own_estimate(memory, world, i)):
-        noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
+    elif healthy > wp.float64(constants.MEAN_TIME) and is_valid(own_estimate(memory, world, i)):
+        noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
 
 
@@ -180,7 +184,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
         correct_sources(frame, memory, world, i)
     memory.belief[world, i].judged_time += frame.period
     block = memory.belief[world, i].judged_time
-    if block > wp.float64(constants.BLOCK_TIME - constants.SAME_TIME):
+    if block > wp.float64(constants.SHORT_TIME - constants.SAME_TIME):
         memory.belief[world, i].judged_time = wp.float64(0.0)
         judge_sources(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
@@ -215,7 +219,7 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
     """Resect the own pose from a frame by least squares, from the current pose; return whether that converges."""
     bearings = frame.bearings
     inverse = mat66d()
-    for step in range(constants.GAUSS_NEWTON_STEPS):
+    for step in range(constants.MAX_ITERATIONS):
         _, fitting, _ = gate(frame, memory, world, i)
         M = mat66d()
         b = vec6d()
@@ -236,7 +240,7 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
         inverse = inverse6(M)
         if not is_regular(M, inverse, wp.float64(constants.MAX_CONDITION)):
             return False
-        if step < constants.GAUSS_NEWTON_STEPS - 1:
+        if step < constants.MAX_ITERATIONS - 1:
             apply_error(memory, world, i, 0, inverse * b)
     write_resected_covariance(memory, world, i, bearings, inverse)
     return True
@@ -313,7 +317,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
         return SEARCHING
     prior = memory.search[world, i].prior
     found = memory.hypothesis[world, i, 0].estimate
-    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.SAME_PRIOR)
+    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.POSE_GATE)
     if confirmed:
         found = prior
     restart_belief(model, memory, world, i, found)
@@ -328,7 +332,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
     if standing == ESTIMATING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
-    elif resect(frame, memory, world, i) and is_known(wp.float64(constants.SURE) * memory.P[world, i, 0, 0]):
+    elif resect(frame, memory, world, i) and is_known(memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
     else:
         postpone_acceptance(memory, world, i)

@@ -73,7 +73,7 @@ def lasting_variances(model: Any, i: int):
 @device_function
 def walk_variances(model: Any, i: int):
     """Return the growth of these variances per second."""
-    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS_WALK)))
+    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS)))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
     return wp.cw_mul(errors, errors)
 
@@ -160,7 +160,7 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return the variances (rotation, translation) of an increment over dt, lasting errors included."""
     noise = odometry_noise(model, i, dt)
-    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(constants.ERRORS_TIME))
+    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(constants.MEAN_TIME))
 
 
 @wp.func
@@ -199,7 +199,7 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         linear = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
         noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
-        share = dt / (dt + wp.float64(constants.VELOCITY_TIME))
+        share = dt / (dt + wp.float64(constants.MEAN_TIME))
         memory.belief[world, i].mean_v = memory.belief[world, i].mean_v + share * (v - memory.belief[world, i].mean_v)
     else:
         memory.belief[world, i].mean_v = v

@@ -1,4 +1,4 @@
-"""Protection levels: bounds of the own errors that hold with any single faulty source, at the risk PROTECTION_RISK.
+"""Protection levels: bounds of the own errors that hold with any single faulty source, at the risk RISK.
 
 Without source q the solution is x + Phi f with the covariance P + Phi V^-1 Phi^T, see source_monitor.py. If q is the
 faulty one, the error is at most |Phi f| and the quantile of that covariance. The level is the largest over all sources
@@ -18,7 +18,7 @@ from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d, vec6d
 from coopenv.observers.robust.sources import is_active
 from coopenv.world.warp_internals import device_function
 
-QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.PROTECTION_RISK)  # of an error along its most uncertain axis
+QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along its most uncertain axis
 
 
 @wp.func

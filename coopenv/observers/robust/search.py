@@ -78,7 +78,7 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     """Return whether a hypothesis differs from each of the first `count`."""
     for g in range(count):
         distance = distance_squared(memory.hypothesis[world, i, h].estimate, memory.hypothesis[world, i, g].estimate)
-        if distance < wp.float64(constants.SAME_HYPOTHESIS):
+        if distance < wp.float64(constants.POSE_GATE):
             return False
     return True
 
@@ -138,8 +138,8 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
             across = step * wp.sqrt(frame.variance)
             b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
         else:
-            variance = memory.measurement[world, triple[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
-            z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)
+            variance = memory.measurement[world, triple[n]].variance  # with the factor of `received_variance`
+            z[n, axis - 2] = z[n, axis - 2] + wp.where(step > wp.float64(0.0), wp.sqrt(variance), -wp.sqrt(variance))
             exists = variance > wp.float64(0.0)
     return exists, b, z
 
@@ -167,7 +167,7 @@ def begin_search(memory: Any, world: int, i: int, prior: PoseEstimate):
     memory.search[world, i] = Search()
     memory.search[world, i].active = 1
     memory.search[world, i].prior = prior
-    memory.search[world, i].least_time = wp.float64(constants.MIN_SEARCH_TIME)
+    memory.search[world, i].least_time = wp.float64(constants.SHORT_TIME)
 
 
 @device_function
@@ -238,7 +238,7 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, n: int):
     """
     time = wp.float64(constants.LINEARISATION_TIME)
     if memory.measurement[world, n].variance > wp.float64(0.0):
-        time = wp.float64(constants.CORRELATION_TIME)
+        time = wp.float64(constants.MEAN_TIME)
     noise = memory.measurement[world, n].noise
     lasting = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
     return wp.float64(2.0) * (frame.variance + lasting) / noise
@@ -258,8 +258,8 @@ def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: in
             cost = nis
             if wp.isfinite(nis):
                 cost = innovation_with(memory, world, n, memory.measurement[world, n].common_noise)
-            memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.MAX_BEARING_COST))
-            memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
+            memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.BEARING_GATE))
+            memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.BEARING_GATE))
             memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
         memory.measurement[world, n].fits = fits
         fitting += fits
@@ -299,18 +299,18 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
     time the estimates of a follower's leaders improve, which separates the solutions.
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
-    tracking = not patient or clear >= wp.float64(constants.CLEAR_TIME)
+    tracking = not patient or clear >= wp.float64(constants.SHORT_TIME)
     if not solve_triple(frame, memory, world, i, triple, patient, tracking):
-        clear = wp.float64(-constants.DOUBT_TIME)
+        clear = wp.float64(-constants.NEWS_TIME)
         tracking = False
     if tracking:
         for h in range(memory.search[world, i].hypotheses):
             distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
-            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
+            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.POSE_GATE))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].misfit = wp.float64(0.0)
         clear = wp.float64(0.0)
-        least = wp.where(patient, wp.float64(constants.MIN_SEARCH_TIME), wp.float64(constants.MIN_DOUBTFUL_TIME))
+        least = wp.where(patient, wp.float64(constants.SHORT_TIME), wp.float64(constants.LONG_TIME))
         memory.search[world, i].least_time = least
     else:
         memory.search[world, i].hypotheses = 0
@@ -330,7 +330,7 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
     if not tracking:
         memory.search[world, i].waited_time += period
         memory.search[world, i].clear_time += period
-        patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
+        patient = memory.search[world, i].waited_time < wp.float64(constants.LONG_TIME)
         # not soon after a frame that did not determine the pose
         if not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME):
             triple = chosen_triple(frame, memory, world, i)
@@ -346,7 +346,7 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
 @device_function
 def postpone_acceptance(memory: Any, world: int, i: int):
     """Track the remaining hypothesis for some more frames: this frame does not determine the pose well enough."""
-    memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.DOUBT_TIME)
+    memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
 
 
 @device_function

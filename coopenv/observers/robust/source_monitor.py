@@ -144,7 +144,7 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
             correct_source(frame, memory, world, i, q)
             if is_sender(q):
                 correct_steps_effect(frame, memory, world, i, q)
-    weight = wp.min(frame.period / wp.float64(constants.LOST_TIME), wp.float64(1.0))
+    weight = wp.min(frame.period / wp.float64(constants.MEAN_TIME), wp.float64(1.0))
     for n in range(frame.bearings):
         q = memory.measurement[world, n].source
         fits = memory.measurement[world, n].fits

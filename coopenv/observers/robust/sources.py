@@ -112,7 +112,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
     """Return the slot of a target, a new one if there is room, else -1; note that it is in view.
 
     A member needs a slot, which it takes from a source that is no member; a landmark takes one only from a source that
-    has been out of view for `FORGET_TIME`.
+    has been out of view for `MEAN_TIME`.
     """
     q = slot_of(memory, world, i, target)
     if q < 0:
@@ -120,7 +120,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
         q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, SOURCES, 1 + SENDER_SLOTS))
         if landmark and q >= 0 and memory.source[world, i, q].target != NO_TARGET:
             unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
-            q = wp.where(unseen > wp.float64(constants.FORGET_TIME), q, -1)
+            q = wp.where(unseen > wp.float64(constants.MEAN_TIME), q, -1)
         if q >= 0:
             free_source(memory, world, i, q)
             memory.source[world, i, q].target = target

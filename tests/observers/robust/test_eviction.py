@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.robust.constants import FORGET_TIME, MAX_MEMBERS
+from coopenv.observers.robust.constants import MEAN_TIME, MAX_MEMBERS
 from tests.helpers.robust_observers import OpenRobust
 from tests.helpers.robust_scenes import crowd, small_errors
 
@@ -27,9 +27,9 @@ def test_those_in_view_are_met_when_others_are_gone():
             estimate = super().update(tick)
             if self.setup.vehicle == leaders:
                 members = set(self.member_numbers)
-                if tick.time < left + FORGET_TIME - tick.dt:
+                if tick.time < left + MEAN_TIME - tick.dt:
                     full.append(members)
-                elif tick.time > left + FORGET_TIME + tick.dt:
+                elif tick.time > left + MEAN_TIME + tick.dt:
                     late.append(members >= set(range(gone, leaders)))
             return estimate
 
