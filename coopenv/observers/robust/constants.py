@@ -92,5 +92,3 @@ three."""
 PRUNE_GAP = BEARING_GATE + ODDS
 """Largest difference to the least cost: one wrong association, which costs `BEARING_GATE` at most, decides nothing."""
 MAX_MISFIT = 5.0 * BEARING_GATE  # cost of the best hypothesis beyond twice the expected one: five wrong bearings
-    5.0 * BEARING_GATE
-)  # largest cost of the best hypothesis beyond twice the expected one: five wrong bearings
