@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import typer
 
-from coopenv.api.arguments import FIELDS, OTHERS
+from coopenv.api.arguments import FIELDS, OTHERS, Step
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning import read_study
@@ -34,7 +34,7 @@ from tests.helpers import bags, mrclam_files
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
-RUN = {"README.md", "agents.md", "backends.md", "bags.md", "cars.md", "data.md", "draws.md", "highway.md"}
+RUN = {"README.md", "agents.md", "backends.md", "bags.md", "data.md", "draws.md", "highway.md"}
 RUN |= {"replay.md", "terms.md", "trainers.md", "view.md"}
 """Pages whose programs are run below."""
 
@@ -77,9 +77,10 @@ def test_the_page_on_backends(capsys: pytest.CaptureFixture[str]) -> None:
     assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
 
 
-def test_the_page_on_terms_lists_every_entry_of_a_step() -> None:
-    page = (DOCS / "terms.md").read_text(encoding="utf-8")
-    assert all(f"`{name}`" in page for name in (*FIELDS, *OTHERS))
+def test_the_entries_of_a_step_are_listed_in_the_api() -> None:
+    page = (DOCS / "reference" / "api" / "index.md").read_text(encoding="utf-8")
+    assert "::: coopenv.api.arguments.Step\n" in page
+    assert all(f"`{name}`" in str(Step.__doc__) for name in (*FIELDS, *OTHERS))
 
 
 def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -127,14 +128,6 @@ def test_the_page_on_bags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / "topics.toml").write_text(a_map.replace("marker = 7 ", "marker = 3 "), encoding="utf-8")
     (program,) = run(DOCS / "bags.md")
     assert program["env"].possible_agents == ["vehicle_1"]
-
-
-@pytest.mark.slow
-def test_the_page_on_cars(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("zenoh", reason="needs the extra 'svea'")
-    monkeypatch.chdir(ROOT)
-    (program,) = run(DOCS / "cars.md")
-    assert {info["car"]["name"] for info in program["infos"].values()} <= {"svea1", "svea7"}
 
 
 def test_the_page_on_recorded_robots(
