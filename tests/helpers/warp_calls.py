@@ -75,18 +75,14 @@ class Calls:
 
 
 def _type(word: str, dtype: str) -> Any:
-    """Return the Warp type of a word of a signature: "3" and "33" are a vector and a square matrix."""
+    """Return the Warp type of a word of a signature: "3" is a vector, and "63" a matrix of six rows."""
     scalar = getattr(wp, dtype)
     if word in WHOLE:
         return WHOLE[word]
-    rows = int(word[0])
-    return (
-        scalar
-        if word == "1"
-        else wp.types.vector(rows, scalar)
-        if len(word) == 1
-        else wp.types.matrix((rows, rows), scalar)
-    )
+    if word == "1":
+        return scalar
+    sizes = tuple(map(int, word))
+    return wp.types.matrix(sizes, scalar) if len(sizes) == 2 else wp.types.vector(*sizes, scalar)
 
 
 def _array(value: np.ndarray, kind: Any, count: int) -> wp.array:

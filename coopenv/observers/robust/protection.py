@@ -1,4 +1,4 @@
-"""Protection levels: bounds of the own errors that hold with any single faulty source, at the risk RISK.
+"""Protection levels: bounds of the own errors that hold with any single faulty source, at the risk `RISK`.
 
 Without source q the solution is x + Phi f with the covariance P + Phi V^-1 Phi^T, see source_monitor.py. If q is the
 faulty one, the error is at most |Phi f| and the quantile of that covariance. The level is the largest over all sources
@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import is_known
+from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE
 from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d, vec6d
 from coopenv.observers.robust.sources import is_active
 from coopenv.world.warp_internals import device_function
@@ -22,38 +22,57 @@ QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along
 
 
 @wp.func
-def levels(R: Any, P: Any, mean: Any):
-    """Return (2,) bounds of the horizontal error, m, and of the angle, rad, of a left error of a mean and covariance.
-
-    The trace bounds the variance along any axis.
-    """
-    up = vec3d(R[2, 0], R[2, 1], R[2, 2])
-    shift = vec3d(mean[3], mean[4], mean[5])
-    along = wp.dot(up, shift)
-    angle = P[0, 0] + P[1, 1] + P[2, 2]
-    horizontal = P[3, 3] + P[4, 4] + P[5, 5]
+def own_variances(up: Any, P: Any):
+    """Return (2,) horizontal variance, m^2, and angular variance, rad^2, of a left error; up: the vertical, body."""
+    level = vec2d(P[3, 3] + P[4, 4] + P[5, 5], P[0, 0] + P[1, 1] + P[2, 2])
     for i in range(3):
         for j in range(3):
-            horizontal -= up[i] * P[3 + i, 3 + j] * up[j]
+            level[0] -= up[i] * P[3 + i, 3 + j] * up[j]
+    return level
+
+
+@wp.func
+def fault_variances(up: Any, Phi: Any, C: Any):
+    """Return likewise those of Phi f, with the covariance C of the fault f."""
+    vertical = vec3d()
+    level = vec2d()
+    for i in range(3):
+        level[0] += wp.dot(Phi[i + 3], C * Phi[i + 3])
+        level[1] += wp.dot(Phi[i], C * Phi[i])
+        vertical += up[i] * Phi[i + 3]
+    level[0] -= wp.dot(vertical, C * vertical)
+    return level
+
+
+@wp.func
+def levels(up: Any, variances: Any, mean: Any):
+    """Return (2,) bounds of the horizontal error, m, and of the angle, rad, of a left error of a mean and variances.
+
+    The sum of variances bounds the variance along any axis.
+    """
+    shift = vec3d(mean[3], mean[4], mean[5])
+    along = wp.dot(up, shift)
     quantile = wp.float64(QUANTILE)
     return vec2d(
         wp.sqrt(wp.max(wp.length_sq(shift) - along * along, wp.float64(0.0)))
-        + quantile * wp.sqrt(wp.max(horizontal, wp.float64(0.0))),
-        wp.length(vec3d(mean[0], mean[1], mean[2])) + quantile * wp.sqrt(wp.max(angle, wp.float64(0.0))),
+        + quantile * wp.sqrt(wp.max(variances[0], wp.float64(0.0))),
+        wp.length(vec3d(mean[0], mean[1], mean[2])) + quantile * wp.sqrt(wp.max(variances[1], wp.float64(0.0))),
     )
 
 
 @device_function
 def protection_level(memory: Any, world: int, i: int):
     """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown."""
-    R = memory.member[world, i, 0].pose.R
-    own = memory.P[world, i, 0, 0] + memory.doubt[world, i]
-    most = levels(R, own, vec6d())
+    up = wp.transpose(memory.member[world, i, 0].pose.R) * vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+    own = own_variances(up, memory.P[world, i, 0, 0] + memory.doubt[world, i])
+    most = levels(up, own, vec6d())
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             Phi = memory.sensitivity[world, i, q, 0]
-            P = own + Phi * memory.source[world, i, q].covariance * wp.transpose(Phi)
-            if not is_known(P):
+            variances = own + fault_variances(up, Phi, memory.source[world, i, q].covariance)
+            if not (
+                variances[0] < wp.float64(KNOWN_POSITION_VARIANCE) and variances[1] < wp.float64(KNOWN_ANGLE_VARIANCE)
+            ):
                 return vec2d(wp.float64(wp.inf))
-            most = wp.max(most, levels(R, P, Phi * memory.source[world, i, q].offset))
+            most = wp.max(most, levels(up, variances, Phi * memory.source[world, i, q].offset))
     return most

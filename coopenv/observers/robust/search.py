@@ -299,7 +299,7 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
     time the estimates of a follower's leaders improve, which separates the solutions.
     """
     clear = wp.max(memory.search[world, i].clear_time, period)
-    tracking = not patient or clear >= wp.float64(constants.SHORT_TIME)
+    tracking = not patient or clear >= wp.float64(constants.NEWS_TIME)
     if not solve_triple(frame, memory, world, i, triple, patient, tracking):
         clear = wp.float64(-constants.NEWS_TIME)
         tracking = False

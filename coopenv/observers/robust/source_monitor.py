@@ -158,7 +158,7 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
                 if is_active(memory, world, i, q):
                     MW = wp.transpose(memory.effect[world, n, q]) * W
                     for c in range(q + 1):
-                        if is_active(memory, world, i, c):
+                        if is_active(memory, world, i, c) and (c == q or is_sender(q) or is_sender(c)):
                             A = memory.information[world, i, q, c] + MW * memory.effect[world, n, c]
                             memory.information[world, i, q, c] = A
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.robust.constants import MEAN_TIME, MAX_MEMBERS
+from coopenv.observers.robust.constants import MAX_MEMBERS, MEAN_TIME
 from tests.helpers.robust_observers import OpenRobust
 from tests.helpers.robust_scenes import crowd, small_errors
 

@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
-from coopenv.observers.robust.constants import LEAST_LEFT
+from coopenv.observers.robust.constants import LEAST_SHARE
 from coopenv.observers.robust.correlations import excess
 from coopenv.observers.robust.memory import Pose
 from tests.helpers.warp_calls import Calls
@@ -113,7 +113,7 @@ def test_a_sender_is_vaguer_where_what_is_told_of_it_contradicts_what_is_believe
     after = A @ np.swapaxes(A, 1, 2) + 1e-8 * np.eye(6)
     values = rng.uniform(-1.0, 1.0, (100, 6))
     values[20:, 0] = -np.abs(values[20:, 0])
-    values[:20] = rng.uniform(2.0 * LEAST_LEFT, 1.0, (20, 6))  # nothing contradicts
+    values[:20] = rng.uniform(2.0 * LEAST_SHARE, 1.0, (20, 6))  # nothing contradicts
     B = np.linalg.cholesky(after) @ np.linalg.qr(rng.normal(size=(100, 6, 6)))[0]
     left = (B * values[:, None]) @ np.swapaxes(B, 1, 2)
     added = call(excess, left, after)
@@ -122,4 +122,4 @@ def test_a_sender_is_vaguer_where_what_is_told_of_it_contradicts_what_is_believe
     for one, reported, more in zip(left, after, added, strict=True):
         before, axes = eigh(one, reported)
         now = axes.T @ (one + more) @ axes
-        assert_allclose(now, np.diag(np.maximum(before, LEAST_LEFT)), atol=1e-9)
+        assert_allclose(now, np.diag(np.maximum(before, LEAST_SHARE)), atol=1e-9)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.evidence import CHANGES, STEP_AT
 from coopenv.observers import Recording
-from coopenv.observers.robust.constants import BLOCK_TIME, FAULT_GATE, MONITOR_TIME
+from coopenv.observers.robust.constants import SHORT_TIME, FAULT_GATE, MONITOR_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
 from coopenv.observers.robust.sources import NO_TARGET, ODOMETRY
 from coopenv.runs.recorder import record
@@ -95,7 +95,7 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
     places = [displaced((np.eye(3), np.array(p)), 0.3 * rng.normal(size=6)) for p in ((5.0, -3.0, 1.0), (-4, 6, 2))]
     senders = [by_hand.started(p, by_hand.covariance(rng, 0.01, 0.05), n) for n, p in enumerate(places, 1)]
     points = [*by_hand.LANDMARKS[:3], *(p + R @ by_hand.MARKER for R, p in places)]
-    last = round(BLOCK_TIME / PERIOD)
+    last = round(SHORT_TIME / PERIOD)
     for k in range(1, last + 1):
         messages, bearings = {}, {}
         if k < 20:
@@ -116,7 +116,7 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
     P = to_map @ observer.P @ to_map.T
     lower = np.tril(np.ones(information.shape[:2]))[..., None, None]
     A = np.where(lower > 0, information, information.transpose(1, 0, 3, 2))
-    V, v = eliminated(A, vector, P * MONITOR_TIME / BLOCK_TIME, slots)
+    V, v = eliminated(A, vector, P * MONITOR_TIME / SHORT_TIME, slots)
     assert all(np.linalg.norm(A[q, slots]) > 0.0 for q in (ODOMETRY, 1, 2, 5, 6, 7))
     assert_allclose(observer.memory.source["information"], V, rtol=1e-6, atol=1e-9 * abs(A).max())
     assert_allclose(observer.memory.source["sum"], v, rtol=1e-6, atol=1e-9 * abs(vector).max())
