@@ -83,12 +83,14 @@ MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower o
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """rad and m: standard deviation per axis below which a pose is a linearisation point and is sent. Chosen."""
 MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
-PERTURBATION = 2.0
-"""Standard deviations by which measurements are perturbed to find solutions that noise removes, and factor of a
-neighbour's deviation in a frame that is solved. Chosen."""
+MARGIN = 2.0
+"""Standard deviations by which measurements are perturbed to find solutions that noise removes; factor of a neighbour's
+deviation in a frame that is solved, of a found pose's before it is broadcast, and of an anchor's. Chosen."""
+SQUARED_MARGIN = MARGIN**2
 PROBLEMS = 1 + 3 * 2 * 5
 """Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
 three."""
 PRUNE_GAP = BEARING_GATE + ODDS
 """Largest difference to the least cost: one wrong association, which costs `BEARING_GATE` at most, decides nothing."""
+MAX_PRIOR_COST = 2.0 * PRUNE_GAP  # bound on the cost of the distance to the prior, which may be wrong
 MAX_MISFIT = 5.0 * BEARING_GATE  # cost of the best hypothesis beyond twice the expected one: five wrong bearings

@@ -83,7 +83,7 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
     variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(constants.THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
     gone = possible_speed(memory, world, i) * age
-    factor = wp.float64(constants.PERTURBATION * constants.PERTURBATION)
+    factor = wp.float64(constants.SQUARED_MARGIN)
     if memory.search[world, i].hypotheses > 0:
         factor = wp.max(factor, wp.float64(constants.MEAN_TIME) / frame.period)
     return factor * (variance + gone * gone)

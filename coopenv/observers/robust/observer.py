@@ -170,7 +170,13 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
         declare_lost(model, memory, world, i, now.tick)
     elif healthy > wp.float64(constants.MEAN_TIME) and is_valid(own_estimate(memory, world, i)):
         noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
-        set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
+        set_anchor(
+            memory,
+            world,
+            i,
+            with_noise(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0], noise),
+            now.tick,
+        )
 
 
 @device_function
@@ -332,7 +338,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
     if standing == ESTIMATING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
-    elif resect(frame, memory, world, i) and is_known(memory.P[world, i, 0, 0]):
+    elif resect(frame, memory, world, i) and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
     else:
         postpone_acceptance(memory, world, i)

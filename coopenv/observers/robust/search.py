@@ -131,7 +131,7 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
     if number > 0:
         n = (number - 1) // 10
         axis = (number - 1) % 5
-        step = wp.float64(constants.PERTURBATION)
+        step = wp.float64(constants.MARGIN)
         if (number - 1) // 5 % 2 == 1:
             step = -step
         if axis < 2:
@@ -306,7 +306,7 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
     if tracking:
         for h in range(memory.search[world, i].hypotheses):
             distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
-            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.POSE_GATE))
+            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].misfit = wp.float64(0.0)
         clear = wp.float64(0.0)
