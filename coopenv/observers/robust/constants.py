@@ -11,8 +11,9 @@ THIRD = 1.0 / 3.0
 RISK = 1e-3  # of a correct measurement outside its gate, and of an error above the protection level
 BEARING_GATE, POSE_GATE = float(chdtri(2, RISK)), float(chdtri(6, RISK))
 """Gates of a normalised squared error: of a bearing, and of a pose."""
-ROUNDING = 1e-6  # share of its variances by which a covariance may fail to be positive definite; messages have float32
-MAX_CONDITION = 1.0 / ROUNDING**2  # of the information of a frame; from there on it determines no pose
+ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite
+SINGLE = 1e-6  # share of a variance that rounding to single precision in messages may change
+MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on it determines no pose
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
@@ -87,9 +88,6 @@ MARGIN = 2.0
 """Standard deviations by which measurements are perturbed to find solutions that noise removes; factor of a neighbour's
 deviation in a frame that is solved, of a found pose's before it is broadcast, and of an anchor's. Chosen."""
 SQUARED_MARGIN = MARGIN**2
-PROBLEMS = 1 + 3 * 2 * 5
-"""Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
-three."""
 PRUNE_GAP = BEARING_GATE + ODDS
 """Largest difference to the least cost: one wrong association, which costs `BEARING_GATE` at most, decides nothing."""
 MAX_PRIOR_COST = 2.0 * PRUNE_GAP  # bound on the cost of the distance to the prior, which may be wrong

@@ -309,7 +309,7 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
         for b in range(a + 1):
             X = mat66d(memory.P[world, i, memory.known[world, a].member, memory.known[world, b].member])
             if a == b:
-                X = algebra.inflated(X, wp.float64(constants.ROUNDING))
+                X = algebra.inflated(X, wp.float64(constants.SINGLE))
             for c in range(b):
                 X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
             if a == b:

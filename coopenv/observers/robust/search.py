@@ -30,6 +30,10 @@ from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, Pose
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
 from coopenv.world.warp_internals import device_function
 
+PROBLEMS = 1 + 3 * 2 * 5
+"""Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
+three."""
+
 
 @device_function
 def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
@@ -153,7 +157,7 @@ def solve_triple(
     Return False if `patient` and a solution is not well determined.
     """
     memory.search[world, i].hypotheses = 0
-    for number in range(constants.PROBLEMS):
+    for number in range(PROBLEMS):
         exists, b, z = problem(frame, memory, world, triple, number)
         if exists:
             if not solve(frame, memory, world, i, triple, b, z, patient, tracking):

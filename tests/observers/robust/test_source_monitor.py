@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.evidence import CHANGES, STEP_AT
 from coopenv.observers import Recording
-from coopenv.observers.robust.constants import SHORT_TIME, FAULT_GATE, MONITOR_TIME
+from coopenv.observers.robust.constants import FAULT_GATE, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
 from coopenv.observers.robust.sources import NO_TARGET, ODOMETRY
 from coopenv.runs.recorder import record
