@@ -111,13 +111,15 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path, monkeypatch
     assert len(list((tmp_path / "package" / "__pycache__").glob("compiled-*"))) == 1
 
 
-def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
-    head = "from coopenv.estimation.compiled import NUMBER, compiled\n"
-    (tmp_path / "doubled.py").write_text(head + "@compiled(NUMBER)\ndef double(x):\n    return 2.0 * x\n")
-    modules = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    show = "from doubled import double; print(double(2.0))"
-    for _ in range(2):
-        assert output(show, PYTHONPATH=modules, NUMBA_CACHE_DIR=str(tmp_path / "cache")) == ["4.0"]
+def test_damaged_machine_code_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
+    for times in (1, 2):
+
+        @compiled.compiled(compiled.NUMBER)
+        def doubled(x: float) -> float:
+            return 2.0 * x
+
+        assert doubled(2.0) == 4.0 and compiled.fresh[-times:] == times * ["doubled"]
         kept = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
         assert kept
         for path in kept:
