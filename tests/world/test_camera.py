@@ -375,7 +375,7 @@ def test_paper_noise_draw_by_draw(axis: tuple[float, float, float]) -> None:
     frame = paper_frame(np.array(axis))
     for tick, state in enumerate(states):
         for j, z in enumerate(place):
-            words = philox.philox4x32((tick, j, 6, 0), (seed, 0), 7)
+            words = philox.philox4x32((tick, j, 6, 0), (seed, 0))
             u = 2 * ((np.array(words[:2], float) + 0.5) / 2**32) - 1
             g = frame.T @ z
             image = np.append(g[:2] / g[2] + scale * u, 1.0)
