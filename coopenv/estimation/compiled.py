@@ -11,8 +11,7 @@ no slower, but takes seconds to compile in every function that uses it.
 """
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -62,30 +61,21 @@ def _made(function: Any, arguments: tuple[Any, ...], folder: Path | None) -> Any
     options: dict[str, Any] = {"error_model": "numpy"}
     if folder is not None:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        held = None if _kept(function, folder) else lock(folder, LONGEST_COMPILATION)
         try:
-            with nullcontext() if _kept(function, folder) else _locked(folder):
-                return njit(arguments, cache=True, **options)(function)
+            return njit(arguments, cache=True, **options)(function)
         except Exception:  # what is kept is damaged, or the disk is full; an error of the function comes once more
             pass
         finally:
             config.CACHE_DIR = before
+            if held is not None:
+                os.close(held)
     return njit(arguments, **options)(function)
 
 
 def _kept(function: Any, folder: Path) -> bool:
     """Return whether there is machine code of a function."""
-    return any(folder.glob(f"*/*.{function.__qualname__}-{function.__code__.co_firstlineno}.*.nbi"))
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Let one process at a time compile: those that wait find the machine code."""
-    descriptor = lock(folder, LONGEST_COMPILATION)
-    try:
-        yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
+    return any(folder.glob(f"*/*.{function.__name__}-{function.__code__.co_firstlineno}.*.nbi"))
 
 
 @cache

@@ -126,6 +126,19 @@ def test_damaged_machine_code_is_made_anew(tmp_path: Path, monkeypatch: pytest.M
             path.write_bytes(path.read_bytes()[:20])
 
 
+def test_one_process_compiles_and_none_waits_for_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    locked: list[Path] = []
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "lock", lambda folder, wait: locked.append(folder))
+    for _ in range(2):
+
+        @compiled.compiled(compiled.NUMBER)
+        def halved(x: float) -> float:
+            return 0.5 * x
+
+        assert halved(2.0) == 1.0 and locked == [tmp_path]
+
+
 def test_functions_run_as_python_where_compilation_is_off() -> None:
     show = "from coopenv.observers.bearing_measurements import across; print(across(0.0, 0.0, 1.0)[0])"
     assert output(show, NUMBA_DISABLE_JIT="1") == ["[", "1.", "-0.", "-0.]"]
