@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,23 +77,23 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize(
     ("line", "names"),
     [
-        ("list", coopenv.list_envs()),
-        ("list observers", observer_names()),
-        ("list agents", list_agents()),
+        ("list", coopenv.list_envs),
+        ("list observers", observer_names),
+        ("list agents", list_agents),
         (
             "list variants",
-            [
+            lambda: [
                 *(*VARIANTS, "landmarks", "landmarks+robots", "blind"),
                 *(f"{name}={kind.value}" if kind.value else name for name, kind in FAULTS.items()),
             ],
         ),
     ],
 )
-def test_list_as_json(line: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_as_json(line: str, names: Callable[[], list[str]], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*line.split(), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in rows] == names
-    assert line != "list" or {row["id"] for row in rows} == {environment_id(name) for name in names}
+    assert [row["name"] for row in rows] == names()
+    assert line != "list" or {row["id"] for row in rows} == {environment_id(name) for name in names()}
 
 
 def test_describe_says_what_matters_on_one_screen(capsys: pytest.CaptureFixture[str]) -> None:
