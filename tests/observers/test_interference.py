@@ -32,6 +32,9 @@ FAULTS: dict[str, dict[str, Any]] = {
     "clock": {"faults.clock_offset": 0.1, "v2x.staleness": 0.1},
     "corruption": {"faults.corruption.probability": 0.3},
     "restart": {OTHER: {"restart": {"chance": 1.0, "time": 0.42}}},
+    "map": {f"{OTHER}.map_error": {"chance": 1.0, "landmark": "SL2", "offset": 2.0, "start": 0.3}},
+    "map of a restart": {"faults": {"map_error": {"chance": 0.7}, "restart": {"chance": 0.5, "time": 0.42}}},
+    "jammer": {f"{OTHER}.jammer": {"chance": 1.0, "range": 22.0, "start": 0.3, "period": 0.2, "duty": 0.5}},
     "lens": {"camera.focal_length_error": 0.05},
 }
 
