@@ -10,9 +10,12 @@ seeds; the line below it replays the worst attack on a recording.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -23,10 +26,21 @@ from coopenv.base.format import in_parentheses
 from coopenv.bench.observers.changes import DIRECTION
 from coopenv.bench.observers.rows import standard_error
 from coopenv.estimation.poses import Array
+from coopenv.observers.registry import find_embedded
 from coopenv.runs.console import Progress
 from coopenv.runs.page import table
 
 SCENE = "busy_intersection_tracking"
+TARGETS = {
+    "few": {},
+    "many": {
+        "vehicles.vehicle_2.neighbours": ["SL1", "SL2", "SL3", "vehicle_1"],
+        "vehicles.vehicle_3.neighbours": ["SL2", "SL3", "vehicle_1", "vehicle_2"],
+        "vehicles.vehicle_4.neighbours": ["SL2", "SL3", "vehicle_1", "vehicle_2", "vehicle_3"],
+        "vehicles.vehicle_5.neighbours": ["SL3", "vehicle_1", "vehicle_2", "vehicle_3", "vehicle_4"],
+    },
+}
+"""Changes of the scene: three targets per vehicle, or at least two honest ones besides the liar, see the page."""
 OBSERVERS = ("robust", "schmidt_kalman", "riccati")
 """The first one is attacked in training."""
 LIAR = 1
@@ -69,14 +83,20 @@ Steering = Callable[[float, Array], Array]
 class Worlds:
     """Batch worlds in which one vehicle lies as a `Steering` decides."""
 
-    def __init__(self, count: int, observer: str, odometry: str, horizon: float) -> None:
+    def __init__(self, count: int, observer: str, odometry: str, scene: Mapping[str, Any]) -> None:
+        """Build the worlds; `scene` are dotted keys, `horizon` among them."""
         lie = {"kind": "drift", "start": START, "odometry": odometry}
-        overrides = {"horizon": horizon, f"vehicles.vehicle_{LIAR + 1}.faults": {"lie": lie}}
+        overrides = {**scene, f"vehicles.vehicle_{LIAR + 1}.faults": {"lie": lie}}
         self.envs = coopenv.make_vec(
-            SCENE, num_worlds=count, observer=observer, autoreset="disabled", overrides=overrides
+            SCENE,
+            num_worlds=count,
+            dtype="float64",  # as recordings have it
+            observer=observer,
+            autoreset="disabled",
+            overrides=overrides,
         )
         scenario = self.envs.scenario
-        self._seconds = int(horizon - START)
+        self._seconds = int(scenario.horizon - START)
         self._decisions = round(scenario.rates.decision)
         self._idle = np.zeros(self.envs.action_space.shape, np.float32)
         self._honest = np.arange(self.envs.vehicles) != LIAR
@@ -167,19 +187,19 @@ class Search:
 
     def __init__(self, asked: argparse.Namespace, odometry: str, on_progress: Callable[[], None]) -> None:
         self._asked, self._on_progress = asked, on_progress
-        self._worlds = Worlds(asked.population * asked.seeds, OBSERVERS[0], odometry, asked.horizon)
+        self._worlds = Worlds(asked.population * asked.seeds, OBSERVERS[0], odometry, scene_of(asked))
 
     def constant(self) -> Array:
         """Return the parameters (3,) of the best drift at a constant velocity."""
         rate = self._asked.rate
-        return self._best(np.zeros(3), np.array([0.5 * LATEST, rate, rate]))
+        return self._best(np.zeros(3), np.array([0.5 * LATEST, 0.5 * rate, 0.5 * rate]))
 
     def policy(self, first: Array) -> Array:
         """Return the parameters (1 + 2 F,) of the best linear policy, searched from a constant drift on."""
         features = 2 + 2 + 2 * (self._worlds.envs.vehicles - LIAR - 1)
         matrix = np.zeros((2, features))
         matrix[:, 0] = first[1:]
-        spread = np.concatenate([[0.2 * LATEST], np.full(matrix.size, self._asked.rate)])
+        spread = np.concatenate([[0.2 * LATEST], np.full(matrix.size, 0.3 * self._asked.rate)])
         return self._best(np.concatenate([first[:1], matrix.ravel()]), spread)
 
     def _best(self, mean: Array, std: Array) -> Array:
@@ -195,27 +215,34 @@ class Search:
         return mean
 
 
-def attacks(asked: argparse.Namespace, found: dict[str, Array]) -> dict[str, Array]:
-    """Return the parameters (W, ...) of all attacks on evaluation seeds; `found`: those that were trained."""
-    count, random = asked.held_out, np.random.default_rng(1)
+def attacks(count: int, rate: float, found: dict[str, Array]) -> dict[str, Array]:
+    """Return the parameters (count, ...) of all attacks, limited to a rate, m/s; `found`: those that were trained."""
+    random = np.random.default_rng(1)
     none, all_rates = np.zeros(count), np.full(count, PLAIN_RATE)
     drawn = random.random((3, count))
     return {
         "default drift": constant(none, all_rates, np.full(count, np.arctan2(DIRECTION[1], DIRECTION[0]))),
-        "random drift": constant(LATEST * drawn[0], asked.rate * drawn[1], 2.0 * np.pi * drawn[2]),
+        "random drift": constant(LATEST * drawn[0], rate * drawn[1], 2.0 * np.pi * drawn[2]),
         **{name: np.tile(parameters, (count, 1)) for name, parameters in found.items()},
     }
+
+
+def scene_of(asked: argparse.Namespace) -> dict[str, Any]:
+    """Return the dotted keys of the scene."""
+    return {"horizon": asked.horizon, **TARGETS[asked.targets]}
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     made = argparse.ArgumentParser(prog="python -m benchmarks.adversary", description=__doc__)
+    made.add_argument("--targets", choices=TARGETS, default="many", help="of every vehicle (default: many)")
     made.add_argument("--rate", type=float, default=0.3, help="fastest drift, m/s (default: 0.3)")
     made.add_argument("--horizon", type=float, default=30.0, help="length of an episode, s (default: 30)")
-    made.add_argument("--generations", type=int, default=8, help="of each search (default: 8)")
-    made.add_argument("--population", type=int, default=16, help="candidates per generation (default: 16)")
-    made.add_argument("--seeds", type=int, default=2, help="training seeds per candidate (default: 2)")
-    made.add_argument("--held-out", type=int, default=16, help="evaluation seeds (default: 16)")
+    made.add_argument("--generations", type=int, default=12, help="of each search (default: 12)")
+    made.add_argument("--population", type=int, default=24, help="candidates per generation (default: 24)")
+    made.add_argument("--seeds", type=int, default=4, help="training seeds per candidate (default: 4)")
+    made.add_argument("--held-out", type=int, default=32, help="evaluation seeds (default: 32)")
+    made.add_argument("--held-out-host", type=int, default=6, help="of observers on the host (default: 6)")
     return made
 
 
@@ -259,16 +286,17 @@ def evaluate(
     asked: argparse.Namespace, trained: dict[str, dict[str, Array]], on_progress: Callable[[], None]
 ) -> Results:
     """Return the episodes of all attacks on evaluation seeds."""
-    seeds, results = EVALUATION_SEEDS[: asked.held_out], {}
-    for observer in OBSERVERS:
-        for odometry in ODOMETRY:
-            worlds = Worlds(asked.held_out, observer, odometry, asked.horizon)
-            plans = attacks(asked, trained[odometry])
-            if odometry == ODOMETRY[0]:
-                plans = {"none": np.zeros((asked.held_out, 3)), **plans}
-            for name, parameters in plans.items():
-                results[name, odometry, observer] = worlds.play(seeds, linear(parameters, asked.rate))
-                on_progress()
+    results = {}
+    for observer, odometry in product(OBSERVERS, ODOMETRY):
+        count = asked.held_out if find_embedded(observer) else min(asked.held_out, asked.held_out_host)
+        worlds = Worlds(count, observer, odometry, scene_of(asked))
+        plans = attacks(count, asked.rate, trained[odometry])
+        if odometry == ODOMETRY[0]:
+            plans = {"none": np.zeros((count, 3)), **plans}
+        for name, parameters in plans.items():
+            steering = linear(parameters, asked.rate)
+            results[name, odometry, observer] = worlds.play(EVALUATION_SEEDS[:count], steering)
+            on_progress()
     return results
 
 
@@ -291,9 +319,10 @@ def worst_line(asked: argparse.Namespace, results: Results) -> str:
     rollouts = of_first[name, odometry, observer]
     world = int(np.argmax(rollouts.mean))
     figures = f"{rollouts.mean[world]:.2f} m on average, {rollouts.worst[world]:.2f} m of the worst vehicle"
+    keys = " ".join(f"--set '{key}={json.dumps(value)}'" for key, value in scene_of(asked).items())
     command = (
-        f"coopenv bench observers {SCENE} --observers {observer} --first {EVALUATION_SEEDS[world]} --seeds 1 --set "
-        f"horizon={asked.horizon:g} --steady-from {START:g} --fault {fault_of(rollouts.velocity[world], odometry)}"
+        f"coopenv bench observers {SCENE} --observers {observer} --first {EVALUATION_SEEDS[world]} --seeds 1 {keys} "
+        f"--steady-from {START:g} --fault {fault_of(rollouts.velocity[world], odometry)}"
     )
     return f"\nWorst case of `{observer}`, {name}, {odometry} odometry ({figures}):\n\n```\n{command}\n```"
 
