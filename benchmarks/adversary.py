@@ -238,11 +238,11 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--targets", choices=TARGETS, default="many", help="of every vehicle (default: many)")
     made.add_argument("--rate", type=float, default=0.3, help="fastest drift, m/s (default: 0.3)")
     made.add_argument("--horizon", type=float, default=30.0, help="length of an episode, s (default: 30)")
-    made.add_argument("--generations", type=int, default=12, help="of each search (default: 12)")
-    made.add_argument("--population", type=int, default=24, help="candidates per generation (default: 24)")
-    made.add_argument("--seeds", type=int, default=4, help="training seeds per candidate (default: 4)")
-    made.add_argument("--held-out", type=int, default=32, help="evaluation seeds (default: 32)")
-    made.add_argument("--held-out-host", type=int, default=6, help="of observers on the host (default: 6)")
+    made.add_argument("--generations", type=int, default=10, help="of each search (default: 10)")
+    made.add_argument("--population", type=int, default=16, help="candidates per generation (default: 16)")
+    made.add_argument("--seeds", type=int, default=2, help="training seeds per candidate (default: 2)")
+    made.add_argument("--held-out", type=int, default=16, help="evaluation seeds (default: 16)")
+    made.add_argument("--held-out-host", type=int, default=4, help="of observers on the host (default: 4)")
     return made
 
 

@@ -88,8 +88,8 @@ LINES_AND_FILES = {
     ".": (130, 2),
     "api": (3880, 19),
     "backends": (3275, 17),
-    "base": (1390, 9),
-    "bench": (4340, 17),
+    "base": (1395, 9),
+    "bench": (4455, 18),
     "cars": (7090, 35),
     "cli": (2050, 7),
     "estimation": (1720, 8),
@@ -97,10 +97,10 @@ LINES_AND_FILES = {
     "observers": (11960, 49),
     "policies": (1270, 7),
     "runs": (3060, 13),
-    "scenario": (3040, 12),
+    "scenario": (3080, 12),
     "training": (1160, 5),
     "viz": (4450, 17),
-    "world": (4170, 17),
+    "world": (4300, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 
