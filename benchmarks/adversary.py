@@ -98,7 +98,7 @@ class Worlds:
         scenario = self.envs.scenario
         self._seconds = int(scenario.horizon - START)
         self._decisions = round(scenario.rates.decision)
-        self._idle = np.zeros(self.envs.action_space.shape, np.float32)
+        self._idle = np.zeros((self.envs.num_envs, scenario.action.size), np.float32)
         self._honest = np.arange(self.envs.vehicles) != LIAR
 
     def play(self, seeds: Sequence[int], steering: Steering) -> Rollouts:
@@ -210,9 +210,9 @@ class Search:
         count = self._asked.seeds
         seeds = [*range(generation * count, (generation + 1) * count)] * len(candidates)
         steering = linear(np.repeat(candidates, count, axis=0), self._asked.rate)
-        mean = self._worlds.play(seeds, steering).mean.reshape(len(candidates), count).mean(axis=1)
+        errors = self._worlds.play(seeds, steering).mean
         self._on_progress()
-        return mean
+        return np.asarray(errors.reshape(len(candidates), count).mean(axis=1))
 
 
 def attacks(count: int, rate: float, found: dict[str, Array]) -> dict[str, Array]:
