@@ -18,7 +18,7 @@ HORIZON = 8.0
 def test_the_cross_entropy_method_finds_a_maximum() -> None:
     best = np.array([1.0, -2.0, 0.5])
     found = adversary.cross_entropy(
-        lambda candidates, generation: -np.square(candidates - best).sum(axis=1), np.zeros(3), np.ones(3), 40, 24
+        lambda candidates, generation: -np.square(candidates - best).sum(axis=1), np.zeros(3), np.ones(3), 30, 24
     )
     assert_allclose(found, best, atol=0.05)
 

@@ -104,7 +104,7 @@ def test_a_wrong_map_is_observed_as_it_is() -> None:
     R, p = estimates(engine)
     places = np.array([landmark.position for landmark in scenario.landmarks])
     for i in range(5):
-        own = places + [2.0 * (i == 1), 0.0, 0.0]
+        own = places + np.array([2.0 * (i == 1), 0.0, 0.0])
         order = np.argsort(np.linalg.norm((own - p[0, i])[:, :2], axis=1))
         expected = (own[order] - p[0, i]) @ R[0, i]
         np.testing.assert_allclose(seen(engine, scenario, "map_position")[0, i], expected, atol=1e-4)
