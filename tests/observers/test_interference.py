@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 from coopenv.backends.replay import Replay
 from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.observers import Message, Recording, run
+from coopenv.observers.centralised import Centralised
 from coopenv.observers.contract import Tick, check_received
 from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
@@ -120,6 +121,26 @@ def test_a_restart_begins_anew_and_nobody_else_does() -> None:
     listen(recorded("restart"))
     assert [vehicle for vehicle, _ in Listens.started] == [0, 1, 2, 3, 4, 1]
     assert Listens.started[-1][1][3, 3] >= 1e4
+
+
+class SeesMaps(Centralised):
+    """Keeps the maps of all vehicles by tick."""
+
+    maps: list[list[np.ndarray]]
+
+    def update(self, ticks: Any) -> Any:
+        SeesMaps.maps.append([tick.landmarks for tick in ticks])
+        return super().update(ticks)
+
+
+def test_a_joint_observer_has_every_vehicle_s_own_map() -> None:
+    SeesMaps.maps = []
+    assert not run(SeesMaps, recorded("map")).failure
+    off = np.array(SeesMaps.maps) - recorded("map").landmarks[1:, None]
+    wrong = np.linalg.norm(off, axis=-1)
+    expected = np.zeros_like(wrong)
+    expected[17:, 1, 1] = 2.0  # from tick 18 on, the second landmark of the second vehicle
+    assert_allclose(wrong, expected, atol=1e-12)
 
 
 def test_clocks_shift_ages() -> None:
