@@ -309,14 +309,17 @@ def evaluate(
 
 def table_of(results: Results) -> str:
     """Return the table: errors of the honest vehicles in m, mean and worst vehicle, with standard errors."""
-    columns = ["attack", "odometry", *(f"`{name}`: {kind}" for name in OBSERVERS for kind in ("mean", "worst vehicle"))]
     rows = []
     for name, odometry in dict.fromkeys((name, odometry) for name, odometry, _ in results):
         found = [results[name, odometry, observer] for observer in OBSERVERS]
-        figures = [values for each in found for values in (each.mean, each.worst)]
-        cells = [in_parentheses(float(values.mean()), standard_error(values)) for values in figures]
+        cells = [", ".join(map(_with_error, (each.mean, each.worst))) for each in found]
         rows.append([name, "" if name == "none" else odometry, *cells])
-    return table(columns, rows)
+    return table(["attack", "odometry", *(f"`{name}`" for name in OBSERVERS)], rows)
+
+
+def _with_error(values: Array) -> str:
+    """Return the mean of (W,) values with its standard error."""
+    return in_parentheses(float(values.mean()), standard_error(values))
 
 
 def worst_line(asked: argparse.Namespace, results: Results) -> str:
