@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
@@ -9,6 +10,7 @@ from pydantic.fields import FieldInfo
 
 from coopenv.base.installation import list_envs
 from coopenv.base.sections import Section
+from coopenv.bench.observers.rows import Row
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import SVEA, CarProfile, Role
@@ -117,8 +119,14 @@ def observation() -> str:
     return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)])
 
 
+def comparison() -> str:
+    """Return the columns of a comparison of observers, which its report explains in the same words."""
+    return table(("column", "meaning"), [(f"`{column.name}`", column.metadata["meaning"]) for column in fields(Row)])
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "bag_map": lambda: _reference(TopicMap),
+    "comparison": comparison,
     "deployment": lambda: _reference(Deployment),
     "observation": observation,
     "profile": lambda: _reference(CarProfile),

@@ -33,8 +33,8 @@ INFO_FIELDS = (
 )
 """Arrays (num_envs,) in every info, beside `reward_terms`, which holds one by the name of each term, and `time`, s
 since the start of the episode. `alive` is false for vehicles that had ended before this step; `ended` is 0 under way,
-1 arrived, 2 collided, from 3 on a condition of the scenario's own; errors in m and deg; `protection_level` is
-(num_envs, 2), m and rad, see `Step`."""
+1 arrived, 2 collided, 3 off route, from 4 on a condition of the scenario's own; errors in m and deg;
+`protection_level` is (num_envs, 2), m and rad, see `Step`."""
 
 
 class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):

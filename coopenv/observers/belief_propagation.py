@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, WHOLE, compiled, eliminated
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, WHOLE, compiled, eliminated, product
 from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import LEFT, recentring
 from coopenv.observers.contract import Message, Tick
@@ -38,8 +38,7 @@ STEP_PERIOD = 0.1  # s between passes through the window
 NUMBERS = 27  # of a message: the triangle of the information, and information times error
 PASSES = 2  # at a new frame
 
-BLOCKS, ROWS = types.Array(types.float64, 4, "C"), types.Array(types.float64, 3, "C")
-PAIRS, PAIR_ROWS = types.Array(types.float64, 5, "C"), types.Array(types.float64, 4, "C")
+BLOCKS, PAIRS = (types.Array(types.float64, n, "C") for n in (4, 5))
 
 
 class BeliefPropagation(GraphEstimator):
@@ -53,13 +52,13 @@ class BeliefPropagation(GraphEstimator):
         N = len(P)
         self.first, self.step_time = 0, 0.0  # first frame of the window
         self.counts = [np.zeros((N, 2))]
-        # messages into the variables, by frame: from odometry before and after, and from factors between vehicles
-        self.before, self.before_eta = np.linalg.inv(P)[None], np.zeros((1, N, 6))
-        self.after, self.after_eta = np.zeros((1, N, 6, 6)), np.zeros((1, N, 6))
-        self.pair, self.pair_eta = np.zeros((1, N, N, 12, 6)), np.zeros((1, N, N, 12))
+        # messages into the variables, by frame: from odometry before and after, and from bearings, see `passed`
+        self.before, self.after = np.zeros((2, 1, N, 6, 7))
+        self.before[0, :, :, :6] = np.linalg.inv(P)
+        self.pair = np.zeros((1, N, N, 12, 7))
         self.exchanged = np.zeros(N)
 
-    NAMES = ("before", "before_eta", "after", "after_eta", "pair", "pair_eta")
+    NAMES = ("before", "after", "pair")
 
     def correct(self, ticks: Sequence[Tick]) -> Array:
         """Pass messages at the new frame, and through the window when it is due."""
@@ -87,31 +86,30 @@ class BeliefPropagation(GraphEstimator):
         """
         graph, high, N = self.graph, self.graph.frames, len(self.setups)
         frames = range(low, high)
-        pairs, eta, counts = (
-            np.array(part) for part in zip(*(graph.pairs(k, self.scaled) for k in frames), strict=True)
-        )
-        motion = [graph.odometry(k) if k else (np.zeros((N, 6, 6)), np.zeros((N, 6))) for k in frames]
-        F, u = (np.array(part) for part in zip(*motion, strict=True))
+        pairs, counts = (np.array(part) for part in zip(*(graph.pairs(k) for k in frames), strict=True))
+        steps = np.array([graph.odometry(k) if k else np.zeros((N, 6, 7)) for k in frames])
         place = slice(max(low - 1 - self.first, 0), None)
         if low > self.first:  # the frame before gives its belief, and takes none
-            pairs, eta, F, u = (np.concatenate([np.zeros_like(part[:1]), part]) for part in (pairs, eta, F, u))
-            pairs[0], eta[0], _ = graph.pairs(low - 1, self.scaled)
+            pairs, steps = (np.concatenate([np.zeros_like(part[:1]), part]) for part in (pairs, steps))
+            pairs[0], _ = graph.pairs(low - 1)
         Q = graph.variance[high - len(pairs) : high]
         messages = [np.ascontiguousarray(getattr(self, name)[place]) for name in self.NAMES]
-        arguments: list[Any] = [*messages, pairs, eta, F, u, Q, passes]
+        own = np.arange(N)
+        messages[2][:, own, own, :6] = pairs[:, own, own, :6][..., [*range(6), 12]]
+        arguments: list[Any] = [*messages, pairs, steps, Q, passes]
         L, mean = passed(*arguments)
         new = high - low
         for name, values in zip(self.NAMES, messages, strict=True):
             getattr(self, name)[place] = values
         L, mean = L[-new:], mean[-new:]
         graph.move(low, mean)
-        for name in ("before", "after"):
-            eta_of = getattr(self, f"{name}_eta")
-            eta_of[-new:] -= (getattr(self, name)[-new:] @ mean[..., None])[..., 0]
-        self.pair_eta[-new:, ..., :6] -= np.einsum("fijrc,fic->fijr", self.pair[-new:, ..., :6, :], mean)
-        self.pair_eta[-new:, ..., 6:] -= np.einsum("fijrc,fjc->fijr", self.pair[-new:, ..., 6:, :], mean)
+        pair = self.pair[-new:]
+        into = [(self.before[-new:], mean), (self.after[-new:], mean)]
+        into += [(pair[..., :6, :], mean[:, :, None]), (pair[..., 6:, :], mean[:, None])]
+        for message, at in into:
+            message[..., 6] -= (message[..., :6] @ at[..., None])[..., 0]
         self.counts[low - self.first :] = list(counts[-new:])
-        linked = np.einsum("fijxx->fij", pairs[-new:, :, :, 6:, 6:]) > 0.0
+        linked = np.einsum("fijxx->fij", pairs[-new:, :, :, 6:, 6:12]) > 0.0
         self.exchanged += 2.0 * passes * (linked.sum((0, 2)) + linked.sum((0, 1)))
         return L, mean
 
@@ -133,87 +131,54 @@ class BeliefPropagation(GraphEstimator):
         ]
 
 
-@compiled(BLOCKS, ROWS, BLOCKS, ROWS, PAIRS, PAIR_ROWS, PAIRS, PAIR_ROWS, WHOLE, WHOLE)
-def belief(
-    before: Array,
-    before_eta: Array,
-    after: Array,
-    after_eta: Array,
-    pair: Array,
-    pair_eta: Array,
-    factors: Array,
-    factors_eta: Array,
-    k: int,
-    i: int,
-) -> tuple[Array, Array]:
-    """Return the information (6, 6) of variable (k, i) and information times error (6,)."""
-    L = before[k, i] + after[k, i] + factors[k, i, i, :6, :6]
-    eta = before_eta[k, i] + after_eta[k, i] + factors_eta[k, i, i, :6]
+@compiled(BLOCKS, BLOCKS, PAIRS, WHOLE, WHOLE)
+def belief(before: Array, after: Array, pair: Array, k: int, i: int) -> Array:
+    """Return the belief (6, 7) of variable (k, i) by its messages."""
+    total: Array = before[k, i] + after[k, i]
     for j in range(len(before[k])):
-        if j != i:
-            L = L + pair[k, i, j, :6] + pair[k, j, i, 6:]
-            eta = eta + pair_eta[k, i, j, :6] + pair_eta[k, j, i, 6:]
-    return L, eta
+        total = total + pair[k, i, j, :6] + pair[k, j, i, 6:]
+    return total
 
 
-@compiled(MATRIX, VECTOR, MATRIX, VECTOR, WHOLE)
-def factor_message(L: Array, eta: Array, cavity: Array, cavity_eta: Array, to: int) -> tuple[Array, Array]:
-    """Return the message of a factor (12, 12), (12,) to its first (0) or second (6) variable, by the other's cavity."""
+@compiled(MATRIX, MATRIX, WHOLE)
+def factor_message(factor: Array, cavity: Array, to: int) -> Array:
+    """Return the message (6, 7) of a factor (12, 13) to its first (0) or second (6) variable, by the other's cavity."""
     of = 6 - to
-    A = L[of : of + 6, of : of + 6] + cavity
-    right = np.empty((6, 7))
-    right[:, :6] = L[of : of + 6, to : to + 6]
-    right[:, 6] = eta[of : of + 6] + cavity_eta
-    solved = np.ascontiguousarray(eliminated(A, right))
-    across = np.ascontiguousarray(L[to : to + 6, of : of + 6]).dot(solved)
-    return L[to : to + 6, to : to + 6] - across[:, :6], eta[to : to + 6] - across[:, 6]
+    A = factor[of : of + 6, of : of + 6] + cavity[:, :6]
+    right, message = cavity.copy(), np.empty((6, 7))
+    right[:, :6] = factor[of : of + 6, to : to + 6]
+    right[:, 6] += factor[of : of + 6, 12]
+    message[:, :6] = factor[to : to + 6, to : to + 6]
+    message[:, 6] = factor[to : to + 6, 12]
+    return message - product(factor[to : to + 6, of : of + 6], eliminated(A, right))
 
 
-@compiled(MATRIX, VECTOR, VECTOR)
-def odometry_factor(F: Array, u: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the factor (12, 12), (12,) of the errors at a frame and at the next one, of e' = F e + u + noise."""
-    J = np.zeros((6, 12))
-    J[:, :6] = -F
+@compiled(MATRIX, VECTOR)
+def odometry_factor(step: Array, variance: Array) -> Array:
+    """Return the factor (12, 13) of the errors at a frame and at the next one, of e' = F e + u + noise."""
+    J = np.zeros((6, 13))
     for r in range(6):
-        J[r, 6 + r] = 1.0
+        J[r, :6], J[r, 6 + r], J[r, 12] = -step[r, :6], 1.0, step[r, 6]
     WJ = J.copy()
     for r in range(6):
         WJ[r] = J[r] / variance[r]
-    L, eta = J.T.copy().dot(WJ), np.zeros(12)
-    for c in range(12):
-        for r in range(6):
-            eta[c] += WJ[r, c] * u[r]
-    return L, eta
+    return product(J[:, :12].T, WJ)
 
 
-@compiled(BLOCKS, ROWS, BLOCKS, ROWS, PAIRS, PAIR_ROWS, PAIRS, PAIR_ROWS, BLOCKS, ROWS, MATRICES, WHOLE)
+@compiled(BLOCKS, BLOCKS, PAIRS, PAIRS, BLOCKS, MATRICES, WHOLE)
 def passed(
-    before: Array,
-    before_eta: Array,
-    after: Array,
-    after_eta: Array,
-    pair: Array,
-    pair_eta: Array,
-    factors: Array,
-    factors_eta: Array,
-    F: Array,
-    u: Array,
-    variance: Array,
-    passes: int,
+    before: Array, after: Array, pair: Array, factors: Array, steps: Array, variance: Array, passes: int
 ) -> tuple[Array, Array]:
     """Pass messages forward and backward over K frames of N vehicles; change the messages in place.
 
+    The last column of messages and factors is information times error.
+
     Args:
-        before: (K, N, 6, 6) messages of odometry from the frame before, and with it the prior of the first frame.
-        before_eta: (K, N, 6) information times error.
-        after: (K, N, 6, 6) messages of odometry from the frame after.
-        after_eta: (K, N, 6).
-        pair: (K, N, N, 12, 6) messages of factor (i, j) to i (first six rows) and to j.
-        pair_eta: (K, N, N, 12).
-        factors: (K, N, N, 12, 12) of `FrameGraph.pairs`.
-        factors_eta: (K, N, N, 12).
-        F: (K, N, 6, 6) of `FrameGraph.odometry`.
-        u: (K, N, 6).
+        before: (K, N, 6, 7) messages of odometry from the frame before, and with it the prior of the first frame.
+        after: (K, N, 6, 7) messages of odometry from the frame after.
+        pair: (K, N, N, 12, 7) messages of factor (i, j) to i (first six rows) and to j; of (i, i) by the landmarks.
+        factors: (K, N, N, 12, 13) of `FrameGraph.pairs`.
+        steps: (K, N, 6, 7) of `FrameGraph.odometry`.
         variance: (K, N, 6) of odometry.
         passes: at each frame between the vehicles.
 
@@ -226,33 +191,24 @@ def passed(
         k = step if forward else 2 * K - 1 - step
         if forward and k > 0:
             for i in range(N):
-                L, eta = odometry_factor(F[k, i], u[k, i], variance[k, i])
-                C, c = belief(before, before_eta, after, after_eta, pair, pair_eta, factors, factors_eta, k - 1, i)
-                before[k, i], before_eta[k, i] = factor_message(L, eta, C - after[k - 1, i], c - after_eta[k - 1, i], 6)
+                cavity = belief(before, after, pair, k - 1, i) - after[k - 1, i]
+                before[k, i] = factor_message(odometry_factor(steps[k, i], variance[k, i]), cavity, 6)
         for _ in range(passes):
             for i in range(N):
                 for j in range(N):
-                    if i == j or factors[k, i, j, 9, 9] + factors[k, i, j, 10, 10] + factors[k, i, j, 11, 11] <= 0.0:
+                    of = factors[k, i, j]
+                    if i == j or of[9, 9] + of[10, 10] + of[11, 11] <= 0.0:
                         continue
-                    C, c = belief(before, before_eta, after, after_eta, pair, pair_eta, factors, factors_eta, k, i)
-                    to, to_eta = factor_message(
-                        factors[k, i, j], factors_eta[k, i, j], C - pair[k, i, j, :6], c - pair_eta[k, i, j, :6], 6
-                    )
-                    pair[k, i, j, 6:], pair_eta[k, i, j, 6:] = to, to_eta
-                    C, c = belief(before, before_eta, after, after_eta, pair, pair_eta, factors, factors_eta, k, j)
-                    to, to_eta = factor_message(
-                        factors[k, i, j], factors_eta[k, i, j], C - pair[k, i, j, 6:], c - pair_eta[k, i, j, 6:], 0
-                    )
-                    pair[k, i, j, :6], pair_eta[k, i, j, :6] = to, to_eta
+                    pair[k, i, j, 6:] = factor_message(of, belief(before, after, pair, k, i) - pair[k, i, j, :6], 6)
+                    pair[k, i, j, :6] = factor_message(of, belief(before, after, pair, k, j) - pair[k, i, j, 6:], 0)
         if not forward and k > 0:
             for i in range(N):
-                L, eta = odometry_factor(F[k, i], u[k, i], variance[k, i])
-                C, c = belief(before, before_eta, after, after_eta, pair, pair_eta, factors, factors_eta, k, i)
-                after[k - 1, i], after_eta[k - 1, i] = factor_message(L, eta, C - before[k, i], c - before_eta[k, i], 0)
+                cavity = belief(before, after, pair, k, i) - before[k, i]
+                after[k - 1, i] = factor_message(odometry_factor(steps[k, i], variance[k, i]), cavity, 0)
     L, mean = np.empty((K, N, 6, 6)), np.empty((K, N, 6))
     for k in range(K):
         for i in range(N):
-            C, c = belief(before, before_eta, after, after_eta, pair, pair_eta, factors, factors_eta, k, i)
-            L[k, i] = C
-            mean[k, i] = eliminated(C, c.reshape((6, 1)))[:, 0]
+            total = belief(before, after, pair, k, i)
+            L[k, i] = total[:, :6]
+            mean[k, i] = eliminated(total[:, :6], total[:, 6:])[:, 0]
     return L, mean

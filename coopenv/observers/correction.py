@@ -1,8 +1,8 @@
 """The Kalman update of the zoo, with bearings linearised half way between prediction and correction.
 
 For two vehicles with little relative motion, linearising at the predicted pose biases the estimated range outwards,
-because gain and innovation depend on the same noise. Linearising at the corrected pose biases it inwards. Half way the
-bias vanishes, as in a Stratonovich integral (docs/observers.md#linearisation has the comparison).
+because gain and innovation depend on the same noise. Linearising half way between prediction and correction makes this
+bias smaller (docs/explanation/robust.md#shown-by-experiment-the-point-of-linearisation compares the points).
 
 The other form is iterated to convergence, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
 filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993; with a line search as in

@@ -16,6 +16,7 @@ fully until most of them fit. New bearings pass the gate of the other filters fi
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import types
@@ -49,7 +50,12 @@ LEAST_STD = 1e-6  # rad and m, of an odometry increment: without noise its infor
 PHI = LARGEST  # squared residual at which the loss begins to differ from least squares
 MOST_SCALED = 0.5  # share of a vehicle's bearings that may be scaled
 
-FLAGS = types.Array(types.boolean, 1, "A", readonly=True)
+SEEN = types.Tuple((PLACES, PLACES, MATRIX, MATRIX))
+"""Bearings: vehicle of the camera (m,); target, -1: landmark (m,); body frame (m, 3); landmark's position (m, 3), m."""
+VEHICLES = types.Tuple((MATRIX, MATRIX, VECTOR, types.Array(types.boolean, 1, "A", readonly=True)))
+"""Cameras (N, 3), m, and markers (N, 3), m, in the body; variance (N,) of a bearing, rad^2; robust loss or not (N,)."""
+Bearings = tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]
+Vehicles = tuple[Array, Array, Array, NDArray[np.bool_]]
 STACK = types.Array(types.float64, 4, "A", readonly=True)
 
 
@@ -57,29 +63,27 @@ class FrameGraph:
     """Poses, odometry and bearings of N vehicles at K frames, in arrays that grow."""
 
     FRAME_ARRAYS = ("R", "p", "turn", "shift", "variance")
-    BEARING_ARRAYS = ("observer", "target", "bearing", "point")
 
     def __init__(self, setups: Sequence[Setup], R: Array, p: Array) -> None:
         """Start with one frame at poses R (N, 3, 3) and p (N, 3), map, m."""
         N = len(p)
         self.landmarks = setups[0].landmarks
         self.markers = np.array([setup.marker for setup in setups], float)
-        self.cameras = np.array([setup.lever_arm for setup in setups], float)
-        self.noise = np.array([setup.noise.bearing_std**2 for setup in setups])  # (N,) rad^2
+        cameras, variance = [setup.lever_arm for setup in setups], [setup.noise.bearing_std**2 for setup in setups]
+        self.vehicles: Vehicles = np.array(cameras, float), self.markers, np.array(variance), np.zeros(N, np.bool_)
         self.frames = 1
         self.R, self.p = R[None].copy(), p[None].copy()  # where factors are linearised
         self.turn, self.shift = np.zeros((1, N, 3, 3)), np.zeros((1, N, 3))  # odometry since the last frame, m
         self.variance = np.ones((1, N, 6))  # of it, rad^2 and m^2
         self.begin = np.zeros(2, np.int64)  # first bearing of each frame, and of the next one
-        self.observer = np.zeros(1, np.int64)  # vehicle of the camera
-        self.target = np.zeros(1, np.int64)  # vehicle, -1: landmark
-        self.bearing, self.point = np.zeros((1, 3)), np.zeros((1, 3))  # body frame; the landmark's position, map, m
+        self.bearings: Bearings = np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros((1, 3)), np.zeros((1, 3))
 
     def append(self, ticks: Sequence[Tick]) -> None:
         """Add a frame without bearings, at the poses that odometry predicts."""
         k = self.frames
-        self._grow(self.FRAME_ARRAYS, k + 1)
-        self._grow(("begin",), k + 2)
+        for name in self.FRAME_ARRAYS:
+            setattr(self, name, grown(getattr(self, name), k + 1))
+        self.begin = grown(self.begin, k + 2)
         for i, tick in enumerate(ticks):
             self.turn[k, i], self.shift[k, i] = increment(tick)
             self.variance[k, i] = tick.noise.odometry(tick.dt) + LEAST_STD**2
@@ -91,51 +95,47 @@ class FrameGraph:
         """Add m bearings (m, 3) of a vehicle to the last frame; points (m, 3) are those of landmarks, map, m."""
         first = int(self.begin[self.frames])
         end = first + len(targets)
-        self._grow(self.BEARING_ARRAYS, end)
-        self.observer[first:end], self.target[first:end] = vehicle, np.maximum(targets - self.landmarks, -1)
-        self.bearing[first:end], self.point[first:end] = bearings, points
+        observer, target, bearing, point = self.bearings
+        self.bearings = grown(observer, end), grown(target, end), grown(bearing, end), grown(point, end)
+        added: Any = vehicle, np.maximum(targets - self.landmarks, -1), bearings, points
+        for values, new in zip(self.bearings, added, strict=True):
+            values[first:end] = new
         self.begin[self.frames] = end
-
-    def _grow(self, names: Sequence[str], length: int) -> None:
-        for name in names:
-            values = getattr(self, name)
-            if len(values) < length:
-                grown = np.zeros((2 * length, *values.shape[1:]), values.dtype)
-                grown[: len(values)] = values
-                setattr(self, name, grown)
 
     def move(self, first: int, dx: Array) -> None:
         """Move the poses from a frame on by their errors (F, N, 6)."""
         moved_poses(self.R[first : first + len(dx)], self.p[first : first + len(dx)], dx)
 
-    def pairs(self, frame: int, scaled: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-        """Return the information of the bearings of a frame; `scaled` (N,): vehicles with the robust loss.
+    def bearings_of(self, first: int, end: int) -> Bearings:
+        """Return the bearings of the frames from one on, up to another one."""
+        of = slice(self.begin[first], self.begin[end])
+        observer, target, bearing, point = self.bearings
+        return observer[of], target[of], bearing[of], point[of]
+
+    def pairs(self, frame: int) -> tuple[Array, Array]:
+        """Return the information of the bearings of a frame.
 
         Returns:
-            (N, N, 12, 12) information about the errors of observer and target, (N, N, 12) information times error, and
-            (N, 2) the bearings of each vehicle and how many of them do not fit. At [i, i] the first six are those of
-            the bearings to landmarks.
+            (N, N, 12, 13) information about the errors of observer and target, with information times error as the last
+            column, and (N, 2) the bearings of each vehicle and how many of them do not fit. At [i, i] the first six
+            rows are those of the bearings to landmarks.
         """
-        of = slice(self.begin[frame], self.begin[frame + 1])
-        L, eta, count = pair_information(
-            self.R[frame],
-            self.p[frame],
-            self.observer[of],
-            self.target[of],
-            self.bearing[of],
-            self.point[of],
-            self.cameras,
-            self.markers,
-            self.noise,
-            scaled,
-        )
-        return L, eta, count
+        seen = self.bearings_of(frame, frame + 1)
+        information, count = pair_information(self.R[frame], self.p[frame], seen, self.vehicles)
+        return information, count
 
-    def odometry(self, frame: int) -> tuple[Array, Array]:
-        """Return F (N, 6, 6) and u (N, 6): the error at a frame is F e + u + noise, of e (N, 6) at the frame before."""
+    def odometry(self, frame: int) -> Array:
+        """Return [F u] (N, 6, 7): the error at a frame is F e + u + noise, of e (N, 6) at the frame before."""
         k = frame
-        F, u = motion(self.R[k - 1], self.p[k - 1], self.R[k], self.p[k], self.turn[k], self.shift[k])
-        return F, u
+        step: Array = motion(self.R[k - 1], self.p[k - 1], self.R[k], self.p[k], self.turn[k], self.shift[k])
+        return step
+
+
+def grown(values: NDArray[Any], length: int) -> NDArray[Any]:
+    """Return an array of at least a length that begins with some values, themselves if there is room."""
+    if len(values) >= length:
+        return values
+    return np.concatenate([values, np.zeros((2 * length - len(values), *values.shape[1:]), values.dtype)])
 
 
 class GraphEstimator(ABC):
@@ -153,7 +153,6 @@ class GraphEstimator(ABC):
         self.graph = FrameGraph(self.setups, R, p)
         self.P = np.array(initial_covariances, float)  # (N, 6, 6) at the last tick
         self.gates = [InnovationGate() for _ in self.setups]
-        self.scaled = np.zeros(len(p), np.bool_)  # vehicles whose bearings have the robust loss
         self.sent = [Message() for _ in self.setups]
         self.begin(self.P)
 
@@ -207,7 +206,7 @@ class GraphEstimator(ABC):
 
     def judge(self, count: Array) -> None:
         """Apply the robust loss to the vehicles most of whose bearings fit, by the counts (N, 2) of some frames."""
-        self.scaled = count[:, 1] <= MOST_SCALED * count[:, 0]
+        self.graph.vehicles = *self.graph.vehicles[:3], count[:, 1] <= MOST_SCALED * count[:, 0]
 
 
 @compiled(types.Array(types.float64, 4, "A"), types.Array(types.float64, 3, "A"), MATRICES)
@@ -229,40 +228,29 @@ def logarithm(R: Array) -> Array:
 
 
 @compiled(MATRICES, MATRIX, MATRICES, MATRIX, MATRICES, MATRIX)
-def motion(before_R: Array, before_p: Array, R: Array, p: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
-    """Return F and u of `FrameGraph.odometry`, without the Jacobian of the logarithm, which is 1 where u is small."""
+def motion(before_R: Array, before_p: Array, R: Array, p: Array, turn: Array, shift: Array) -> Array:
+    """Return [F u] of `FrameGraph.odometry`, without the Jacobian of the logarithm, which is 1 where u is small."""
     N = len(R)
-    F, u = np.zeros((N, 6, 6)), np.zeros((N, 6))
+    step = np.zeros((N, 6, 7))
     for i in range(N):
         E = product(R[i].T, before_R[i])
         S = product(E, cross_matrix(-shift[i]))
         for r in range(3):
             for c in range(3):
-                F[i, r, c] = turn[i, c, r]
-                F[i, r + 3, c] = S[r, c]
-                F[i, r + 3, c + 3] = E[r, c]
-        u[i, :3] = logarithm(product(E, turn[i]))
-        u[i, 3:] = transformed(R[i].T, before_p[i] + transformed(before_R[i], shift[i]) - p[i])
-    return F, u
+                step[i, r, c] = turn[i, c, r]
+                step[i, r + 3, c] = S[r, c]
+                step[i, r + 3, c + 3] = E[r, c]
+        step[i, :3, 6] = logarithm(product(E, turn[i]))
+        step[i, 3:, 6] = transformed(R[i].T, before_p[i] + transformed(before_R[i], shift[i]) - p[i])
+    return step
 
 
-@compiled(MATRICES, MATRIX, PLACES, PLACES, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, FLAGS)
-def pair_information(
-    R: Array,
-    p: Array,
-    observer: NDArray[np.int64],
-    target: NDArray[np.int64],
-    bearing: Array,
-    point: Array,
-    cameras: Array,
-    markers: Array,
-    variance: Array,
-    scaled: NDArray[np.bool_],
-) -> tuple[Array, Array, Array]:
+@compiled(MATRICES, MATRIX, SEEN, VEHICLES)
+def pair_information(R: Array, p: Array, seen: Bearings, vehicles: Vehicles) -> tuple[Array, Array]:
     """Return what `FrameGraph.pairs` does, from its arrays."""
-    N = len(R)
-    L, eta, count = np.zeros((N, N, 12, 12)), np.zeros((N, N, 12)), np.zeros((N, 2))
-    J, r, row = np.zeros((2, 12)), np.zeros(2), np.zeros(6)
+    (observer, target, bearing, point), (cameras, markers, variance, scaled), N = seen, vehicles, len(R)
+    information, count = np.zeros((N, N, 12, 13)), np.zeros((N, 2))
+    J, row = np.zeros((2, 13)), np.zeros(6)  # derivatives, and the residual as the last column
     for n in range(len(observer)):
         i, j = observer[n], target[n]
         z = point[n].copy()
@@ -273,14 +261,14 @@ def pair_information(
         distance = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9)
         B = across(d[0] / distance, d[1] / distance, d[2] / distance)
         for k in range(2):
-            r[k] = B[k, 0] * bearing[n, 0] + B[k, 1] * bearing[n, 1] + B[k, 2] * bearing[n, 2]
             put_derivative(row, B[k], a, 1.0 / distance)
             J[k, :6] = row
-            J[k, 6:] = 0.0
+            J[k, 6:12] = 0.0
             if j >= 0:  # in the body of the target
                 put_derivative(row, transformed(R[j].T, transformed(R[i], B[k])), markers[j], -1.0 / distance)
-                J[k, 6:] = row
-        squared = (r[0] * r[0] + r[1] * r[1]) / variance[i]
+                J[k, 6:12] = row
+            J[k, 12] = B[k, 0] * bearing[n, 0] + B[k, 1] * bearing[n, 1] + B[k, 2] * bearing[n, 2]
+        squared = (J[0, 12] * J[0, 12] + J[1, 12] * J[1, 12]) / variance[i]
         ahead = d[0] * bearing[n, 0] + d[1] * bearing[n, 1] + d[2] * bearing[n, 2] > 0.0
         count[i, 0] += 1.0
         count[i, 1] += 0.0 if squared <= PHI and ahead else 1.0
@@ -291,7 +279,6 @@ def pair_information(
         b = i if j < 0 else j
         for k in range(2):
             for x in range(12):
-                eta[i, b, x] += w * J[k, x] * r[k]
-                for y in range(12):
-                    L[i, b, x, y] += w * J[k, x] * J[k, y]
-    return L, eta, count
+                for y in range(13):
+                    information[i, b, x, y] += w * J[k, x] * J[k, y]
+    return information, count

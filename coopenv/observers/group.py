@@ -139,8 +139,10 @@ class ObserverGroup:
     @property
     def refused(self) -> NDArray[np.int64]:
         """(N,) received messages that were invalid, or that the vehicle's observer could not read."""
-        own = [getattr(observer, "ignored_messages", 0) for observer in self.observers]
-        return self.mail.refused + np.array(own, dtype=np.int64)
+        refused = self.mail.refused.copy()
+        for i, observer in enumerate(self.observers):
+            refused[i] += getattr(observer, "ignored_messages", 0)
+        return refused
 
     def update_all(self, sensed: Sensed, interference: Interference | None = None) -> list[TimedEstimate]:
         """Let a joint observer take a tick of every vehicle."""

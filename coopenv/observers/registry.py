@@ -8,6 +8,7 @@ is named by its import path: `mine.py:Mine` or `package.module:Mine`.
 
 from __future__ import annotations
 
+import ast
 import re
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
 class ZooEntry:
     """An observer of this package; its modules load on first use."""
 
-    plugin: str  # module and class, or function of a setup
-    about: str  # one line for tables
+    plugin: str  # module and class, or function of a setup; the first sentence of its docstring stands in tables
     kernels: str = ""  # module and `Embedded`; empty: it runs on the host only
     needs: str = ""  # module of the extra `bench` without which it does not run
     in_space: bool = True  # whether it is meant for vehicles in space
@@ -39,83 +39,33 @@ class ZooEntry:
 
 
 ZOO = {
-    "dead_reckoning": ZooEntry(
-        "single_frame:DeadReckoning", "Adds up odometry and sends nothing", "riccati.kernels:DEAD_RECKONING"
-    ),
+    "dead_reckoning": ZooEntry("single_frame:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
     # on a plane, bearings to three points overdetermine the pose
-    "p3p": ZooEntry(
-        "single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False
-    ),
-    "riccati": ZooEntry(
-        "riccati.kernels:riccati",
-        "The paper's observer, with the scenario's gains",
-        "riccati.kernels:RICCATI",
-        covariance=False,
-    ),
-    "hamel_samson": ZooEntry(
-        "error_state_filters:HamelSamson", "The paper's observer with landmarks alone", covariance=False
-    ),
-    "mekf": ZooEntry("error_state_filters:Mekf", "Error-state filter; takes received positions as exact"),
-    "mekf_covariance": ZooEntry(
-        "error_state_filters:MekfCovariance", "Error-state filter; weighs received positions by covariance"
-    ),
-    "mekf_covariance_ungated": ZooEntry(
-        "error_state_filters:MekfCovarianceUngated", "Error-state filter that accepts every bearing"
-    ),
-    "covariance_intersection": ZooEntry(
-        "covariance_intersection:CovarianceIntersection", "Kalman filter; neighbours by covariance intersection"
-    ),
-    "split_covariance_intersection": ZooEntry(
-        "covariance_intersection:SplitCovarianceIntersection", "Kalman filter; neighbours by split intersection"
-    ),
-    "pairwise": ZooEntry("schmidt_kalman:Pairwise", "Keeps cross-covariances pair by pair"),
-    "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman", "Considers neighbours with cross-covariances"),
-    "iterated_ekf": ZooEntry(
-        "error_state_filters:IteratedEkf", "Error-state filter that iterates corrections; sends covariances"
-    ),
-    "left_invariant": ZooEntry("error_state_filters:LeftInvariant", "Invariant filter, left error; sends covariances"),
-    "right_invariant": ZooEntry(
-        "error_state_filters:RightInvariant", "Invariant filter, right error; sends covariances"
-    ),
-    "distributed_invariant": ZooEntry(
-        "covariance_intersection:DistributedInvariant",
-        "Invariant filter, right error; neighbours by covariance intersection",
-    ),
-    "ukf": ZooEntry("error_state_filters:Ukf", "Unscented (sigma-point) filter; sends covariances"),
-    "factor_graph": ZooEntry(
-        "factor_graph:FactorGraph", "Factor graph smoothed at key frames; sends covariances", needs="gtsam"
-    ),
-    "planar_ekf": ZooEntry("planar.plugin:PlanarEkf", "Extended Kalman filter of x, y and heading", in_space=False),
-    "planar_robust": ZooEntry(
-        "planar.plugin:PlanarRobust",
-        "Calibrates its odometry online; fuses neighbours by split covariance intersection",
-        in_space=False,
-    ),
-    "robust": ZooEntry(
-        "robust.observer:robust",
-        "This project's observer for vehicles in space: several hypotheses, gates",
-        "robust.observer:ROBUST",
-        on_a_plane=False,
-    ),
-    "centralised": ZooEntry("centralised:Centralised", "One filter over all vehicles and all measurements"),
-    "first_estimates_ekf": ZooEntry(
-        "consistent_ekf:FirstEstimatesEkf", "Centralised filter that linearises at first estimates"
-    ),
-    "observability_constrained_ekf": ZooEntry(
-        "consistent_ekf:ObservabilityConstrainedEkf",
-        "Centralised filter with Jacobians projected onto the observable directions",
-    ),
-    "belief_propagation": ZooEntry(
-        "belief_propagation:BeliefPropagation",
-        "Gaussian belief propagation over the last frames, with robust factors",
-        on_a_plane=False,
-    ),
-    "smoother": ZooEntry(
-        "smoother:Smoother", "Robust smoother of all vehicles over the whole window", on_a_plane=False
-    ),
-    "fixed_lag_smoother": ZooEntry(
-        "smoother:FixedLagSmoother", "Robust smoother of all vehicles over the last half second", on_a_plane=False
-    ),
+    "p3p": ZooEntry("single_frame:PerspectivePoints", on_a_plane=False),
+    "riccati": ZooEntry("riccati.kernels:riccati", "riccati.kernels:RICCATI", covariance=False),
+    "hamel_samson": ZooEntry("error_state_filters:HamelSamson", covariance=False),
+    "mekf": ZooEntry("error_state_filters:Mekf"),
+    "mekf_covariance": ZooEntry("error_state_filters:MekfCovariance"),
+    "mekf_covariance_ungated": ZooEntry("error_state_filters:MekfCovarianceUngated"),
+    "covariance_intersection": ZooEntry("covariance_intersection:CovarianceIntersection"),
+    "split_covariance_intersection": ZooEntry("covariance_intersection:SplitCovarianceIntersection"),
+    "pairwise": ZooEntry("schmidt_kalman:Pairwise"),
+    "schmidt_kalman": ZooEntry("schmidt_kalman:SchmidtKalman"),
+    "iterated_ekf": ZooEntry("error_state_filters:IteratedEkf"),
+    "left_invariant": ZooEntry("error_state_filters:LeftInvariant"),
+    "right_invariant": ZooEntry("error_state_filters:RightInvariant"),
+    "distributed_invariant": ZooEntry("covariance_intersection:DistributedInvariant"),
+    "ukf": ZooEntry("error_state_filters:Ukf"),
+    "factor_graph": ZooEntry("factor_graph:FactorGraph", needs="gtsam"),
+    "planar_ekf": ZooEntry("planar.plugin:PlanarEkf", in_space=False),
+    "planar_robust": ZooEntry("planar.plugin:PlanarRobust", in_space=False),
+    "robust": ZooEntry("robust.observer:robust", "robust.observer:ROBUST", on_a_plane=False),
+    "centralised": ZooEntry("centralised:Centralised"),
+    "first_estimates_ekf": ZooEntry("consistent_ekf:FirstEstimatesEkf"),
+    "observability_constrained_ekf": ZooEntry("consistent_ekf:ObservabilityConstrainedEkf"),
+    "belief_propagation": ZooEntry("belief_propagation:BeliefPropagation", on_a_plane=False),
+    "smoother": ZooEntry("smoother:Smoother", on_a_plane=False),
+    "fixed_lag_smoother": ZooEntry("smoother:FixedLagSmoother", on_a_plane=False),
 }
 """By name."""
 
@@ -230,9 +180,17 @@ def description(name: str) -> str:
     """Return the description of a known observer in one line, or why it cannot be used here."""
     if reason := obstacle(name):
         return reason
-    if name in ZOO:
-        return ZOO[name].about
-    return " ".join((find(name).__doc__ or "").split()).partition(". ")[0].rstrip(".")
+    text = _docstring(ZOO[name].plugin) if name in ZOO else find(name).__doc__
+    return " ".join((text or "").split()).partition(". ")[0].rstrip(".")
+
+
+def _docstring(place: str) -> str | None:
+    """Return the docstring of a class or function of this package from the source: loading it may take seconds."""
+    module, _, name = place.partition(":")
+    source = (Path(__file__).parent / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
+    kinds = ast.ClassDef | ast.FunctionDef
+    [found] = [node for node in ast.parse(source).body if isinstance(node, kinds) and node.name == name]
+    return ast.get_docstring(found)
 
 
 def check_known(name: str) -> None:

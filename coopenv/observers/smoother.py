@@ -21,15 +21,18 @@ from scipy.linalg import cholesky_banded, solve_triangular
 from scipy.linalg.lapack import dtbtrs
 
 from coopenv.base.errors import CoopenvError
-from coopenv.estimation.compiled import MATRICES, MATRIX, TARGET, VECTOR, WHOLE, compiled
+from coopenv.estimation.compiled import MATRICES, MATRIX, TARGET, WHOLE, compiled
 from coopenv.estimation.poses import Array
 from coopenv.observers.bearing_measurements import LEFT, recentring
 from coopenv.observers.contract import Tick
 from coopenv.observers.correction import PLACES
 from coopenv.observers.frame_graph import (
-    FLAGS,
+    SEEN,
     STACK,
+    VEHICLES,
+    Bearings,
     GraphEstimator,
+    Vehicles,
     motion,
     pair_information,
 )
@@ -133,13 +136,10 @@ class FixedLagSmoother(GraphEstimator):
         A CoopenvError means that the measurements do not determine the poses.
         """
         g, first, end = self.graph, prior.frame, self.graph.frames if last is None else last + 1
-        of = slice(g.begin[first + 1], g.begin[end])
         arguments: list[Any] = [getattr(g, name)[first:end] for name in g.FRAME_ARRAYS]
-        arguments += [g.begin[first : end + 1] - g.begin[first + 1]]
-        arguments += [getattr(g, name)[of] for name in g.BEARING_ARRAYS]
-        arguments += [g.cameras, g.markers, g.noise, self.scaled]
+        arguments += [g.begin[first : end + 1] - g.begin[first + 1], g.bearings_of(first + 1, end), g.vehicles]
         bands, eta, seen = normal_equations(*arguments)
-        size = 6 * len(g.cameras)
+        size = 6 * len(g.markers)
         rows, columns = np.tril_indices(size)
         bands[rows - columns, columns] += prior.information[rows, columns]
         eta[:size] += prior.information.dot(prior.mean)
@@ -177,9 +177,7 @@ def add_block(bands: Array, row: int, column: int, block: Array) -> None:
                 bands[row + r - column - c, column + c] += block[r, c]
 
 
-@compiled(
-    STACK, MATRICES, STACK, MATRICES, MATRICES, PLACES, PLACES, PLACES, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, FLAGS
-)
+@compiled(STACK, MATRICES, STACK, MATRICES, MATRICES, PLACES, SEEN, VEHICLES)
 def normal_equations(
     R: Array,
     p: Array,
@@ -187,14 +185,8 @@ def normal_equations(
     shift: Array,
     variance: Array,
     begin: NDArray[np.int64],
-    observer: NDArray[np.int64],
-    target: NDArray[np.int64],
-    bearing: Array,
-    point: Array,
-    cameras: Array,
-    markers: Array,
-    noise: Array,
-    scaled: NDArray[np.bool_],
+    bearings: Bearings,
+    vehicles: Vehicles,
 ) -> tuple[Array, Array, Array]:
     """Return the information (12N, 6NF) of F frames in lower banded form, information times error, and the counts.
 
@@ -204,35 +196,35 @@ def normal_equations(
     size = 6 * N
     bands, eta, count = np.zeros((2 * size, size * F)), np.zeros(size * F), np.zeros((N, 2))
     for k in range(1, F):
-        T, u = motion(R[k - 1], p[k - 1], R[k], p[k], turn[k], shift[k])
+        step = motion(R[k - 1], p[k - 1], R[k], p[k], turn[k], shift[k])
         for i in range(N):
+            T, u = np.ascontiguousarray(step[i, :, :6]), step[i, :, 6]
             here, before = size * k + 6 * i, size * (k - 1) + 6 * i
             W = np.diag(1.0 / variance[k, i])
-            WT = np.ascontiguousarray(-W.dot(T[i]))
+            WT = np.ascontiguousarray(-W.dot(T))
             add_block(bands, here, here, W)
             add_block(bands, here, before, WT)
-            add_block(bands, before, before, -T[i].T.copy().dot(WT))
-            Wu = u[i] / variance[k, i]
+            add_block(bands, before, before, -T.T.copy().dot(WT))
+            Wu = u / variance[k, i]
             eta[here : here + 6] += Wu
             for c in range(6):
                 for r in range(6):
-                    eta[before + c] -= T[i, r, c] * Wu[r]
+                    eta[before + c] -= T[r, c] * Wu[r]
         of = slice(begin[k], begin[k + 1])
-        L, e, seen = pair_information(
-            R[k], p[k], observer[of], target[of], bearing[of], point[of], cameras, markers, noise, scaled
-        )
+        observer, target, bearing, point = bearings
+        L, seen = pair_information(R[k], p[k], (observer[of], target[of], bearing[of], point[of]), vehicles)
         count += seen
         for i in range(N):
             for j in range(N):
                 if L[i, j, 0, 0] + L[i, j, 1, 1] + L[i, j, 3, 3] + L[i, j, 4, 4] + L[i, j, 5, 5] > 0.0:
                     a, b = size * k + 6 * i, size * k + 6 * j
                     add_block(bands, a, a, L[i, j, :6, :6])
-                    eta[a : a + 6] += e[i, j, :6]
+                    eta[a : a + 6] += L[i, j, :6, 12]
                     if i != j:
-                        add_block(bands, b, b, L[i, j, 6:, 6:])
-                        eta[b : b + 6] += e[i, j, 6:]
+                        add_block(bands, b, b, L[i, j, 6:, 6:12])
+                        eta[b : b + 6] += L[i, j, 6:, 12]
                         if i > j:
-                            add_block(bands, a, b, L[i, j, :6, 6:])
+                            add_block(bands, a, b, L[i, j, :6, 6:12])
                         else:
                             add_block(bands, b, a, L[i, j, 6:, :6])
     return bands, eta, count

@@ -53,27 +53,15 @@ class LookAhead(RouteFollower):
 
     needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
     remembers = 2  # decisions until the next plan, and the present one
+    price = 10.0  # s/s, that a second with a standard deviation of 1 m is worth
+    tolerated = 0.02  # m, standard deviation that costs nothing
+    farthest = 0.8  # m, offset from the route that costs nothing
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        *,
-        price: float = 10.0,
-        tolerated: float = 0.02,
-        farthest: float = 0.8,
-    ) -> None:
-        """Choose what matters.
-
-        Args:
-            scenario: of the environment.
-            price: seconds that a second with a standard deviation of 1 m is worth.
-            tolerated: standard deviation that costs nothing, m.
-            farthest: offset from the route that costs nothing, m.
-        """
+    def __init__(self, scenario: Scenario) -> None:
+        """See `Driver`."""
         super().__init__(scenario)
         self.foresight = min(self.foresight, FORESIGHT)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
-        self.price, self.tolerated, self.farthest = price, tolerated, farthest
         noise, rates = scenario.noise, scenario.rates
         per_second = rates.odometry if noise.odometry_rate == "sample" else noise.odometry_rate
         self.drift = noise.velocity**2 / per_second + (noise.odometry_scale * self.cruise) ** 2  # m^2/s
@@ -161,27 +149,21 @@ class Peek(RouteFollower):
     """
 
     needs = ("position_std", "map_position", "route_heading", "route_offset")
+    threshold = 0.1  # m, standard deviation of the position from which on it peeks
+    ahead = 0.4  # m, how far ahead the view is predicted; in proportion farther for a car that is longer than `SMALL`
+    farthest = 0.6  # m, offset from the route from which on it does not lead farther away
 
-    def __init__(
-        self, scenario: Scenario, *, threshold: float = 0.1, ahead: float = 0.4, farthest: float = 0.6
-    ) -> None:
-        """Choose when to peek.
-
-        Args:
-            scenario: of the environment.
-            threshold: standard deviation of the position from which on it peeks, m.
-            ahead: how far ahead the view is predicted, m; in proportion farther for a car that is longer than `SMALL`.
-            farthest: offset from the route from which on it does not lead farther away, m.
-        """
+    def __init__(self, scenario: Scenario) -> None:
+        """See `Driver`."""
         super().__init__(scenario)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
-        self.threshold, self.ahead, self.farthest = np.log10(threshold), ahead * self.scale, farthest
+        self.ahead *= self.scale
         self.pans = next((field.high for field in self.layout.action if field.name == "pan"), 0.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
         heading = self.read(observations, "route_heading")[:, 0]
-        lost = self.read(observations, "position_std")[:, 0] > self.threshold
+        lost = self.read(observations, "position_std")[:, 0] > np.log10(self.threshold)
         offset = np.where(lost, self.offset(observations, heading), 0.0)
         speed, along = self.speed(observations), self.pursue(self.direction(observations))
         if self.pans:

@@ -25,13 +25,12 @@ class Driver(ABC):
     remembers = 0
     """How many numbers it remembers of every row."""
 
-    def __init__(self, scenario: Scenario, *, cruise: float | None = None, look_ahead: float | None = None) -> None:
+    def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
         """Learn where everything stands in an observation.
 
         Args:
             scenario: of the environment.
-            cruise: speed when nothing is in the way, m/s (None: top speed).
-            look_ahead: distance of the pursued point of the route, m (None: 1 m, or more where cars are fast).
+            cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
 
         Raises:
             ValueError: the observation lacks a field, or the environment does not take speeds.
@@ -43,8 +42,8 @@ class Driver(ABC):
         if missing := [name for name in (*self.needs, "route") if name not in known]:
             raise ValueError(f"the observation lacks {', '.join(missing)} (route: the group route or goal)")
         self.cruise = self.layout.action[0].high if cruise is None else cruise
-        least = PURSUED * self.cruise / scenario.rates.decision
-        self.look_ahead = max(1.0, least) if look_ahead is None else look_ahead
+        self.look_ahead = max(1.0, PURSUED * self.cruise / scenario.rates.decision)
+        """Distance of the pursued point of the route, m."""
         driven = [vehicle.body for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
         self.length, self.width, _ = max((body.size for body in driven), default=(*SMALL, 0.0))
         self.scale = max(1.0, self.length / SMALL[0])
@@ -142,33 +141,21 @@ class RouteFollower(Driver):
     In the leader-follower order a vehicle receives from its leaders only, so giving way to senders cannot deadlock.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        *,
-        cruise: float | None = None,
-        look_ahead: float | None = None,
-        clearance: float = 0.9,
-        closest: float = 0.75,
-        foresight: float | None = None,
-    ) -> None:
-        """Choose the manner of driving.
+    clearance = 0.9
+    """Distance to keep between reference points, m, without a standard deviation of the own position."""
+    closest = 0.75
+    """Distance to keep at a certain position, m; its standard deviation is added, up to `clearance`. Both are at least
+    the distance of perpendicular cars `GAP` apart."""
 
-        Args:
-            scenario: of the environment.
-            cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
-            look_ahead: distance of the pursued point of the route, m (None: see `Driver`).
-            clearance: distance to keep between reference points, m, without a standard deviation of the own position.
-            closest: distance to keep at a certain position, m; its standard deviation is added, up to `clearance`.
-                Both are at least the distance of perpendicular cars `GAP` apart.
-            foresight: how far ahead to look for others, s (None: 6 s, or less where cars stop slowly, see `REACTION`).
-        """
-        super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
+    def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
+        """See `Driver`."""
+        super().__init__(scenario, cruise=cruise)
         least = (self.length + self.width) / 2.0 + GAP
-        self.clearance, self.closest = max(clearance, least), max(closest, least)
+        self.clearance, self.closest = max(self.clearance, least), max(self.closest, least)
         stopping = self.cruise / scenario.dynamics.max_acceleration
         nimble = stopping <= SOON
-        self.foresight = (6.0 if nimble else stopping + REACTION) if foresight is None else foresight
+        self.foresight = 6.0 if nimble else stopping + REACTION
+        """How far ahead to look for others, s."""
         self.paces = (1.0,) if nimble else (0.0, 0.5, 1.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -249,34 +236,15 @@ class IntelligentDriver(RouteFollower):
     """
 
     needs = ("velocity",)
+    time_gap = 0.8  # s, to the vehicle ahead
+    standstill_gap = 0.3  # m, between bumpers
+    acceleration = 1.0  # m/s^2, largest
+    deceleration = 1.5  # m/s^2, comfortable
+    half_width = 0.5  # m, distance from the route within which a vehicle is on it
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        *,
-        cruise: float | None = None,
-        look_ahead: float | None = None,
-        time_gap: float = 0.8,
-        standstill_gap: float = 0.3,
-        acceleration: float = 1.0,
-        deceleration: float = 1.5,
-        half_width: float = 0.5,
-    ) -> None:
-        """Choose the manner of driving.
-
-        Args:
-            scenario: of the environment.
-            cruise: desired speed, m/s (None: top speed).
-            look_ahead: distance of the pursued point of the route, m (None: see `Driver`).
-            time_gap: to the vehicle ahead, s.
-            standstill_gap: between bumpers, m.
-            acceleration: largest, m/s^2.
-            deceleration: comfortable, m/s^2.
-            half_width: distance from the route within which a vehicle is on it, m.
-        """
-        super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
-        self.time_gap, self.standstill_gap, self.half_width = time_gap, standstill_gap, half_width
-        self.acceleration, self.deceleration = acceleration, deceleration
+    def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
+        """See `Driver`."""
+        super().__init__(scenario, cruise=cruise)
         self.period = 1.0 / scenario.rates.decision
         bodies = [vehicle.body.size[0] for vehicle in scenario.vehicles if vehicle.body]
         self.length = max(bodies, default=0.0)
@@ -316,23 +284,18 @@ class StopWhenLost(RouteFollower):
 
     needs = ("position_std",)
     remembers = 1  # decisions for which it has been lost
+    threshold = 0.15  # m, standard deviation of the position above which it stops
+    patience = 3.0  # s, longest time to stand
 
-    def __init__(self, scenario: Scenario, *, threshold: float = 0.15, patience: float = 3.0) -> None:
-        """Choose when to stop.
-
-        Args:
-            scenario: of the environment.
-            threshold: standard deviation of the position above which it stops, m.
-            patience: longest time to stand, s.
-        """
+    def __init__(self, scenario: Scenario) -> None:
+        """See `Driver`."""
         super().__init__(scenario)
-        self.threshold = np.log10(threshold)
-        self.patience = round(patience * scenario.rates.decision)
+        self.longest = round(self.patience * scenario.rates.decision)  # decisions
 
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s."""
-        lost = self.read(observations, "position_std")[:, 0] > self.threshold
+        lost = self.read(observations, "position_std")[:, 0] > np.log10(self.threshold)
         (waited,) = self.memory(observations)
         waited[:] = np.where(lost, waited + 1, 0)
-        stands = lost & (waited <= self.patience)
+        stands = lost & (waited <= self.longest)
         return np.where(stands, 0.0, super().speed(observations))

@@ -198,6 +198,11 @@ def test_what_is_no_message_is_told_in_one_line() -> None:
     )
 
 
+def test_an_observer_that_cannot_be_built_ends_its_run() -> None:
+    failure = run("planar_robust", recording()).failure
+    assert failure.startswith("of vehicle_1 at 0.000 s: CoopenvError: PlanarRobust is for robots on a plane")
+
+
 SENSED = ("rotation", "translation", "velocity", "angular_velocity", "targets", "bearings", "valid", "landmarks")
 
 

@@ -41,8 +41,12 @@ def test_peek_turns_to_landmarks_and_back_into_its_lane() -> None:
     assert peek.drive(observation(**{**lost, "route_offset": 0.9}))[1][0] <= 0.0  # no farther to the left
 
 
+class Impatient(StopWhenLost):
+    threshold, patience = 0.1, 0.3  # m, s
+
+
 def test_stopping_has_an_end() -> None:
-    driver = StopWhenLost(SCENARIO, threshold=0.1, patience=0.3)
+    driver = Impatient(SCENARIO)
     lost, sure = observation(position_std=0.0), observation(position_std=-2.0)
     speeds = [driver.drive(row)[0][0] for row in (lost, lost, lost, lost, lost, sure, lost)]
     assert speeds == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]

@@ -84,7 +84,7 @@ class RecordProperties:
 
 
 class Series(NamedTuple):
-    """What figures show, at `Scene.t`; arrays (S, N)."""
+    """What figures show, at `RecordProperties.t`; arrays (S, N)."""
 
     position_error: Array  # m
     position_std: Array  # m, NaN where the observer states no covariance

@@ -106,10 +106,10 @@ class Row:
     orientation_rmse_deg: float = _column("the same of the geodesic angle between true and estimated orientation, deg")
     orientation_rmse_se_deg: float = _column("standard error of orientation_rmse_deg over the seeds, deg")
     bound_m: float = _column("posterior Cramér-Rao bound of the position, joint over all vehicles, m")
-    anees: float = _column("mean NEES in the steady state divided by its dimension; 1 for an honest covariance")
+    anees: float = _column("mean NEES in the steady state divided by its dimension; 1: consistent, more: overconfident")
     anees_se: float = _column("standard error of anees over the seeds")
     settled_fraction: float = _column(f"share of seeds whose errors stay below {SETTLED.text} to the end")
-    settle_time_s: float = _column("median over these seeds of the time from which on they do, s")
+    settle_time_s: float = _column("median over these seeds of the time at which that begins, s")
     bytes_per_s: float = _column("payload that the vehicle broadcasts, bytes per second")
     us_per_update: float = _column("median time of an update with its message, microseconds; depends on the machine")
     failure: str = _column("first vehicle that failed, when and why; empty without a failure")
@@ -124,7 +124,7 @@ class Row:
     position_rmse_median_m: float = _column("median over seeds of each run's RMSE, m")
     position_rmse_p90_m: float = _column("90 % quantile over seeds of each run's RMSE, m")
     converged_fraction: float = _column(f"share of seeds whose errors stay below {CONVERGED.text} to the end")
-    convergence_time_s: float = _column("median over these seeds of the time from which on they do, s")
+    convergence_time_s: float = _column("median over these seeds of the time at which that begins, s")
     convergence_rate_per_s: float = _column(
         "median over seeds of the Theil-Sen slope of -log of the error's descent, 1/s"
     )
@@ -136,7 +136,7 @@ class Row:
     rpe_deg: float = _column(f"its angle over {RELATIVE_DELTA:g} s, deg")
     nis: float = _column("mean NIS in the steady state divided by its degrees of freedom; 1 for a consistent filter")
     anees_low: float = _column(
-        f"with anees_high: where that of an honest filter lies in {LEVEL:.0%} of all instants, for as many runs "
+        f"with anees_high: where that of a consistent filter lies in {LEVEL:.0%} of all instants, for as many runs "
         "(chi-square); the mean over time lies closer to 1"
     )
     anees_high: float = _column("see anees_low")

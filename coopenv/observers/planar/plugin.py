@@ -119,11 +119,11 @@ MOST_FAILED = 15  # searches with so many bearings after which the prior is drop
 
 
 class PlanarRobust(PlanarEkf):
-    """Calibrates its odometry online, broadcasts its sightings, and fuses by split covariance intersection.
+    """Calibrates its odometry online; fuses neighbours by split covariance intersection.
 
-    It declares itself lost when most bearings fail the gate, or when its covariance is so large that a single bearing
-    cannot correct it. It then states a large covariance, sends nothing, and searches for the pose that agrees with the
-    bearings of the last half minute.
+    It broadcasts its sightings. It declares itself lost when most bearings fail the gate, or when its covariance is so
+    large that a single bearing cannot correct it. It then states a large covariance, sends nothing, and searches for
+    the pose that agrees with the bearings of the last half minute.
 
     Messages hold position and covariance (72 bytes), and after a sighting a pose with its covariance in single
     precision (36 bytes), whether landmarks were seen lately (1), and 5 bytes for each robot seen.
