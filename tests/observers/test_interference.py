@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 from coopenv.backends.replay import Replay
 from coopenv.base.errors import CoopenvError, world_keys
 from coopenv.observers import Message, Recording, run
+from coopenv.observers.centralised import Centralised
 from coopenv.observers.contract import Tick, check_received
 from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
@@ -32,6 +33,9 @@ FAULTS: dict[str, dict[str, Any]] = {
     "clock": {"faults.clock_offset": 0.1, "v2x.staleness": 0.1},
     "corruption": {"faults.corruption.probability": 0.3},
     "restart": {OTHER: {"restart": {"chance": 1.0, "time": 0.42}}},
+    "map": {f"{OTHER}.map_error": {"chance": 1.0, "landmark": "SL2", "offset": 2.0, "start": 0.3}},
+    "map of a restart": {"faults": {"map_error": {"chance": 0.7}, "restart": {"chance": 0.5, "time": 0.42}}},
+    "jammer": {f"{OTHER}.jammer": {"chance": 1.0, "range": 22.0, "start": 0.3, "period": 0.2, "duty": 0.5}},
     "lens": {"camera.focal_length_error": 0.05},
 }
 
@@ -117,6 +121,26 @@ def test_a_restart_begins_anew_and_nobody_else_does() -> None:
     listen(recorded("restart"))
     assert [vehicle for vehicle, _ in Listens.started] == [0, 1, 2, 3, 4, 1]
     assert Listens.started[-1][1][3, 3] >= 1e4
+
+
+class SeesMaps(Centralised):
+    """Keeps the maps of all vehicles by tick."""
+
+    maps: list[list[np.ndarray]]
+
+    def update(self, ticks: Any) -> Any:
+        SeesMaps.maps.append([tick.landmarks for tick in ticks])
+        return super().update(ticks)
+
+
+def test_a_joint_observer_has_every_vehicle_s_own_map() -> None:
+    SeesMaps.maps = []
+    assert not run(SeesMaps, recorded("map")).failure
+    off = np.array(SeesMaps.maps) - recorded("map").landmarks[1:, None]
+    wrong = np.linalg.norm(off, axis=-1)
+    expected = np.zeros_like(wrong)
+    expected[17:, 1, 1] = 2.0  # from tick 18 on, the second landmark of the second vehicle
+    assert_allclose(wrong, expected, atol=1e-12)
 
 
 def test_clocks_shift_ages() -> None:
