@@ -81,7 +81,7 @@ $(VENV)/.uv: $(VENV)/.dev
 	@touch $@
 
 test-matrix: $(VENV)/.uv ## the tests under other Pythons, versions and processors; CELLS="lowest newest" for some of them
-	@$(BIN)/python -m tests.matrix $(CELLS)
+	@$(BIN)/python .ci/matrix.py $(CELLS)
 
 $(VENV)/.docs: $(VENV)/.dev
 	@echo "Installing what the documentation site needs into $(VENV) (once) ..."

@@ -20,6 +20,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import in_parentheses
 from coopenv.base.installation import scenario_path
+from coopenv.bench.observers.faults import variant_of
 from coopenv.bench.observers.rows import standard_error
 from coopenv.estimation.poses import Array
 from coopenv.observers import run
@@ -44,8 +45,8 @@ JUDGED_FROM = 15.0
 """s, in changed recordings."""
 STEP_AT = 12.0
 """s, at which the gyro bias steps."""
-DIRECTION = np.array([0.8, 0.6, 0.0])
-"""Of a landmark's error in the map."""
+ANGLE = np.arctan2(0.6, 0.8)
+"""rad, of a landmark's error in the map."""
 
 BASE = "busy_intersection_tracking"
 """Whose noise, initial errors and observer settings the road has."""
@@ -88,12 +89,11 @@ def tracking() -> Scenario:
 
 
 def landmark_moved(distance: float) -> Change:
-    """Return a change that moves one landmark of the map by a distance, m: the second of three, the tenth of 34."""
+    """Return a change that moves one landmark of the maps by a distance, m: the second of three, the tenth of 34."""
 
     def change(recording: Recording, random: np.random.Generator) -> Recording:
-        landmarks = recording.landmarks.copy()
-        landmarks[:, 1 if landmarks.shape[1] < 10 else 9] += distance * DIRECTION
-        return replace(recording, landmarks=landmarks)
+        name = recording.setups[0].target_names[1 if recording.landmarks.shape[1] < 10 else 9]
+        return variant_of(f"map_error={name}:{distance},angle={ANGLE}").applied(recording, 0)
 
     return change
 

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 import coopenv
 from coopenv.base.installation import environment_id
-from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_actions, rollout
+from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_actions, rendering, rollout
 
 ENVS = coopenv.list_envs()
 short = cache(partial(coopenv.load_scenario, overrides={"horizon": 6.0}))
@@ -28,9 +28,17 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", [c for c in CHECKS if c is not rendering], ids=lambda check: check.__name__)
 def test_suite(name: str, check: Callable[[Make], None]) -> None:
     check(partial(coopenv.parallel_env, short(name)))
+
+
+@pytest.mark.parametrize("drawn", ["busy_intersection", "urban_crossing", "highway_intersection"])
+def test_rendering(drawn: str) -> None:
+    """One of each kind of motion; that every environment is drawn is tested in tests/viz/test_topview.py."""
+    if drawn == "highway_intersection":
+        pytest.importorskip("highway_env", reason="needs the extra highway")
+    rendering(partial(coopenv.parallel_env, short(drawn)))
 
 
 def test_registries(name: str) -> None:

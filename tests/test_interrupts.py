@@ -40,8 +40,7 @@ def test_a_run_ends_with_one_line(number: signal.Signals, earlier: bool, tmp_pat
     assert not earlier or (tmp_path / "result" / "metrics.json").read_text() == "earlier"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("whole_group", [False, True])
+@pytest.mark.parametrize(("number", "whole_group"), [(signal.SIGINT, True), (signal.SIGTERM, False)])
 def test_workers_end_with_their_parent(number: signal.Signals, whole_group: bool, tmp_path: Path) -> None:
     process = start(BENCH, tmp_path)
     wait_until(lambda: len(workers_of(process.pid)) == 2)

@@ -29,7 +29,8 @@ def test_a_closed_pipe_is_quiet(arguments: list[str], tmp_path: Path) -> None:
 
 def test_results_are_kept_when_the_table_cannot_be_printed(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
-        process = start((*COOPENV, "run", "overtaking", "--steps", "1", "--out", "x"), tmp_path, stdout=full)
+        command = (*COOPENV, "run", "overtaking", "--steps", "1", "--no-figures", "--out", "x")
+        process = start(command, tmp_path, stdout=full)
         process.communicate(timeout=DEADLOCK)
     assert process.returncode == 2
     assert (tmp_path / "x" / "metrics.json").is_file()

@@ -395,7 +395,8 @@ class PlugIns:
         joint = self.groups[0].joint
         with self._naming_the_observer():
             for w in worlds if joint else ():
-                for i, answer in enumerate(self.groups[w].update_all(sensed[w])):
+                faults = self._interference(w, sensed[w].index)
+                for i, answer in enumerate(self.groups[w].update_all(sensed[w], faults)):
                     self._write(w, i, answer.estimate)
             for vehicle in self._order:
                 world.receive(vehicle)

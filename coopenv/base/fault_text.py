@@ -36,10 +36,14 @@ class FaultKind:
     high: float = inf
     words: Mapping[str, float] = field(default_factory=dict)
     """Words before the value, `WORD[:VALUE]`, each with its default; empty: the value is a number."""
+    free_word: bool = False
+    """Whether any word may stand before the value, `[WORD:]VALUE`."""
     start: bool = False
     """Whether `@START` is allowed."""
     duration: bool = False
     options: tuple[str, ...] = ()
+    signed: tuple[str, ...] = ()
+    """Those of them that may be negative."""
     vehicles: bool = False
     """Whether the fault is of single vehicles."""
 
@@ -90,7 +94,7 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
             raise FaultError(f"{where}: {shown(option)} is not OPTION=VALUE")
         if key not in kind.options:
             raise FaultError(f"{where}: no option {shown(key)}; allowed: {listed(kind.options) or 'none'}")
-        options[key] = _number(given, f"{where}: {key}")
+        options[key] = _number(given, f"{where}: {key}", -inf if key in kind.signed else 0.0)
     start = found["start"]
     is_share = start is not None and start.endswith("%")
     begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", 0.0, 1e6)
@@ -113,13 +117,16 @@ def _value(text: str | None, kind: FaultKind, where: str, name: str) -> tuple[st
         word, colon, number = (text or "").partition(":")
         check_one_of(f"{where}: unknown {name}", word, kind.words, FaultError)
         return word, _number(number, f"{where}: value", kind.low, kind.high) if colon else kind.words[word]
+    word = ""
+    if kind.free_word and text is not None:
+        word, _, text = text.rpartition(":")
     if text is None:
         if kind.default is None:
             raise FaultError(f"{where}: needs a value, {name}=NUMBER ({kind.value.lower()}: {kind.meaning})")
-        return "", kind.default
+        return word, kind.default
     if not kind.value:
         raise FaultError(f"{where}: has no value, got {shown(text)}")
-    return "", _number(text, f"{where}: value", kind.low, kind.high)
+    return word, _number(text, f"{where}: value", kind.low, kind.high)
 
 
 def _number(text: str, where: str, low: float = 0.0, high: float = inf) -> float:
@@ -127,6 +134,6 @@ def _number(text: str, where: str, low: float = 0.0, high: float = inf) -> float
         number = float(text)
     except ValueError:
         number = nan
-    if not low <= number <= high or number == inf:
+    if not low <= number <= high or abs(number) == inf:
         raise FaultError(f"{where}: expected a number from {low:g} to {high:g}, got {shown(text)}")
     return number

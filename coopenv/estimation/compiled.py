@@ -1,7 +1,7 @@
 """Functions of a few small arrays, compiled by Numba: in NumPy every operation takes a microsecond, whatever its size.
 
 Each function is compiled for one type per argument, which admits any memory layout. Compilation happens when the module
-is first loaded on a machine. As in C, the shapes of the arguments are not checked.
+is first loaded on a machine, once: other processes wait for it. As in C, the shapes of the arguments are not checked.
 
 Numba caches machine code per function and invalidates it when the function's own file changes. Changes of functions and
 constants in other files go unnoticed. The cache folder is therefore named by a digest of all these sources.
@@ -23,6 +23,7 @@ import numba
 import numpy as np
 from numba import njit, types
 
+from coopenv.base.files import lock
 from coopenv.estimation import poses
 from coopenv.estimation.poses import Array
 
@@ -37,6 +38,7 @@ NUMBER, WHOLE, FLAG = types.float64, types.int64, types.boolean
 
 PACKAGE = Path(__file__).parents[1]
 ROOMS = ("estimation", "observers")  # where compiled functions are, and what they use
+LONGEST_COMPILATION = 120.0  # s of all functions; a process that holds the lock for longer is taken for suspended
 _BEGINNING = "compiled-"  # of the folders' names
 
 fresh: list[str] = []
@@ -59,13 +61,21 @@ def _made(function: Any, arguments: tuple[Any, ...], folder: Path | None) -> Any
     options: dict[str, Any] = {"error_model": "numpy"}
     if folder is not None:
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        held = None if _kept(function, folder) else lock(folder, LONGEST_COMPILATION)
         try:
             return njit(arguments, cache=True, **options)(function)
         except Exception:  # what is kept is damaged, or the disk is full; an error of the function comes once more
             pass
         finally:
             config.CACHE_DIR = before
+            if held is not None:
+                os.close(held)
     return njit(arguments, **options)(function)
+
+
+def _kept(function: Any, folder: Path) -> bool:
+    """Return whether there is machine code of a function."""
+    return any(folder.glob(f"*/*.{function.__name__}-{function.__code__.co_firstlineno}.*.nbi"))
 
 
 @cache

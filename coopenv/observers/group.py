@@ -90,11 +90,14 @@ class ObserverGroup:
         """
         k, clock = sensed.index, None if interference is None else interference.clock
         try:
-            if interference is not None and interference.restarts[vehicle]:
-                self._restart(vehicle, sensed)
-            observer = self.observers[vehicle]
+            restarts = interference is not None and interference.restarts[vehicle]
+            if restarts:
+                self.mail.forget(vehicle)
             messages = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
-            tick = sensed.tick(self.observer_init.setups[vehicle], messages)
+            tick = sensed.tick(self.observer_init.setups[vehicle], messages, interference)
+            if restarts:
+                self._restart(vehicle, tick.landmarks)
+            observer = self.observers[vehicle]
             begin = perf_counter()
             estimate = observer.update(tick)
             message = observer.message() if k % self.observer_init.period == 0 else None
@@ -106,12 +109,11 @@ class ObserverGroup:
             raise self._blamed(error, k, vehicle) from error
         return TimedEstimate(estimate, elapsed)
 
-    def _restart(self, vehicle: int, sensed: Sensed) -> None:
-        """Restart a vehicle's observer without messages, with a wide prior about the landmarks' centre."""
-        middle = sensed.landmarks.mean(axis=0) if len(sensed.landmarks) else np.zeros(3)
+    def _restart(self, vehicle: int, landmarks: Array) -> None:
+        """Restart a vehicle's observer with a wide prior about the centre of the landmarks (L, 3) of its map."""
+        middle = landmarks.mean(axis=0) if len(landmarks) else np.zeros(3)
         self.observers[vehicle] = self.factory(self.observer_init.setups[vehicle])
         self.observers[vehicle].reset((np.eye(3), middle), UNKNOWN.copy())
-        self.mail.forget(vehicle)
 
     def _post(
         self, vehicle: int, k: int, message: Message, interference: Interference | None, tamper: Tamper | None
@@ -142,11 +144,11 @@ class ObserverGroup:
             refused[i] += getattr(observer, "ignored_messages", 0)
         return refused
 
-    def update_all(self, sensed: Sensed) -> list[TimedEstimate]:
+    def update_all(self, sensed: Sensed, interference: Interference | None = None) -> list[TimedEstimate]:
         """Let a joint observer take a tick of every vehicle."""
         setups = self.observer_init.setups
         try:
-            ticks = [sensed.tick(setup, {}) for setup in setups]
+            ticks = [sensed.tick(setup, {}, interference) for setup in setups]
             begin = perf_counter()
             estimates = self.observers[0].update(ticks)
             messages = self.observers[0].messages()

@@ -2,8 +2,8 @@
 
 The receiver checks each message. An invalid message is refused and counted; otherwise it has the effect of a loss.
 
-Faults change messages, offset clocks and restart observers. The world draws them (`coopenv.world.v2x`), so that
-observers in its kernels and on the host have the same faults.
+Faults change messages and maps, offset clocks and restart observers. The world draws them (`coopenv.world.v2x`), so
+that observers in its kernels and on the host have the same faults.
 """
 
 from collections.abc import Callable, Mapping
@@ -210,10 +210,17 @@ class Interference:
     restarts: NDArray[np.bool_]  # (..., N) whether its observer starts anew before this tick
     kept: NDArray[np.int64]  # (N,) ticks for which it keeps its messages to replay them
     consistent: NDArray[np.bool_]  # (N,) whether the other entries of its messages agree with a false pose
+    map_error: Array  # (N, L, 3) of the landmarks' places on its map, m
+    map_tick: NDArray[np.int64]  # (N, L) tick from which on the map has that error; -1: never
 
     def at(self, k: int) -> "Interference":
         """Return the faults at tick k."""
         return replace(self, **{name: getattr(self, name)[k] for name in PER_TICK})
+
+    def map_error_of(self, vehicle: int, k: int) -> Array:
+        """Return (L, 3) the errors of a vehicle's map at tick k, m."""
+        begun = self.map_tick[vehicle]
+        return np.where(((begun >= 0) & (begun <= k))[:, None], self.map_error[vehicle], 0.0)
 
 
 def altered(
@@ -253,6 +260,7 @@ def interference_of(
     begun = view("lie_tick")[world]
     lies = (begun >= 0) & (k >= begun)
     old = np.where(fault["lie"] == REPLAY, fault["lie_replay"], 0).astype(np.int64)
+    landmarks = slice(model.landmarks)
     return Interference(
         shift=np.array(view("broadcast_shift")[world], dtype=float),
         turn=np.array(view("broadcast_turn")[world], dtype=float),
@@ -262,6 +270,8 @@ def interference_of(
         restarts=view("restart_tick")[world] == k,
         kept=old,
         consistent=fault["lie_consistent"].astype(bool),
+        map_error=np.array(view("map_error")[world, :, landmarks], dtype=float),
+        map_tick=view("map_tick")[world, :, landmarks].astype(np.int64),
     )
 
 

@@ -84,9 +84,11 @@ class Sensed(Measurements):
     messages: Mapping[tuple[int, int], Received] = field(default_factory=dict)
     """(receiver, sender) to a message that arrived since the last tick from a vehicle that is estimated elsewhere."""
 
-    def tick(self, setup: Setup, messages: Mapping[int, Received]) -> Tick:
-        """Return the read-only tick of one vehicle with its messages."""
-        i = setup.vehicle
+    def tick(self, setup: Setup, messages: Mapping[int, Received], interference: "Interference | None" = None) -> Tick:
+        """Return the read-only tick of one vehicle with its messages, and with the errors of its map."""
+        i, landmarks = setup.vehicle, self.landmarks
+        if interference is not None:
+            landmarks = sealed(landmarks + interference.map_error_of(i, self.index))
         return Tick(
             index=self.index,
             time=self.index * self.dt if self.time is None else self.time,
@@ -98,7 +100,7 @@ class Sensed(Measurements):
             targets=sealed(setup.targets[:]),
             bearings=sealed(self.bearings[i].take(setup.targets, axis=0)),
             valid=sealed(self.visible[i].take(setup.targets)),
-            landmarks=self.landmarks,
+            landmarks=landmarks,
             messages=messages,
             lever_arm=sealed(setup.lever_arm[:]),
             noise=setup.noise.moving(self.velocity[i], self.angular_velocity[i]),

@@ -151,7 +151,7 @@ def _play(group: ObserverGroup, recording: Recording) -> Iterator[tuple[int, int
         sensed = recording.at(k)
         faults = None if recording.interference is None else recording.interference.at(k)
         if group.joint:
-            for i, answer in enumerate(group.update_all(sensed)):
+            for i, answer in enumerate(group.update_all(sensed, faults)):
                 yield k, i, answer
         else:
             for i in recording.order:

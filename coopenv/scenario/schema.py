@@ -278,6 +278,12 @@ def _problems(s: Scenario) -> Iterator[str]:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
     if s.action.pan is not None and s.cosimulator is not None:
         yield f"action.pan: cameras of vehicles of {s.cosimulator.title} do not turn"
+    parts = {"faults": s.faults, **{f"vehicles.{i}.faults": v.faults for i, v in enumerate(s.vehicles) if v.faults}}
+    marks = [landmark.name for landmark in s.landmarks]
+    for where, faults in parts.items():
+        mark = faults.map_error.landmark
+        if mark is not None and mark not in marks:
+            yield f"{where}.map_error.landmark: unknown landmark {shown(mark)}{suggest(mark, marks)}"
     yield from _beyond_limits(s)
 
 

@@ -270,7 +270,7 @@ class Lie(Section):
     offset: NonNegative = 5.0
     """Of `jump` and `collude`, m."""
     turn: NonNegative = 0.0
-    """Of `jump` and `collude`: about its own z axis, added to its attitude, rad."""
+    """Of all but `replay`: about its own z axis, added to its attitude, rad."""
     odometry: Literal["consistent", "honest"] = "consistent"
     """Whether the odometry in its messages, if they have one, leads where the lie does or where the vehicle drives."""
     speed: Positive = 0.05
@@ -283,8 +283,48 @@ class Lie(Section):
     """What it claims to know its pose by, rad and m (default: its honest covariance)."""
 
 
+class MapError(Section):
+    """Landmarks whose place on a vehicle's map is wrong; a wrong entry is the same on all maps that have it."""
+
+    chance: Probability = 0.0
+    """That an entry is wrong in an episode, drawn per landmark."""
+    landmark: str | None = Field(default=None, max_length=64)
+    """Name of the landmark (default: any may be wrong)."""
+    offset: NonNegative = 1.0
+    """Of the place on the map from the true one, m."""
+    offset_spread: NonNegative = 0.0
+    """So much more at most, drawn uniformly, m."""
+    direction: Direction | None = None
+    """Of the offset, map axes, of any length (default: horizontal, drawn per landmark)."""
+    start: NonNegative = 0.0
+    """From when on, s; the place is right before."""
+    start_spread: NonNegative = 0.0
+    """So much later at most, drawn uniformly per landmark, s."""
+
+
+class Jammer(Section):
+    """A jammer that the vehicle carries: receivers in its range lose all messages, its own receiver too."""
+
+    chance: Probability = 0.0
+    """That the vehicle has one in an episode."""
+    range: Positive | None = None
+    """m (none: unlimited)."""
+    position: Vector3 | None = None
+    """Fixed place of the jammer, m (default: it moves with the vehicle)."""
+    start: NonNegative = 0.0
+    """From when on, s."""
+    start_spread: NonNegative = 0.0
+    """So much later at most, drawn uniformly, s."""
+    duration: Positive | None = None
+    """s (none: to the end)."""
+    period: Positive = 1.0
+    """Of a periodic jammer, s."""
+    duty: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    """Share of each period in which it jams, from the period's start on; 1: a constant jammer."""
+
+
 class Faults(Section):
-    """What goes wrong with a vehicle's computer, clock and messages."""
+    """What goes wrong with a vehicle's computer, clock, map and messages."""
 
     clock_offset: NonNegative = 0.0
     """Standard deviation of what the vehicle's clock is off by, s. Messages seem older or newer by the difference of
@@ -292,6 +332,8 @@ class Faults(Section):
     restart: Restart = Restart()
     corruption: Corruption = Corruption()
     lie: Lie = Lie()
+    map_error: MapError = MapError()
+    jammer: Jammer = Jammer()
 
     @property
     def alters(self) -> bool:
@@ -301,4 +343,5 @@ class Faults(Section):
     @property
     def any(self) -> bool:
         """Whether anything may go wrong."""
-        return self.alters or self.clock_offset > 0.0 or self.restart.chance > 0.0
+        chances = self.restart.chance, self.map_error.chance, self.jammer.chance
+        return self.alters or self.clock_offset > 0.0 or max(chances) > 0.0

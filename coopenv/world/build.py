@@ -100,8 +100,8 @@ def _groups(scenario: Scenario) -> dict[str, Any]:
 
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
     """Return the values of the model's `FaultValues`."""
-    restart, corruption, lie = f.restart, f.corruption, f.lie
-    direction = np.zeros(3) if lie.direction is None else np.array(lie.direction) / np.linalg.norm(lie.direction)
+    restart, corruption, lie, wrong, jammer = f.restart, f.corruption, f.lie, f.map_error, f.jammer
+    marks = [mark.name for mark in scenario.landmarks]
     return {
         "clock": f.clock_offset,
         "restart_chance": restart.chance,
@@ -115,13 +115,35 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
         "lie_chance": lie.chance,
         "lie_start": lie.start,
         "lie_spread": lie.start_spread,
-        "lie_size": lie.speed if lie.kind == "drift" else lie.offset,
+        "lie_offset": lie.offset if lie.kind in ("jump", "collude") else 0.0,
+        "lie_speed": lie.speed if lie.kind == "drift" else 0.0,
         "lie_replay": scenario.ticks_of_replay(lie.age),
-        "lie_direction": direction,
+        "lie_direction": _unit(lie.direction),
         "lie_std": lie.std or 0.0,
         "lie_turn": lie.turn,
         "lie_consistent": int(lie.kind != "none" and lie.odometry == "consistent"),
+        "map_chance": wrong.chance,
+        "map_landmark": -1 if wrong.landmark is None else marks.index(wrong.landmark),
+        "map_offset": wrong.offset,
+        "map_offset_spread": wrong.offset_spread,
+        "map_direction": _unit(wrong.direction),
+        "map_start": wrong.start,
+        "map_spread": wrong.start_spread,
+        "jammer_chance": jammer.chance,
+        "jammer_start": jammer.start,
+        "jammer_spread": jammer.start_spread,
+        "jammer_duration": math.inf if jammer.duration is None else jammer.duration,
+        "jammer_period": jammer.period,
+        "jammer_duty": jammer.duty,
+        "jammer_range": math.inf if jammer.range is None else jammer.range,
+        "jammer_fixed": jammer.position is not None,
+        "jammer_position": np.array(jammer.position or NOWHERE) - scenario.map.origin,
     }
+
+
+def _unit(direction: tuple[float, float, float] | None) -> np.ndarray:
+    """Return a direction with length 1; zero for None."""
+    return np.zeros(3) if direction is None else np.array(direction) / np.linalg.norm(direction)
 
 
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
@@ -254,6 +276,8 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "clocks": any(f.clock_offset > 0.0 for f in faults),
         "restarts": any(f.restart.chance > 0.0 for f in faults),
         "alters": any(f.alters for f in faults),
+        "map_errors": any(f.map_error.chance > 0.0 for f in faults),
+        "jammers": any(f.jammer.chance > 0.0 for f in faults),
     }
 
 

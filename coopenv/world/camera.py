@@ -37,6 +37,17 @@ def marker_position(model: Any, state: Any, world: int, agent: int):
 
 
 @wp.func
+def mapped_position(model: Any, state: Any, world: int, vehicle: int, landmark: int):
+    """Return where a landmark's visible point is on a vehicle's map at the next tick, see the fault `map_error`."""
+    point = marker_position(model, state, world, landmark)
+    if model.map_errors == 1:
+        begun = state.map_tick[world, vehicle, landmark]
+        if begun >= 0 and state.tick[world] + 1 >= begun:
+            point += state.map_error[world, vehicle, landmark]
+    return point
+
+
+@wp.func
 def camera_to_body(model: Any, state: Any, world: int, vehicle: int):
     """Return the rotation of a vehicle's camera in its body, as the vehicle knows it."""
     R = model.camera[vehicle].rotation

@@ -266,12 +266,29 @@ def model_struct(p: Precision) -> Any:
         lie_chance: scalar
         lie_start: scalar  # s
         lie_spread: scalar  # s
-        lie_size: scalar  # m, or m/s of a drift
+        lie_offset: scalar  # m
+        lie_speed: scalar  # m/s
         lie_replay: wp.int32  # ticks by which messages are old
         lie_direction: vec3  # of length 1; zero: drawn
         lie_std: scalar  # claimed, rad and m; 0: honest
         lie_turn: scalar  # rad
         lie_consistent: wp.int32  # whether the odometry in messages leads where the lie does
+        map_chance: scalar
+        map_landmark: wp.int32  # that is off; -1: any
+        map_offset: scalar  # m
+        map_offset_spread: scalar  # m
+        map_direction: vec3  # of length 1; zero: drawn
+        map_start: scalar  # s
+        map_spread: scalar  # s
+        jammer_chance: scalar
+        jammer_start: scalar  # s
+        jammer_spread: scalar  # s
+        jammer_duration: wp.float64  # s
+        jammer_period: wp.float64  # s
+        jammer_duty: wp.float64
+        jammer_range: scalar  # m
+        jammer_fixed: wp.int32  # 1: it stands at `jammer_position`, 0: on its vehicle
+        jammer_position: vec3  # m
 
     @wp.struct
     class ObserverValues:
@@ -337,6 +354,8 @@ def model_struct(p: Precision) -> Any:
         clocks: wp.int32  # 1: some clock is off
         restarts: wp.int32  # 1: some vehicle may restart
         alters: wp.int32  # 1: some broadcast pose may differ from its sender's estimate
+        map_errors: wp.int32  # 1: a landmark may be off on some map
+        jammers: wp.int32  # 1: some vehicle may carry a jammer
         radio: Radio
         observer: ObserverValues
         judgement: Judgement

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, identity3, join6, quaternion_vector, skew, smallest_eigenvalue6
-from coopenv.world.camera import VISIBLE, body_bearing, marker_position
+from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
@@ -72,9 +72,9 @@ def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: 
 
 @device_function
 def known_position(model: Any, state: Any, world: int, vehicle: int, target: int):
-    """Return where a target is: a landmark's known place, or a neighbour's message (Rhat_j phat_j)."""
+    """Return where a target is: a landmark's place on the map, or a neighbour's message (Rhat_j phat_j)."""
     if target < model.landmarks:
-        return marker_position(model, state, world, target)
+        return mapped_position(model, state, world, vehicle, target)
     sender = target - model.landmarks
     R = state.inbox_rotation[world, vehicle, sender]
     return state.inbox_position[world, vehicle, sender] + R * model.scene.marker[target]

@@ -43,6 +43,8 @@ CLOCK = wp.constant(wp.uint32(41))
 RESTART = wp.constant(wp.uint32(42))
 LIE = wp.constant(wp.uint32(43))
 CORRUPTION = wp.constant(wp.uint32(44))
+MAP_ERROR = wp.constant(wp.uint32(46))
+JAMMER = wp.constant(wp.uint32(47))
 """Where six numbers are drawn, the next stream gives the second half."""
 
 

@@ -279,7 +279,11 @@ def state_struct(p: Precision) -> Any:
         clock: array("WN", wp.int32, whole(-(10**8), 10**8))  # truth: ticks by which a vehicle's clock is ahead
         restart_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # before which its observer restarts; -1: never
         lie_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # from which on its messages are lies; -1: never
-        lie_vector: array("WN", vec3)  # of its lie, m or m/s, map
+        lie_offset: array("WN", vec3)  # of its lie at that tick, m, map
+        lie_velocity: array("WN", vec3)  # at which the offset grows from that tick on, m/s, map
+        jammer_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # from which on its jammer is on; -1: never
+        map_tick: array("WNA", wp.int32, whole(-1, 2**31 - 1))  # from which on its map is wrong there; -1: never
+        map_error: array("WNA", vec3)  # of a landmark's place on its map, m
         broadcast_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
         broadcast_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
@@ -322,8 +326,8 @@ def state_struct(p: Precision) -> Any:
 
 LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
 """Fields with the true errors of a vehicle's sensors, see `coopenv.world.odometry`; beside `camera_focal`."""
-FAULTS = ("clock", "restart_tick", "lie_tick")
-"""Fields with what goes wrong with a vehicle's clock, computer and messages, see `coopenv.world.v2x`."""
+FAULTS = ("clock", "restart_tick", "lie_tick", "jammer_tick", "map_tick", "map_error")
+"""Fields with what goes wrong with a vehicle's clock, computer, messages and map, see `coopenv.world.v2x`."""
 
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:

@@ -1,7 +1,7 @@
 """V2X: pose estimates travel with delay, period, loss and limited range; faults change what is sent.
 
-Faults of computers, clocks and messages are drawn at a reset. With all of them off, nothing is drawn and nothing is
-changed. A message has two times besides that of its sending: that of its content (`content_tick`, earlier where the
+Faults of computers, clocks, maps and messages are drawn at a reset. With all of them off, nothing is drawn and nothing
+is changed. A message has two times besides that of its sending: that of its content (`content_tick`, earlier where the
 sender replays) and its time stamp (`stamp`), wrong by the clocks' offsets.
 """
 
@@ -10,12 +10,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6
-from coopenv.estimation.outcomes import COLLUDE, DRIFT, HONEST, JUMP, REPLAY
-from coopenv.world.camera import marker_position
+from coopenv.estimation.outcomes import COLLUDE, HONEST, REPLAY
+from coopenv.world.camera import mapped_position
 from coopenv.world.random import (
     CLOCK,
     CORRUPTION,
+    JAMMER,
     LIE,
+    MAP_ERROR,
     RADIO,
     RESTART,
     V2X_LOSS,
@@ -38,7 +40,9 @@ def draw_faults(model: Any, state: Any, world: int, vehicle: int):
     state.clock[world, vehicle] = 0
     state.restart_tick[world, vehicle] = NEVER
     state.lie_tick[world, vehicle] = NEVER
-    state.lie_vector[world, vehicle] = o
+    state.lie_offset[world, vehicle] = o
+    state.lie_velocity[world, vehicle] = o
+    state.jammer_tick[world, vehicle] = NEVER
     state.broadcast_shift[world, vehicle] = o
     state.broadcast_turn[world, vehicle] = o
     if model.clocks == 1:
@@ -47,6 +51,31 @@ def draw_faults(model: Any, state: Any, world: int, vehicle: int):
         draw_restart(model, state, world, vehicle, o)
     if model.fault[vehicle].lie != HONEST:
         draw_lie(model, state, world, vehicle, o)
+    if model.jammers == 1:
+        draw_jammer(model, state, world, vehicle, o)
+    for landmark in range(model.landmarks):
+        state.map_tick[world, vehicle, landmark] = NEVER
+        state.map_error[world, vehicle, landmark] = o
+        if model.map_errors == 1:
+            draw_map_error(model, state, world, vehicle, landmark, o)
+
+
+@wp.func
+def first_tick_of(model: Any, start: Any, spread: Any, word: wp.uint32) -> int:
+    """Return the first tick of a fault that begins at `start`, or at most `spread` later, both in s."""
+    time = wp.float64(start + spread * uniform(word, type(start)(1.0)))
+    ticks = wp.min(time * model.camera_rate, wp.float64(model.horizon_ticks) + wp.float64(1.0))
+    return int(wp.ceil(ticks - wp.float64(1.0e-6)))
+
+
+@wp.func
+def drawn_direction(given: Any, word: wp.uint32):
+    """Return a direction of length 1: the given one, or a horizontal one that is drawn if that is zero."""
+    direction = given
+    if wp.length_sq(given) == given.dtype(0.0):
+        angle = given.dtype(6.283185307179586) * uniform(word, given.dtype(1.0))
+        direction = type(given)(wp.cos(angle), wp.sin(angle), given.dtype(0.0))
+    return direction
 
 
 @wp.func
@@ -74,20 +103,37 @@ def draw_restart(model: Any, state: Any, world: int, vehicle: int, o: Any):
 
 @wp.func
 def draw_lie(model: Any, state: Any, world: int, vehicle: int, o: Any):
-    """Draw from which tick a vehicle lies, and what it adds to its position, m or m/s; of all that collude the same."""
+    """Draw from which tick a vehicle lies, and what it adds to its position; of all that collude the same."""
     fault = model.fault[vehicle]
-    one = o.dtype(1.0)
     subject = wp.where(fault.lie == COLLUDE, model.vehicles, vehicle)
     words = random_words(state.seed[world], state.episode[world], 0, subject, LIE)
-    if uniform(words[0], one) < fault.lie_chance:
-        time = wp.float64(fault.lie_start + fault.lie_spread * uniform(words[1], one))
-        ticks = wp.min(time * model.camera_rate, wp.float64(model.horizon_ticks) + wp.float64(1.0))
-        state.lie_tick[world, vehicle] = int(wp.ceil(ticks - wp.float64(1.0e-6)))
-        direction = fault.lie_direction
-        if wp.length_sq(direction) == o[0]:
-            angle = o.dtype(6.283185307179586) * uniform(words[2], one)
-            direction = type(o)(wp.cos(angle), wp.sin(angle), o[0])
-        state.lie_vector[world, vehicle] = fault.lie_size * direction
+    if uniform(words[0], o.dtype(1.0)) < fault.lie_chance:
+        state.lie_tick[world, vehicle] = first_tick_of(model, fault.lie_start, fault.lie_spread, words[1])
+        direction = drawn_direction(fault.lie_direction, words[2])
+        state.lie_offset[world, vehicle] = fault.lie_offset * direction
+        state.lie_velocity[world, vehicle] = fault.lie_speed * direction
+
+
+@wp.func
+def draw_jammer(model: Any, state: Any, world: int, vehicle: int, o: Any):
+    """Draw from which tick a vehicle's jammer is on."""
+    fault = model.fault[vehicle]
+    words = random_words(state.seed[world], state.episode[world], 0, vehicle, JAMMER)
+    if uniform(words[0], o.dtype(1.0)) < fault.jammer_chance:
+        state.jammer_tick[world, vehicle] = first_tick_of(model, fault.jammer_start, fault.jammer_spread, words[1])
+
+
+@wp.func
+def draw_map_error(model: Any, state: Any, world: int, vehicle: int, landmark: int, o: Any):
+    """Draw from which tick a landmark is off on a vehicle's map, and by how much; the same for all vehicles."""
+    fault = model.fault[vehicle]
+    one = o.dtype(1.0)
+    words = random_words(state.seed[world], state.episode[world], 0, landmark, MAP_ERROR)
+    concerned = fault.map_landmark < 0 or fault.map_landmark == landmark
+    if concerned and uniform(words[0], one) < fault.map_chance:
+        offset = fault.map_offset + fault.map_offset_spread * uniform(words[3], one)
+        state.map_tick[world, vehicle, landmark] = first_tick_of(model, fault.map_start, fault.map_spread, words[1])
+        state.map_error[world, vehicle, landmark] = offset * drawn_direction(fault.map_direction, words[2])
 
 
 @wp.func
@@ -106,12 +152,10 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
     turn = type(shift)()
     one = shift.dtype(1.0)
     if is_lying(state, world, vehicle, tick):
-        if fault.lie == JUMP or fault.lie == COLLUDE:
-            shift = state.lie_vector[world, vehicle]
+        since = wp.float64(tick - state.lie_tick[world, vehicle]) * model.camera_period
+        shift = state.lie_offset[world, vehicle] + state.lie_velocity[world, vehicle] * shift.dtype(since)
+        if fault.lie != REPLAY:
             turn[2] = fault.lie_turn
-        if fault.lie == DRIFT:
-            since = wp.float64(tick - state.lie_tick[world, vehicle]) * model.camera_period
-            shift = state.lie_vector[world, vehicle] * shift.dtype(since)
     if fault.corruption > one - one and wp.float64(tick) * model.camera_period >= wp.float64(fault.corruption_start):
         words = random_words(state.seed[world], state.episode[world], tick, vehicle, CORRUPTION)
         if uniform(words[3], one) < fault.corruption:
@@ -189,7 +233,7 @@ def forget_everything(model: Any, state: Any, world: int, vehicle: int):
     i3 = identity3(o)
     middle = type(o)()
     for landmark in range(model.landmarks):
-        middle += marker_position(model, state, world, landmark) / o.dtype(model.landmarks)
+        middle += mapped_position(model, state, world, vehicle, landmark) / o.dtype(model.landmarks)
     state.estimate_rotation[world, vehicle] = i3
     state.estimate_position[world, vehicle] = middle
     none = i3 - i3
@@ -259,6 +303,8 @@ def transmit(model: Any, state: Any, world: int, tick: int):
         here = state.position[world, model.landmarks + receiver]
         for sender in range(model.vehicles):
             state.arriving[world, receiver, sender] = -1
+        if is_jammed(model, state, world, here, tick):
+            continue
         for n in range(model.target_count[receiver]):
             sender = model.targets[receiver, n] - model.landmarks
             if sender >= 0:
@@ -270,6 +316,27 @@ def transmit(model: Any, state: Any, world: int, tick: int):
                 if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
                     if not is_lost(model, state, world, receiver, sender, tick):
                         state.arriving[world, receiver, sender] = due
+
+
+@device_function
+def is_jammed(model: Any, state: Any, world: int, place: Any, tick: int) -> bool:
+    """Return whether a receiver at a place is in the range of a jammer that is on at a tick."""
+    if model.jammers == 0:
+        return False
+    for vehicle in range(model.vehicles):
+        fault = model.fault[vehicle]
+        begun = state.jammer_tick[world, vehicle]
+        if begun >= 0 and tick >= begun:
+            since = wp.float64(tick - begun) * model.camera_period + wp.float64(1.0e-9)
+            share = since / fault.jammer_period
+            on = since < fault.jammer_duration and share - wp.floor(share) < fault.jammer_duty
+            source = fault.jammer_position
+            if fault.jammer_fixed == 0:
+                source = state.position[world, model.landmarks + vehicle]
+                on = on and state.present[world, model.landmarks + vehicle] != 0
+            if on and not wp.length(source - place) > fault.jammer_range:
+                return True
+    return False
 
 
 @device_function

@@ -124,6 +124,21 @@ class World:
                 column[worlds] = np.where(np.isnan(given), NOT_SET, given)[worlds]
         self.state.parameter_set.assign(factors)
 
+    def steer_lies(self, velocity: np.ndarray) -> None:
+        """Continue the lies that have begun, from their present offset on, at another velocity.
+
+        Args:
+            velocity: (W, N, 3) at which the offset of broadcast positions grows, m/s, map axes; rows of vehicles that
+                do not lie now are not read. See the fault `lie` for the offset's start.
+        """
+        s = self.state
+        now, begun = s.tick.numpy()[:, None], s.lie_tick.numpy()
+        lies, before = ((begun >= 0) & (begun <= now))[..., None], s.lie_velocity.numpy()
+        grown = before * (now - begun)[..., None] * self.model.camera_period
+        s.lie_offset.assign(s.lie_offset.numpy() + np.where(lies, grown, 0.0))
+        s.lie_velocity.assign(np.where(lies, velocity, before))
+        s.lie_tick.assign(np.where(lies[..., 0], now, begun))
+
     def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
 

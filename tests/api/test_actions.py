@@ -50,13 +50,3 @@ def test_out_of_range_is_clipped() -> None:
     far = a.step({agent: np.array([7.0, -9.0]) for agent in a.agents})
     edge = b.step({agent: np.array([1.0, -1.0]) for agent in b.agents})
     assert all(np.array_equal(far[0][agent], edge[0][agent]) for agent in far[0])
-
-
-def test_prescribed_motion_ignores_actions() -> None:
-    env = coopenv.parallel_env("busy_intersection")
-    runs = []
-    for value in (-1.0, 1.0):
-        env.reset(seed=2)
-        runs.append([env.step({agent: np.full(2, value) for agent in env.agents})[0] for _ in range(5)])
-    for a, b in zip(*runs, strict=True):
-        assert all(np.array_equal(a[agent], b[agent]) for agent in a)

@@ -37,7 +37,7 @@ EXCEPTIONS = {
     "urban_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
 }
 """Fields with an entry that hardly varies, and why it is there."""
-TIMES = {"behind_truck": 4}  # as many worlds
+TIMES = {"behind_truck": 6}  # as many worlds
 
 
 class Run(NamedTuple):
@@ -69,9 +69,9 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 @cache
 def run(name: str, driver: str, times: int = 1) -> Run:
-    """Drive all vehicles in 24 worlds or `times` as many."""
+    """Drive all vehicles in 16 worlds or `times` as many."""
     vehicles = len(KNOWN[name].vehicles)
-    worlds = times * (24 if vehicles <= 4 else 48 // vehicles)
+    worlds = times * (16 if vehicles <= 4 else 32 // vehicles)
     envs = coopenv.make_vec(name, num_worlds=worlds, autoreset="disabled")
     engine, policy = envs.engine, drivers(envs.scenario)[driver]
     term = engine.reward_terms.index("position_uncertainty")

@@ -139,7 +139,7 @@ def test_it_passes_the_official_test(make: Make) -> None:
     env = make()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parallel_api_test(env, num_cycles=20)
+        parallel_api_test(env, num_cycles=10)
     env.close()
 
 

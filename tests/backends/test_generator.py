@@ -16,7 +16,7 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.backends.base import VehicleBroadcast
-from coopenv.observers import Message, Received, register, run
+from coopenv.observers import Message, Received, register, registry, run
 from coopenv.observers.recording import Sensed, check_recording
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.policies import load_policy
@@ -181,7 +181,9 @@ def test_what_is_not_known_of_the_truth_stays_out() -> None:
     assert np.isfinite(env.state()).all() and env.health.missing > 0
 
 
-def test_it_is_stopped_by_whatever_goes_wrong_and_by_closing() -> None:
+def test_it_is_stopped_by_whatever_goes_wrong_and_by_closing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+
     class Failing(DeadReckoning):
         def update(self, tick: Any) -> Any:
             raise ZeroDivisionError("no gain")

@@ -113,7 +113,7 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
     moving, still = tmp_path / "moving.toml", tmp_path / "still.toml"
     for path, motion in ((moving, 'kind = "constant", linear = [1, 0, 0]'), (still, 'kind = "static"')):
         path.write_text(
-            'title = "Straight on"\nhorizon = 2.0\nobserver.name = "dead_reckoning"\n'
+            'title = "Straight on"\nhorizon = 2.0\nobserver.name = "riccati"\n'
             'landmarks = [{ name = "sign", position = [1, 2, 3] }]\n'
             f"[[vehicles]]\ninitial_pose = {{ position = [0, 0, 0] }}\nmotion = {{ {motion} }}\n"
         )
@@ -125,7 +125,7 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
     with Image.open(out / "moving.webp") as film:
         assert film.n_frames == 13  # 2 s at 6 pictures a second, and the first
     text = (out / "moving.md").read_text(encoding="utf-8")
-    assert "](moving.webp)" in text and "estimated by `dead_reckoning`" in text and "driven by" not in text
+    assert "](moving.webp)" in text and "estimated by `riccati`" in text and "driven by" not in text
     assert ".webp" not in (out / "still.md").read_text(encoding="utf-8")
     before = (out / "moving.webp").stat().st_mtime_ns
     assert main(["page", str(moving), "--no-film", "--out", str(out)]) == 0

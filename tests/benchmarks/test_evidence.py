@@ -24,9 +24,10 @@ def changed(recording: Recording, change: evidence.Change) -> Recording:
 
 def test_a_landmark_is_moved_in_the_map_alone(recording: Recording) -> None:
     moved = changed(recording, evidence.landmark_moved(0.3))
-    np.testing.assert_allclose(
-        np.linalg.norm(moved.landmarks - recording.landmarks, axis=-1), [[0.0, 0.3, 0.0]] * recording.ticks, atol=1e-12
-    )
+    assert moved.interference is not None
+    for vehicle, k in ((0, 0), (4, recording.ticks - 1)):
+        error = moved.interference.map_error_of(vehicle, k)
+        np.testing.assert_allclose(error, [[0.0, 0.0, 0.0], [0.24, 0.18, 0.0], [0.0, 0.0, 0.0]], atol=1e-12)
     assert moved.bearings is recording.bearings
 
 

@@ -111,17 +111,32 @@ def test_a_change_of_what_a_function_uses_is_noticed(tmp_path: Path, monkeypatch
     assert len(list((tmp_path / "package" / "__pycache__").glob("compiled-*"))) == 1
 
 
-def test_damaged_machine_code_is_made_anew(tmp_path: Path) -> None:
-    head = "from coopenv.estimation.compiled import NUMBER, compiled\n"
-    (tmp_path / "doubled.py").write_text(head + "@compiled(NUMBER)\ndef double(x):\n    return 2.0 * x\n")
-    modules = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    show = "from doubled import double; print(double(2.0))"
-    for _ in range(2):
-        assert output(show, PYTHONPATH=modules, NUMBA_CACHE_DIR=str(tmp_path / "cache")) == ["4.0"]
+def test_damaged_machine_code_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
+    for times in (1, 2):
+
+        @compiled.compiled(compiled.NUMBER)
+        def doubled(x: float) -> float:
+            return 2.0 * x
+
+        assert doubled(2.0) == 4.0 and compiled.fresh[-times:] == times * ["doubled"]
         kept = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
         assert kept
         for path in kept:
             path.write_bytes(path.read_bytes()[:20])
+
+
+def test_one_process_compiles_and_none_waits_for_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    locked: list[Path] = []
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "lock", lambda folder, wait: locked.append(folder))
+    for _ in range(2):
+
+        @compiled.compiled(compiled.NUMBER)
+        def halved(x: float) -> float:
+            return 0.5 * x
+
+        assert halved(2.0) == 1.0 and locked == [tmp_path]
 
 
 def test_functions_run_as_python_where_compilation_is_off() -> None:

@@ -11,7 +11,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
-from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, Calls
+from tests.helpers.warp_calls import DTYPES, EPSILON, Calls
 
 ANGLES = np.concatenate(
     [
@@ -95,17 +95,16 @@ def test_angle_between_near_rotations() -> None:
         assert_allclose(between, angle, atol=1e-14 if angle < 1 else 1e-12, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_quaternion_vector_near_half_turns(dtype: str) -> None:
+def test_quaternion_vector_near_half_turns() -> None:
     angles = np.concatenate([ANGLES, 2 * np.arccos([0.1 + 1e-9, 0.1 - 1e-9, 0.09, 0.11])])
     w, angle = turns(angles)
     expected = np.sin(angle / 2)[:, None] * w / np.where(angle > 0, angle, 1.0)[:, None]
-    lam = call(linalg.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix())
+    lam = call(linalg.quaternion_vector, "float64", Rotation.from_rotvec(w).as_matrix())
     sign = np.ones(len(w))
-    tiny = angle > np.pi - 20 * EPSILON[dtype]  # the two signs are one rotation there
+    tiny = angle > np.pi - 20 * EPSILON["float64"]  # the two signs are one rotation there
     sign[tiny] = np.where((lam * expected).sum(axis=1)[tiny] < 0, -1.0, 1.0)
-    assert_allclose(sign[:, None] * lam, expected, atol=12 * EPSILON[dtype])
-    assert tiny.mean() < 0.1 if dtype == "float64" else tiny.mean() < 0.4
+    assert_allclose(sign[:, None] * lam, expected, atol=12 * EPSILON["float64"])
+    assert tiny.mean() < 0.1
 
 
 @given(st.tuples(component, component, component, component))
@@ -120,12 +119,11 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
     assert near < 1e-14
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_orthonormalise_removes_the_first_order(dtype: str) -> None:
+def test_orthonormalise_removes_the_first_order() -> None:
     rng = np.random.default_rng(2)
     R = Rotation.random(100, rng).as_matrix()
     dent = 1e-4 * rng.uniform(-1, 1, (100, 3, 3))
-    mended = call(linalg.orthonormalise, dtype, R + dent)
+    mended = call(linalg.orthonormalise, "float64", R + dent)
     gram = np.swapaxes(mended, 1, 2) @ mended - np.eye(3)
     assert np.abs(gram).max() < 5e-7
     u, _, vt = np.linalg.svd(R + dent)

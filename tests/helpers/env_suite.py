@@ -62,11 +62,11 @@ def official_tests(make: Make) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         if any(vehicle.presence < 1.0 for vehicle in make().scenario.vehicles):
-            parallel_api_test(make(overrides={"vehicles.*.presence": 1.0}), num_cycles=40)
+            parallel_api_test(make(overrides={"vehicles.*.presence": 1.0}), num_cycles=20)
             # Who is not there does not end either.
             warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
-        parallel_api_test(make(), num_cycles=40)
-        api_test(parallel_to_aec(make()), num_cycles=60)
+        parallel_api_test(make(), num_cycles=20)
+        api_test(parallel_to_aec(make()), num_cycles=40)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # PettingZoo advises against Dict observations
         api_test(parallel_to_aec(make(observation="dict")), num_cycles=20)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 ORIGIN = 1248444187.0
-LEAD_S = 0.2
 LANDMARKS = {6: (0.0, 4.0), 7: (4.0, 0.0), 8: (-4.0, 0.0), 9: (0.0, -4.0), 10: (3.0, 3.0)}
 BARCODES = {subject: 100 + 3 * subject for subject in range(1, 21)}
 HEADER = (

@@ -13,8 +13,7 @@ from coopenv.world.launch import start_warp
 from coopenv.world.warp_internals import scalar_of
 
 DTYPES = ("float64", "float32")
-WIDE = ("float64",)
-"""Of what a file holds against an oracle one test takes both precisions, the others this one."""
+"""Of what a file holds against an oracle one test takes both precisions, the others float64."""
 EPSILON = {"float64": np.finfo(np.float64).eps, "float32": np.finfo(np.float32).eps}
 WHOLE = {"b": wp.bool, "i": wp.int32, "u": wp.uint32, "U": wp.uint64, "u4": wp.types.vector(4, wp.uint32)}
 

@@ -16,7 +16,7 @@ from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors,
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.oracles.batch import assert_same_covariance, small_errors, small_record, solve
+from tests.oracles.batch import assert_same_covariance, small_errors, small_record, small_solution
 
 
 def transitions(made: Recording) -> np.ndarray:
@@ -25,14 +25,14 @@ def transitions(made: Recording) -> np.ndarray:
 
 def test_joint_bound_is_the_batch_solution_s_covariance() -> None:
     made = small_record(3)
-    _, _, covariance = solve(made, range(5))
+    _, _, covariance = small_solution(3)
     assert_same_covariance(cramer_rao(made).covariance[-1], covariance)
 
 
 def test_alone_and_with_others() -> None:
     """Vehicle 1 knows its neighbours: alone it is bounded by its own batch, and its followers can only help."""
     made = small_record(3)
-    _, _, covariance = solve(made, [0])
+    _, _, covariance = small_solution(3, (0,))
     alone, joint = cramer_rao(made, joint=False), cramer_rao(made)
     assert_allclose(alone.position[-1, 0], np.sqrt(np.trace(covariance[0, 3:, 3:])), rtol=1e-3)
     assert (joint.position[1:, 0] < alone.position[1:, 0]).all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers import Coordinates, Recording, Run, SensorNoise, Tick, run
+from coopenv.observers import Coordinates, Run, SensorNoise, Tick, run
 from coopenv.observers.bearing_measurements import (
     LEFT,
     RIGHT,
@@ -27,7 +26,7 @@ from coopenv.observers.covariance_intersection import CovarianceIntersection, be
 from coopenv.observers.registry import find
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.oracles.batch import assert_same_covariance, small_record, solve
+from tests.oracles.batch import assert_same_covariance, small_record, small_solution
 
 STATES = {Coordinates.LEFT: LEFT, Coordinates.RIGHT: RIGHT}
 
@@ -152,11 +151,6 @@ def test_joseph_update_is_the_information_form() -> None:
     assert_allclose(dx, np.linalg.solve(information, H.T @ np.linalg.solve(N, r)), atol=1e-12)
 
 
-@cache
-def short() -> Recording:
-    return small_record()
-
-
 LEADERS = [
     "mekf",
     "mekf_covariance",
@@ -181,14 +175,14 @@ def left_covariance(result: Run, vehicle: int) -> np.ndarray:
 
 
 def assert_most_probable(name: str, vehicles: Sequence[int]) -> None:
-    R, p, covariance = solve(short(), vehicles)
-    result = run(name, short())
+    R, p, covariance = small_solution(4, tuple(vehicles))
+    result = run(name, small_record())
     assert not result.failure
     for i in vehicles:
         std = np.sqrt(np.diag(covariance[i]))
         e = Coordinates.LEFT.error(R[i], p[i], result.rotation[-1, i], result.position[-1, i])
         assert np.abs(e / std).max() < 0.01
-        start = Coordinates.LEFT.error(R[i], p[i], short().start_rotation[i], short().start_position[i])
+        start = Coordinates.LEFT.error(R[i], p[i], small_record().start_rotation[i], small_record().start_position[i])
         assert np.abs(start / std).max() > 0.1  # the measurements did something
         assert_same_covariance(left_covariance(result, i), covariance[i])
 
@@ -249,7 +243,7 @@ def test_an_exact_neighbour_is_taken_almost_whole_and_a_useless_one_left_out() -
 def test_a_leader_s_covariance_counts_as_it_should_while_nothing_is_correlated(name: str) -> None:
     """After one tick, a follower knows what the joint solution of leader and follower says of it."""
     made = small_record(1)
-    _, _, covariance = solve(made, [0, 1])
+    _, _, covariance = small_solution(1, (0, 1))
     assert_same_covariance(left_covariance(run(name, made), 1), covariance[1])
     naive = run("mekf", made).covariance[-1, 1]
     assert np.trace(naive) < 0.999 * np.trace(covariance[1])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -41,6 +42,7 @@ def small_errors(overrides: dict[str, object], size: float = 1e-4, turning: bool
     return scenario.model_copy(update={"vehicles": tuple(vehicles), "camera": camera})
 
 
+@cache
 def small_record(ticks: int = 4) -> Recording:
     """Return a short record with noise so small that second-order terms vanish, and a matching start covariance."""
     scenario = small_errors(
@@ -56,6 +58,14 @@ def small_record(ticks: int = 4) -> Recording:
     )
     made = record(scenario, 3)
     return replace(made, start_covariance=np.tile(np.eye(6) * 1e-8, (5, 1, 1)))
+
+
+@cache
+def small_solution(
+    ticks: int, vehicles: tuple[int, ...] = (0, 1, 2, 3, 4)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `solve` finds of a small record."""
+    return solve(small_record(ticks), vehicles)
 
 
 def solve(recording: Recording, vehicles: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

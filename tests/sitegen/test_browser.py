@@ -9,7 +9,6 @@ from urllib.parse import urlsplit
 import pytest
 
 pytestmark = pytest.mark.browser
-LOCAL = ("file:", "data:", "blob:")
 SIZES = {"laptop": (1280, 800), "phone": (390, 844)}
 CUT = """() => {
     const edge = window.innerWidth + 1, found = [];

@@ -261,7 +261,7 @@ def test_field_of_view_ends_at_walls() -> None:
     np.testing.assert_allclose(length, [[4.0, 8.0, 8.0, 8.0]])
 
 
-@pytest.mark.parametrize("backend", [None, "agg", "tkagg", "module://no_such_backend"])
+@pytest.mark.parametrize("backend", [None, "tkagg", "module://no_such_backend"])
 def test_show_without_a_display_is_silent(backend: str | None) -> None:
     script = (
         "import sys, matplotlib as mpl, numpy as np\n"

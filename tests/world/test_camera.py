@@ -17,7 +17,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.world import camera
 from coopenv.world.model import entry_struct, precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, WIDE, Calls
+from tests.helpers.warp_calls import DTYPES, Calls
 from tests.oracles import geometry, philox
 
 call = Calls(__name__, {camera.segment_hits_box: "3 3 1 33 3 3 > b"})
@@ -339,10 +339,9 @@ def bearings(noise: dict[str, Any], worlds: int = 200, ticks: int = 50, dtype: s
     return b, place / np.linalg.norm(place, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_isotropic_noise(dtype: str) -> None:
+def test_isotropic_noise() -> None:
     sigma = 0.005
-    b, true = bearings({"model": "isotropic", "scale": sigma}, dtype=dtype)
+    b, true = bearings({"model": "isotropic", "scale": sigma})
     assert_allclose(np.linalg.norm(b, axis=-1), 1.0, atol=1e-6)
     for j, t in enumerate(true):
         u = np.cross(t, [0.36, 0.48, 0.8])
@@ -376,7 +375,7 @@ def test_paper_noise_draw_by_draw(axis: tuple[float, float, float]) -> None:
     frame = paper_frame(np.array(axis))
     for tick, state in enumerate(states):
         for j, z in enumerate(place):
-            words = philox.philox4x32((tick, j, 6, 0), (seed, 0), 7)
+            words = philox.philox4x32((tick, j, 6, 0), (seed, 0))
             u = 2 * ((np.array(words[:2], float) + 0.5) / 2**32) - 1
             g = frame.T @ z
             image = np.append(g[:2] / g[2] + scale * u, 1.0)
@@ -384,15 +383,14 @@ def test_paper_noise_draw_by_draw(axis: tuple[float, float, float]) -> None:
             assert_allclose(state["bearing"][0, 0, j], expected / np.linalg.norm(expected), atol=1e-13)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_paper_noise_in_the_plane_of_the_axis_is_finite(dtype: str) -> None:
+def test_paper_noise_in_the_plane_of_the_axis_is_finite() -> None:
     """A target across the optical axis: the formula divides by zero there."""
     places = [(3.0, 0.0, 0.0), (0.0, -2.0, 0.0), (1.0, 1.0, 1e-9), (1.0, 2.0, -1e-9)]
     b, true = bearings(
         {"model": "paper", "scale": 0.005},
         20,
         10,
-        dtype,
+        "float64",
         landmarks=[landmark(f"L{j}", p) for j, p in enumerate(places)],
     )
     assert np.isfinite(b).all()

@@ -13,7 +13,7 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from tests.helpers.builders import command, constant, reset, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, WIDE
+from tests.helpers.warp_calls import DTYPES
 
 WORLDS = 2000
 STRAIGHT = {"name": "straight", "waypoints": [[-6.0, -0.5], [6.0, -0.5]]}
@@ -44,9 +44,8 @@ def test_a_route_without_spreads_is_the_designed_one(dtype: str) -> None:
     assert_allclose(state["rotation"][:, -1], np.tile(np.eye(3), (3, 1, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_routes_are_drawn_uniformly_and_vehicles_apart(dtype: str) -> None:
-    state = drawn(cars(STRAIGHT, LEFT, {**STRAIGHT, "name": "again"}, count=2), dtype)
+def test_routes_are_drawn_uniformly_and_vehicles_apart() -> None:
+    state = drawn(cars(STRAIGHT, LEFT, {**STRAIGHT, "name": "again"}, count=2))
     which = state["route_drawn"].astype(int)
     assert stats.chisquare(np.bincount(which[:, 0])).pvalue > 1e-3
     assert stats.chisquare(np.bincount(3 * which[:, 0] + which[:, 1])).pvalue > 1e-3
@@ -55,9 +54,8 @@ def test_routes_are_drawn_uniformly_and_vehicles_apart(dtype: str) -> None:
     assert (counts[which != 1] == 2).all()
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_a_route_is_shifted_sideways_as_a_whole_and_begun_anywhere(dtype: str) -> None:
-    state = drawn(cars({**LEFT, "lateral_spread": 0.4, "start_spread": 2.0}), dtype)
+def test_a_route_is_shifted_sideways_as_a_whole_and_begun_anywhere() -> None:
+    state = drawn(cars({**LEFT, "lateral_spread": 0.4, "start_spread": 2.0}))
     shift = state["route"][:, 0, 0, 1] + 2.5
     assert stats.kstest(shift / 0.8 + 0.5, "uniform").pvalue > 1e-3
     assert_allclose(state["goal"][:, 0, 0] + 0.5, -shift, atol=1e-5)
@@ -67,9 +65,8 @@ def test_a_route_is_shifted_sideways_as_a_whole_and_begun_anywhere(dtype: str) -
     assert abs(np.corrcoef(x, shift)[0, 1]) < 0.08
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_a_wandering_route_keeps_its_ends_and_its_bounds(dtype: str) -> None:
-    state = drawn(cars({**STRAIGHT, "wander": 0.5}), dtype)
+def test_a_wandering_route_keeps_its_ends_and_its_bounds() -> None:
+    state = drawn(cars({**STRAIGHT, "wander": 0.5}))
     aside = state["route"][:, 0, :49, 1] + 2.5
     assert_allclose(aside[:, [0, -1]], 0.0, atol=1e-6)
     assert 0.3 < np.abs(aside).max() <= 0.5
@@ -106,13 +103,12 @@ def test_episodes_and_worlds_differ_and_repeat() -> None:
     np.testing.assert_array_equal(start(made, [5, 6]).get_state()["route"], first)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_without_routes_the_way_is_straight_to_the_goal(dtype: str) -> None:
+def test_without_routes_the_way_is_straight_to_the_goal() -> None:
     goal = {"position": [3.0, 4.0, 0.0], "radius": 0.5}
     pose = {"position": [0.0, 0.0, 0.0], "position_spread": [0.5, 0.5, 0.0]}
     other = vehicle((0.0, 9.0, 0.0))
     already = vehicle((5.0, 5.0, 0.0), goal={"position": [5.0, 5.0, 0.0], "radius": 0.5})
-    state = drawn(scenario([{"initial_pose": pose, "goal": goal}, other, already]), dtype, 5)
+    state = drawn(scenario([{"initial_pose": pose, "goal": goal}, other, already]), "float64", 5)
     np.testing.assert_array_equal(state["route_count"], np.tile([2, 0, 0], (5, 1)))
     np.testing.assert_array_equal(state["route_drawn"], -1)
     assert_allclose(state["route"][:, 0], np.tile([[0.0, 0.0, 0.0], [3.0, 4.0, 5.0]], (5, 1, 1)), atol=1e-6)

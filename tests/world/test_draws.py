@@ -15,7 +15,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from tests.helpers.builders import constant, estimated_position, landmark, raw, reset, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, WIDE
+from tests.helpers.warp_calls import DTYPES
 
 WORLDS = 3000
 CELLS = 16
@@ -83,11 +83,10 @@ def test_held_out_routes_share_no_cell_with_those_for_training() -> None:
         assert_array_equal(parity(alone), expected)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_groups_fill_their_areas_and_lines_uniformly(dtype: str) -> None:
+def test_groups_fill_their_areas_and_lines_uniformly() -> None:
     made = scenario([vehicle()], landmark_groups=GROUPS, map={"origin": [1.0, 0.0, 0.0]})
     assert made.target_names[4:] == ["area_1", "area_2", "kerb_1", "vehicle_1"]
-    places = field(made, "position", dtype=dtype) + np.array([1.0, 0.0, 0.0])
+    places = field(made, "position") + np.array([1.0, 0.0, 0.0])
     for mark in (4, 5):
         x, y, z = places[:, mark].T
         large = x > 0
@@ -145,8 +144,7 @@ def test_one_vehicle_is_always_left_and_it_is_driven() -> None:
     assert (field(alone, "present")[:, -3:].sum(axis=1) == 1).all()
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_pace_scales_motion_twist_and_odometry(dtype: str) -> None:
+def test_pace_scales_motion_twist_and_odometry() -> None:
     """A half turn of radius 1 m in 4 s at pace 1, then a rest."""
     turn = {
         "kind": "segments",
@@ -154,7 +152,7 @@ def test_pace_scales_motion_twist_and_odometry(dtype: str) -> None:
     }
     mover = landmark("mover", (0.0, 5.0, 1.0), motion=turn, pace_spread=0.4)
     made = scenario([vehicle(motion=turn, pace_spread=0.5)], landmarks=[mover], horizon=5.0)
-    world = start(made, range(300), dtype)
+    world = start(made, range(300))
     pace = world.get_state()["pace"].astype(float)
     assert stats.kstest((pace[:, 0] - 0.6) / 0.8, "uniform").pvalue > 1e-3
     assert stats.kstest(pace[:, 1] - 0.5, "uniform").pvalue > 1e-3

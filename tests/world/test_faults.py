@@ -1,4 +1,4 @@
-"""Faults of clocks, computers and messages: who has them, when and how much, and what others then hear."""
+"""Faults of clocks, computers, maps and messages: when they begin, their size, and what other vehicles receive."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from tests.helpers.builders import constant, estimated_position, run, same_bits, scenario, start, vehicle
 
@@ -69,7 +70,7 @@ def test_who_lies_when_and_where_to_is_drawn() -> None:
     assert abs(np.corrcoef(lies.T)[0, 1]) < 4.5 / np.sqrt(WORLDS)
     begun = state["lie_tick"][:, :2][lies] / 60
     assert stats.kstest((begun - 1.0) / 2.0, "uniform").pvalue > 1e-4
-    vectors = state["lie_vector"][:, :2][lies]
+    vectors = state["lie_offset"][:, :2][lies]
     assert_allclose(np.linalg.norm(vectors, axis=1), 2.0)
     assert not vectors[:, 2].any()
     assert stats.kstest(np.arctan2(*vectors[:, :2].T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-4
@@ -79,8 +80,111 @@ def test_those_who_collude_tell_the_same() -> None:
     lie = {"kind": "collude", "chance": 0.5, "start_spread": 1.0, "offset": 2.0}
     state = start(fleet({0: {"lie": lie}, 1: {"lie": lie}}), range(100)).get_state()
     assert_array_equal(state["lie_tick"][:, 0], state["lie_tick"][:, 1])
-    assert_array_equal(state["lie_vector"][:, 0], state["lie_vector"][:, 1])
-    assert len(np.unique(state["lie_vector"][:, 0, 0])) > 20
+    assert_array_equal(state["lie_offset"][:, 0], state["lie_offset"][:, 1])
+    assert len(np.unique(state["lie_offset"][:, 0, 0])) > 20
+
+
+def test_a_lie_is_steered() -> None:
+    """The offset is the sum of what each velocity has added, in the worlds and vehicles that lie."""
+    lie = {"kind": "drift", "start": 0.2, "speed": 0.3, "direction": [1.0, 0.0, 0.0]}
+    world = start(fleet({1: {"lie": lie}}), [1, 2])
+    velocities = np.random.default_rng(0).normal(size=(8, 2, 3, 3))
+    expected, now = np.zeros((2, 3)), np.array([0.3, 0.0, 0.0])
+    for velocity in velocities:
+        for _ in range(6):
+            world.advance(1)
+            if world.view("tick")[0] > 12:
+                expected = expected + now / 60
+            assert_allclose(told(world.get_state(), 1)[0], expected, atol=1e-12)
+            assert_allclose(told(world.get_state(), 0)[0], 0.0, atol=1e-12)
+        world.steer_lies(velocity)
+        if world.view("tick")[0] >= 12:
+            now = velocity[:, 1]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_on_a_shifted_map_estimates_are_shifted_likewise(dtype: str) -> None:
+    """Without noise, every observer converges to the pose that its map shows."""
+    offset = np.array([0.0, 0.06, 0.08])
+    error = {"chance": 1.0, "offset": 0.1, "direction": offset.tolist(), "start": 1.0}
+    made = fleet({}, faults={"map_error": error}, observer={"name": "riccati"}, horizon=60.0)
+    world = start(made, [5], dtype=dtype)
+    world.advance(59)
+    before = world.get_state()
+    assert_array_equal(before["map_tick"][..., :4], 60)
+    world.advance(1)
+    assert_allclose(world.get_state()["map_error"][0, :, :4], np.broadcast_to(offset, (3, 4, 3)), rtol=1e-6)
+    world.advance(3000)
+    state = world.get_state()
+    off = estimated_position(state)[0] - state["position"][0, 4:]
+    assert_allclose(off, np.broadcast_to(offset, (3, 3)), atol=1e-3)
+
+
+def test_entries_of_a_map_are_wrong_by_chance_the_same_for_all() -> None:
+    error = {"chance": 0.3, "offset": 1.0, "offset_spread": 2.0, "start": 1.0, "start_spread": 3.0}
+    one = {"landmark": "L2", "chance": 1.0}
+    state = start(fleet({1: {"map_error": one}}, faults={"map_error": error}), range(WORLDS)).get_state()
+    begun, vectors = state["map_tick"][..., :4], state["map_error"][..., :4, :]
+    wrong = begun >= 0
+    assert_array_equal(wrong[:, 1], np.arange(4) == np.broadcast_to(1, (WORLDS, 4)))
+    assert_array_equal(begun[:, 0], begun[:, 2])
+    assert_array_equal(vectors[:, 0], vectors[:, 2])
+    assert_array_equal(vectors[:, 0, 1][wrong[:, 0, 1]], vectors[:, 1, 1][wrong[:, 0, 1]])
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 4 * WORLDS, 0.3)
+    assert low <= wrong[:, 0].sum() <= high
+    drawn = vectors[:, 0][wrong[:, 0]]
+    assert stats.kstest(np.linalg.norm(drawn, axis=1) / 2.0 - 0.5, "uniform").pvalue > 1e-4
+    assert stats.kstest(np.arctan2(*drawn[:, :2].T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-4
+    assert stats.kstest((begun[:, 0][wrong[:, 0]] / 60 - 1.0) / 3.0, "uniform").pvalue > 1e-4
+    assert not vectors[~wrong].any() and not drawn[:, 2].any()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_jammer_blocks_the_receivers_in_its_range(dtype: str, delay: int) -> None:
+    """The expected messages follow from true distances and from whole ticks: 12 of each 30 jam, from 15 to 75."""
+    jammers = {
+        0: {"chance": 1.0, "range": 2.1, "start": 0.25, "duration": 1.0, "period": 0.5, "duty": 0.4},
+        2: {"chance": 1.0, "range": 1.5, "position": [4.0, -1.0, 0.5], "start": 1.5},
+    }
+    made = fleet({i: {"jammer": jammer} for i, jammer in jammers.items()}, v2x={"delay": delay})
+    states, expected = run(start(made, dtype=dtype), 120), np.full((3, 3), -1)
+    seen = set()
+    for tick, state in enumerate(states):
+        places = state["position"][0, 4:]
+        first = 15 <= tick < 75 and (tick - 15) % 30 < 12
+        jammed = first & (np.linalg.norm(places - places[0], axis=-1) <= 2.1)
+        jammed |= (tick >= 90) & (np.linalg.norm(places - [4.0, -1.0, 0.5], axis=-1) <= 1.5)
+        seen.add(tuple(jammed.tolist()))
+        for receiver, senders in ((1, [0]), (2, [0, 1])):
+            if tick >= delay and not jammed[receiver]:
+                expected[receiver, senders] = tick - delay
+        assert_array_equal(state["inbox_tick"][0], expected)
+    assert len(seen) > 2
+
+
+def test_jammers_are_drawn() -> None:
+    jammer = {"chance": 0.25, "start": 1.0, "start_spread": 2.0}
+    state = start(fleet({}, faults={"jammer": jammer}), range(WORLDS)).get_state()
+    begun = state["jammer_tick"][state["jammer_tick"] >= 0]
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 3 * WORLDS, 0.25)
+    assert low <= len(begun) <= high
+    assert stats.kstest((begun / 60 - 1.0) / 2.0, "uniform").pvalue > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("faults", "message"),
+    [
+        ({"map_error": {"landmark": "L9"}}, r"faults.map_error.landmark: unknown landmark 'L9' .did you mean"),
+        ({"map_error": {"chance": 1.5}}, "faults.map_error.chance"),
+        ({"jammer": {"duty": 0.0}}, "faults.jammer.duty"),
+        ({"jammer": {"range": -1.0}}, "faults.jammer.range"),
+        ({"jammer": {"radius": 3.0}}, "faults.jammer.radius"),
+    ],
+)
+def test_what_a_scenario_refuses(faults: dict[str, Any], message: str) -> None:
+    with pytest.raises(CoopenvError, match=message):
+        fleet({}, faults=faults)
 
 
 @pytest.mark.parametrize(("delay", "period"), [(0, 1), (3, 1), (2, 4)])
@@ -195,6 +299,7 @@ def test_others_go_on_as_if_there_were_no_fault() -> None:
         assert same_bits(plain[name], off[name]), name
         assert same_bits(plain[name][:, 0], faulty[name][:, 0]), name
     assert not same_bits(plain["estimate_position"][:, 2], faulty["estimate_position"][:, 2])
+    assert (plain["jammer_tick"] == -1).all() and (plain["map_tick"][..., :4] == -1).all()
     assert (plain["restart_tick"] == -1).all() and (plain["lie_tick"] == -1).all() and not plain["clock"].any()
 
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.route_calls import places, points
-from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE
+from tests.helpers.warp_calls import DTYPES, EPSILON
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -27,8 +27,7 @@ def test_a_straight_line_and_its_prolongations(dtype: str) -> None:
         assert_allclose(found[:, 2], angle, atol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_an_arc(dtype: str) -> None:
+def test_an_arc() -> None:
     """A chord of 1/20 of a radius is within 1/3200 of it from the arc; s is then right to within half of a chord."""
     radius, turn = 2.0, 3.0
     angles = np.linspace(0.0, turn, 61)
@@ -36,18 +35,17 @@ def test_an_arc(dtype: str) -> None:
     rng = np.random.default_rng(1)
     at, aside = rng.uniform(0.05, turn - 0.05, 300), rng.uniform(-1.0, 1.0, 300)
     xy = (radius - aside)[:, None] * np.column_stack([np.sin(at), -np.cos(at)]) + [0.0, radius]
-    s, lateral, heading = places(dtype, line, xy).T
+    s, lateral, heading = places("float64", line, xy).T
     assert_allclose(s, radius * at, atol=0.05)
     assert_allclose(lateral, aside, atol=1e-3)
     assert_allclose(heading, at, atol=0.025)
-    x, y, heading = points(dtype, line, radius * at).T
+    x, y, heading = points("float64", line, radius * at).T
     assert_allclose(x, radius * np.sin(at), atol=1.5e-3)
     assert_allclose(y, radius * (1 - np.cos(at)), atol=1.5e-3)
     assert_allclose(heading, at, atol=2.5e-3)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_the_place_is_the_nearest_one_of_a_crooked_line(dtype: str) -> None:
+def test_the_place_is_the_nearest_one_of_a_crooked_line() -> None:
     """Against 20,000 points of the line; the place and the offset say where the point is nearest."""
     rng = np.random.default_rng(2)
     line = np.cumsum(rng.normal([1.0, 0.0], 0.5, (15, 2)), axis=0)
@@ -56,31 +54,29 @@ def test_the_place_is_the_nearest_one_of_a_crooked_line(dtype: str) -> None:
     fine = np.linspace(0.0, lengths[-1], 20001)
     dense = np.column_stack([np.interp(fine, lengths, line[:, k]) for k in (0, 1)])
     distance = np.linalg.norm(xy[:, None] - dense, axis=-1).min(axis=1)
-    s, lateral, _ = places(dtype, line, xy).T
+    s, lateral, _ = places("float64", line, xy).T
     inside = (s > 0) & (s < lengths[-1])
     assert inside.sum() > 150
     assert_allclose(np.abs(lateral[inside]), distance[inside], atol=2e-3)
-    there = points(dtype, line, s)[inside, :2]
+    there = points("float64", line, s)[inside, :2]
     assert_allclose(np.linalg.norm(there - xy[inside], axis=1), distance[inside], atol=2e-3)
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_points_and_places_are_inverse(dtype: str) -> None:
+def test_points_and_places_are_inverse() -> None:
     angles = np.linspace(0.0, 2.0, 40)
     line = 5.0 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
     s = np.linspace(-2.0, 12.0, 57)
-    on = points(dtype, line, s)
-    again = places(dtype, line, on[:, :2])
-    assert_allclose(again[:, 0], s, atol=1e3 * EPSILON[dtype])
-    assert_allclose(again[:, 1], 0.0, atol=1e2 * EPSILON[dtype] ** 0.5)
-    assert_allclose(again[:, 2], on[:, 2], atol=1e3 * EPSILON[dtype])
+    on = points("float64", line, s)
+    again = places("float64", line, on[:, :2])
+    assert_allclose(again[:, 0], s, atol=1e3 * EPSILON["float64"])
+    assert_allclose(again[:, 1], 0.0, atol=1e2 * EPSILON["float64"] ** 0.5)
+    assert_allclose(again[:, 2], on[:, 2], atol=1e3 * EPSILON["float64"])
 
 
-@pytest.mark.parametrize("dtype", WIDE)
-def test_no_route(dtype: str) -> None:
+def test_no_route() -> None:
     nothing = np.zeros((0, 2))
-    assert_allclose(places(dtype, nothing, np.array([[3.0, 4.0]])), 0.0)
-    assert_allclose(points(dtype, nothing, np.array([3.0])), 0.0)
+    assert_allclose(places("float64", nothing, np.array([[3.0, 4.0]])), 0.0)
+    assert_allclose(points("float64", nothing, np.array([3.0])), 0.0)
 
 
 def test_a_vehicle_that_leaves_its_route_ends_there() -> None:

@@ -11,7 +11,7 @@ from coopenv.world.camera import (
     body_bearing,
     camera_to_body,
     inverse_square_of,
-    marker_position,
+    mapped_position,
     project,
     segment_hits_box,
 )
@@ -287,7 +287,7 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
     R = state.estimate_rotation[world, vehicle]
     p = R * state.estimate_position[world, vehicle]
     for n in range(model.landmarks):
-        offset = marker_position(model, state, world, n) - p
+        offset = mapped_position(model, state, world, vehicle, n) - p
         distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
         behind = distance > last.distance or (distance == last.distance and n > last.index)
         nearer = landmark.index < 0 or distance < landmark.distance
@@ -295,7 +295,7 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
             landmark.index = n
             landmark.distance = distance
     if landmark.index >= 0:
-        point = marker_position(model, state, world, landmark.index)
+        point = mapped_position(model, state, world, vehicle, landmark.index)
         landmark.exists = True
         landmark.position = wp.vec3(wp.transpose(R) * point - state.estimate_position[world, vehicle])
         landmark.expected = expected_in_view(model, state, world, vehicle, point)

@@ -1,6 +1,5 @@
 """Variants with faults: changes of a recording, or keys of a scenario.
 
-The truth and the odometry of a recording are never changed. Every random draw is a function of the seed and the fault.
 The spelling is that of `coopenv.base.fault_text`; `/` joins several faults of one variant, for example
 `vehicle_2:lie=drift:0.05@10/gyro_bias=0.0175`.
 """
@@ -8,129 +7,31 @@ The spelling is that of `coopenv.base.fault_text`; `/` joins several faults of o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
+from coopenv.bench.observers.changes import (
+    NO_FOLLOWERS,
+    leaders_of,
+    usual_sender,
+    with_delay,
+    with_jammer,
+    with_lie,
+    with_loss,
+    with_map_error,
+    with_wrong_association,
+    without_landmarks,
+)
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.scenario.sensing import LONGEST_REPLAY
 
 if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
 
 NOMINAL = "nominal"
-DIRECTION = np.array([0.6, 0.8, 0.0])
-"""Of a false position, map axes: horizontal, and along no road."""
-
-
-def with_loss(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Lose each message, per receiver, with a probability in [0, 1]; the last received message stays known."""
-    inbox = recording.inbox_tick
-    news = np.diff(inbox, axis=0, prepend=-1) > 0
-    kept = news & (np.random.default_rng([seed, 1]).random(inbox.shape) >= fault.value)
-    return replace(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
-
-
-def with_delay(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Deliver every message later, by a time that is rounded to whole ticks."""
-    ticks = min(round(fault.value / recording.dt), recording.ticks)
-    inbox = np.full_like(recording.inbox_tick, -1)
-    inbox[ticks:] = recording.inbox_tick[: recording.ticks - ticks]
-    return replace(recording, inbox_tick=inbox)
-
-
-def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Swap bearings within frames so that a share of all bearings carry the identity of another visible target.
-
-    Every bearing starts a swap with another one of its frame, drawn at random, with half that probability, so that
-    it is part of one with (nearly) the whole. A frame with a single bearing stays as it is.
-    """
-    bearings = recording.bearings.copy()
-    generator = np.random.default_rng([seed, 2])
-    starts = recording.visible & (generator.random(recording.visible.shape) < fault.value / 2)
-    partners = generator.random(recording.visible.shape)
-    for k, i, target in np.argwhere(starts):
-        others = np.flatnonzero(recording.visible[k, i])
-        others = others[others != target]
-        if len(others):
-            pair = [target, others[int(partners[k, i, target] * len(others))]]
-            bearings[k, i, pair] = bearings[k, i, pair[::-1]]
-    return replace(recording, bearings=bearings)
-
-
-def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Hide all landmarks from a time on, for a duration."""
-    start = fault.start_in(float(recording.t[-1]))
-    lost = (recording.t >= start) & (recording.t < start + fault.duration)
-    landmarks = np.arange(recording.visible.shape[2]) < recording.landmarks.shape[1]
-    hidden = lost[:, None, None] & landmarks
-    bearings = np.where(hidden[..., None], np.nan, recording.bearings)
-    return replace(recording, visible=recording.visible & ~hidden, bearings=bearings)
-
-
-def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
-    """Let vehicles broadcast another pose, as `[faults.lie]` of a scenario does; default: the usual sender."""
-    from coopenv.observers.mailbox import Interference
-
-    names, period = [setup.name for setup in recording.setups], recording.period
-    K, N = recording.ticks, len(names)
-    senders = [names.index(name) for name in fault.vehicles] or [usual_sender(recording)]
-    since = np.arange(K) - math.ceil(fault.start_in(float(recording.t[-1])) / recording.dt - 1e-6)
-    lying = since >= 0
-    none = (np.zeros((K, N, 3)), np.zeros((K, N, 3)), np.zeros((K, N)), np.zeros((K, N), np.int64))
-    false = deepcopy(recording.interference) or Interference(
-        *none,
-        clock=np.zeros(N, np.int64),
-        restarts=np.zeros((K, N), bool),
-        kept=np.zeros(N, np.int64),
-        consistent=np.zeros(N, bool),
-    )
-    for sender in senders:
-        if fault.word == "replay":
-            false.kept[sender] = period * max(1, round(fault.value / (recording.dt * period)))
-            false.replay[lying, sender] = false.kept[sender]
-        else:
-            size = fault.value * (since * recording.dt if fault.word == "drift" else np.ones(K))
-            false.shift[lying, sender] += (size[:, None] * DIRECTION)[lying]
-            false.turn[lying, sender, 2] += fault.options.get("turn", 0.0)
-        false.consistent[sender] = fault.options.get("honest_odometry", 0.0) == 0.0
-        if "std" in fault.options:
-            false.std[lying, sender] = fault.options["std"]
-    return replace(recording, interference=false)
-
-
-NO_FOLLOWERS = "no vehicle has another one as its neighbour"
-
-
-def leaders_of(world: Recording | Scenario) -> list[int]:
-    """Return the vehicles, in the order of estimation, that another one has as its neighbour."""
-    sets: Sequence[Any]
-    if isinstance(world, Scenario):
-        sets, landmarks = neighbour_sets(world), len(world.landmarks)
-        order: Iterable[int] = processing_order(world, sets)
-    else:
-        sets, landmarks, order = [setup.targets for setup in world.setups], world.setups[0].landmarks, world.order
-    return [i for i in order if any(landmarks + i in targets for targets in sets)]
-
-
-def usual_sender(world: Recording | Scenario) -> int:
-    """Return the second vehicle, in the order of estimation, that has followers, or the only one.
-
-    The first one is mostly seen by vehicles that see the landmarks, too.
-
-    Raises:
-        CoopenvError: no vehicle has followers.
-    """
-    leaders = leaders_of(world)
-    if not leaders:
-        raise CoopenvError(NO_FOLLOWERS)
-    return leaders[min(1, len(leaders) - 1)]
 
 
 @dataclass(frozen=True)
@@ -171,12 +72,33 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         duration=True,
         change=without_landmarks,
     ),
+    "map_error": RecordFault(
+        "[LANDMARK:]METRES",
+        "by which a landmark, or each, is off on the map",
+        1.0,
+        free_word=True,
+        start=True,
+        options=("angle", "spread"),
+        vehicles=True,
+        change=with_map_error,
+    ),
+    "jammer": RecordFault(
+        "METRES",
+        "around a vehicle or a place (x, y, z) in which no message arrives; without a range: everywhere",
+        math.inf,
+        start=True,
+        duration=True,
+        options=("x", "y", "z", "period", "duty"),
+        signed=("x", "y", "z"),
+        vehicles=True,
+        change=with_jammer,
+    ),
     "lie": RecordFault(
         "KIND[:AMOUNT]",
         "a vehicle broadcasts another pose: jump or collude (m), drift (m/s), replay (s)",
         words={"jump": 5.0, "drift": 0.05, "replay": 1.0, "collude": 5.0},
         start=True,
-        options=("std", "turn", "honest_odometry"),
+        options=("std", "turn", "angle", "honest_odometry"),
         vehicles=True,
         change=with_lie,
     ),
@@ -266,6 +188,11 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
             raise FaultError(f"fault {fault.text}: expected landmarks_lost@START+DURATION")
         if fault.name == "restart" and fault.start is None:
             raise FaultError(f"fault {fault.text}: expected restart@START")
+        fixed = not {"x", "y", "z"}.isdisjoint(fault.options)
+        if fault.name == "jammer" and fixed + bool(fault.vehicles) != (fault.value < math.inf):
+            raise FaultError(f"fault {fault.text}: expected jammer, VEHICLE:jammer=METRES or jammer=METRES,x=X,y=Y")
+        if fault.options.get("period") == 0.0:
+            raise FaultError(f"fault {fault.text}: period must be above 0")
     return FaultVariant(name or text, faults)
 
 
@@ -313,7 +240,7 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
     found: dict[str, Any] = {}
     for fault in variant.faults:
         kind, names = FAULTS[fault.name], fault.vehicles or scenario.vehicle_names
-        check_vehicles(fault, scenario.vehicle_names)
+        check_names(fault, scenario.vehicle_names, scenario.target_names[: len(scenario.landmarks)])
         if not isinstance(kind, WorldFault):
             continue
         if kind.of_one and not fault.vehicles:
@@ -333,18 +260,20 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
     return replace(variant, scenario=load_scenario(text, {**overrides, **found})) if found else variant
 
 
-def check_vehicles(fault: Fault, known: Sequence[str]) -> None:
-    """Refuse unknown vehicles. Raises CoopenvError: it names the known ones."""
-    for name in fault.vehicles:
-        if name not in known:
-            raise CoopenvError(
-                f"fault {fault.text}: unknown vehicle '{name}'{suggest(name, known)}; there are {listed(known)}"
-            )
+def check_names(fault: Fault, vehicles: Sequence[str], landmarks: Sequence[str]) -> None:
+    """Refuse unknown vehicles and landmarks. Raises CoopenvError: it names the known ones."""
+    given = {"vehicle": (fault.vehicles, vehicles), "landmark": ([fault.word] * (fault.name == "map_error"), landmarks)}
+    for kind, (names, known) in given.items():
+        for name in names:
+            if name and name not in known:
+                raise CoopenvError(
+                    f"fault {fault.text}: unknown {kind} '{name}'{suggest(name, known)}; there are {listed(known)}"
+                )
 
 
-def check_recorded(variant: FaultVariant, vehicles: Sequence[str]) -> None:
-    """Refuse faults that a finished record of these vehicles cannot have. Raises CoopenvError."""
+def check_recorded(variant: FaultVariant, vehicles: Sequence[str], landmarks: Sequence[str]) -> None:
+    """Refuse faults that a finished record of these vehicles and landmarks cannot have. Raises CoopenvError."""
     for fault in variant.faults:
         if isinstance(FAULTS[fault.name], WorldFault):
             raise CoopenvError(f"fault {fault.text}: is of a simulated world, this one is recorded")
-        check_vehicles(fault, vehicles)
+        check_names(fault, vehicles, landmarks)

@@ -16,14 +16,13 @@ from coopenv.backends.base import Backend
 from coopenv.backends.mrclam.dataset import IN_SPACE
 from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
 from coopenv.base.errors import CoopenvError, DataWarning, suggest
+from coopenv.bench.observers.changes import NO_FOLLOWERS, leaders_of
 from coopenv.bench.observers.faults import (
-    NO_FOLLOWERS,
     NOMINAL,
     ROBOT_VARIANTS,
     VARIANTS,
     FaultVariant,
     check_recorded,
-    leaders_of,
     variant_of,
     with_world,
 )
@@ -89,9 +88,12 @@ class RecordSource(ABC):
     def check(self) -> None:
         """Look at recorded data, so that errors and warnings come before the work."""
         world = self.world()
-        names = world.vehicle_names if isinstance(world, Scenario) else [setup.name for setup in world.setups]
+        if isinstance(world, Scenario):
+            vehicles, targets = world.vehicle_names, world.target_names
+        else:
+            vehicles, targets = [setup.name for setup in world.setups], list(world.setups[0].target_names)
         for variant in self.added:
-            check_recorded(variant, names)
+            check_recorded(variant, vehicles, targets[: len(targets) - len(vehicles)])
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s; without a record only what is asked for is checked.

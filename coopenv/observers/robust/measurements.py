@@ -16,7 +16,7 @@ from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, ve
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.observers.robust.tracklets import only_returns
-from coopenv.world.camera import VISIBLE, body_bearing, marker_position
+from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
@@ -143,7 +143,7 @@ def set_measurement_of_target(
     b = vec3d(body_bearing(model, state, world, i, target))
     sender = target - model.landmarks
     if sender < 0:
-        point = vec3d(marker_position(model, state, world, target))
+        point = vec3d(mapped_position(model, state, world, i, target))
         set_bearing_measurement(memory, world, frame.bearings, 0, b, point, wp.float64(0.0))
         if frame.purpose == TRACKING:
             q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)

@@ -95,6 +95,21 @@ def test_the_map_is_that_of_the_nearest_landmarks_by_ones_own_estimate() -> None
     assert 0.2 < np.mean(found) < 0.8
 
 
+def test_a_wrong_map_is_observed_as_it_is() -> None:
+    error = {"chance": 1.0, "offset": 2.0, "direction": [1.0, 0.0, 0.0]}
+    more = {"include": ["map"], "map_size": 3, "map_scale": 50.0}
+    overrides = {f"observation.{key}": value for key, value in more.items()}
+    scenario = load_scenario("busy_intersection", {**overrides, "vehicles.vehicle_2.faults": {"map_error": error}})
+    engine = driven(scenario, 2)
+    R, p = estimates(engine)
+    places = np.array([landmark.position for landmark in scenario.landmarks])
+    for i in range(5):
+        own = places + np.array([2.0 * (i == 1), 0.0, 0.0])
+        order = np.argsort(np.linalg.norm((own - p[0, i])[:, :2], axis=1))
+        expected = (own[order] - p[0, i]) @ R[0, i]
+        np.testing.assert_allclose(seen(engine, scenario, "map_position")[0, i], expected, atol=1e-4)
+
+
 def test_what_is_expected_in_view_mostly_is() -> None:
     scenario = scenario_with(map_size=12)
     engine = driven(scenario, steps=30)

@@ -338,7 +338,7 @@ def test_recordings_are_judged_by_terms_of_ones_own_and_name_none(tmp_path: Path
     assert b"my_terms" not in log.read_bytes()
     rewards = {"reward.custom.error": f"{tmp_path}/my_terms.py:error"}
     weighed = {**rewards, "reward.weights.error": 1.0, "reward.privileged": True}
-    env = coopenv.parallel_env(log, overrides=weighed)
+    env = coopenv.parallel_env(log, overrides=weighed, dtype="float64")
     env.reset()
     _, earned, _, _, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
     for agent, info in infos.items():

@@ -91,17 +91,27 @@ class Tells(DeadReckoning):
         return Estimate(found.rotation, found.position, found.covariance, found.coordinates, 3.0, 2)
 
 
-def test_observers_registered_here_travel_to_other_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One fails, which stops nobody else; another tells its NIS."""
+SOURCE = """
+from coopenv.observers.single_frame import DeadReckoning
+
+class Mine(DeadReckoning):
+    pass
+"""
+
+
+def test_observers_travel_to_other_processes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """One fails, which stops nobody else; another tells its NIS; the last one is loaded from its file there."""
     monkeypatch.setattr(registry, "_registered", {})
     registry.register("raises", Raises)
     registry.register("tells", Tells)
-    names = ["raises", "tells", "dead_reckoning"]
+    (tmp_path / "mine.py").write_text(SOURCE)
+    names = ["raises", "tells", "dead_reckoning", f"{tmp_path}/mine.py:Mine"]
     rows = compare(names, "overtaking", 2, overrides=SHORT, steady_from=0.5, jobs=2).rows
     assert len(failures(rows)) == 1 and "by design" in failures(rows)[0]
     assert np.isnan(rows[0].position_rmse_m) and rows[0].settled_fraction == 0.0 and rows[0].diverged_fraction == 1.0
     assert [row.nis for row in rows[2:4]] == pytest.approx([1.5, 1.5]) and np.isnan(rows[-1].nis)
-    assert [row.position_rmse_m for row in rows[2:4]] == pytest.approx([row.position_rmse_m for row in rows[4:]])
+    errors = [row.position_rmse_m for row in rows]
+    assert errors[2:4] == pytest.approx(errors[4:6]) and errors[4:6] == errors[6:]
     dof = 2 * 2 * 60  # of two seeds, 1 s at 60 Hz
     assert [rows[2].nis_low, rows[2].nis_high] == pytest.approx(chi2.ppf([0.025, 0.975], dof) / dof)
     assert [rows[2].anees_low, rows[2].anees_high] == pytest.approx(chi2.ppf([0.025, 0.975], 12) / 12)
@@ -199,12 +209,11 @@ def test_figures_say_what_they_show(comparison: coopenv.Comparison, kind: str, w
 
 @pytest.mark.parametrize(("form", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_figures_as_files(comparison: coopenv.Comparison, tmp_path: Path, form: str, start: bytes) -> None:
-    for path, options in ((tmp_path / f"figure.{form}", {}), (tmp_path / "figure", {"format": form})):
+    paths = tmp_path / f"figure.{form}", tmp_path / "figure"
+    for path, options in zip(paths, ({}, {"format": form}), strict=True):
         comparison.figure("errors", variant="v2x_loss", path=path, **options)
         assert path.read_bytes().startswith(start)
-    first = (tmp_path / f"figure.{form}").read_bytes()
-    comparison.figure("errors", variant="v2x_loss", path=tmp_path / f"figure.{form}")
-    assert form == "svg" or (tmp_path / f"figure.{form}").read_bytes() == first
+    assert form == "svg" or paths[0].read_bytes() == paths[1].read_bytes()
 
 
 def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:

@@ -16,15 +16,9 @@ from scipy.stats import binom
 import coopenv
 from coopenv.backends.mcap.writer import write_recording
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.observers import compare
+from coopenv.bench.observers.changes import DIRECTION, usual_sender
 from coopenv.bench.observers.command import figure_files
-from coopenv.bench.observers.faults import (
-    DIRECTION,
-    FAULTS,
-    VARIANTS,
-    usual_sender,
-    variant_of,
-)
+from coopenv.bench.observers.faults import FAULTS, VARIANTS, variant_of
 from coopenv.bench.observers.sources import SimulatedRecords, find_source, variants_of
 from coopenv.cli import main
 from coopenv.cli.bench import ObserverOptions
@@ -48,24 +42,11 @@ def test_how_a_fault_is_written() -> None:
     assert (lie.name, lie.word, lie.value, lie.vehicles) == ("lie", "drift", 0.05, ("vehicle_2", "vehicle_3"))
     assert lie.start_in(60.0) == 10.0 and lie.options == {"std": 0.01}
     assert (bias.name, bias.value, bias.vehicles, bias.options) == ("gyro_bias", 10.0, (), {})
+    wrong, jammer = variant_of("map_error=SL2:0.3@10/jammer=5@2+3,x=-4,duty=0.5").faults
+    assert (wrong.word, wrong.value, wrong.start) == ("SL2", 0.3, 10.0)
+    assert (jammer.value, jammer.duration, jammer.options) == (5.0, 3.0, {"x": -4.0, "duty": 0.5})
     (lost,) = variant_of("landmarks_lost@60%+10").faults
     assert lost.start_in(50.0) == 30.0 and lost.duration == 10.0
-
-
-@pytest.mark.parametrize(
-    "old",
-    [
-        "lie=drift:0.05@vehicle_2,from=10",
-        "gyro_bias=0.1+odometry_scale=0.2",
-        "lying_neighbour=2",
-        "restart=15",
-        "landmarks_lost=10,from=3",
-        "lie=collude:4@vehicle_1:vehicle_2",
-    ],
-)
-def test_an_earlier_spelling_is_refused(old: str) -> None:
-    with pytest.raises(CoopenvError):
-        variant_of(old)
 
 
 @pytest.mark.parametrize(
@@ -139,6 +120,14 @@ def test_the_recorded_world_has_the_fault() -> None:
         ("landmarks_lost", r"expected landmarks_lost@START\+DURATION"),
         ("restart", "expected restart@START"),
         ("corruption=2", "corruption: value: expected a number from 0 to 1"),
+        ("map_error=SL9:0.3", "unknown landmark 'SL9' .did you mean.*there are SL1, SL2, SL3"),
+        ("map_error=SL1:", "map_error: value: expected a number"),
+        ("vehicle_9:map_error=1", "unknown vehicle 'vehicle_9'"),
+        ("jammer=5", "expected jammer, VEHICLE:jammer=METRES or jammer=METRES,x=X,y=Y"),
+        ("vehicle_2:jammer=5,x=1", "expected jammer, VEHICLE"),
+        ("vehicle_2:jammer", "expected jammer, VEHICLE"),
+        ("jammer,period=0", "period must be above 0"),
+        ("lie=jump,std=-1", "lie: std: expected a number from 0 to inf, got '-1'"),
     ],
 )
 def test_what_is_wrong_with_a_fault_is_one_line(fault: str, message: str) -> None:
@@ -185,13 +174,6 @@ def test_variants_and_the_command_that_gives_them_again() -> None:
     )
     names = figure_files(plan.variants, "svg")
     assert all("/" not in name and ":" not in name and "," not in name for name in names)
-
-
-def test_compare_takes_faults() -> None:
-    board = compare(["mekf"], ENV, [3], overrides={"horizon": 0.4}, faults=["corruption=0.5"])
-    assert list(board.variants) == ["nominal", "corruption=0.5"]
-    worse, fine = (np.array([row.position_rmse_m for row in board.rows if row.variant == v]) for v in board.variants)
-    assert fine[0] == worse[0] and not np.allclose(worse, fine)  # the first one hears nobody
 
 
 def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -315,6 +297,60 @@ def test_lies_on_a_recording_are_those_of_a_scenario(word: str, keys: dict[str, 
     found = variant_of(f"vehicle_3:lie={word}@33%,std=0.1").applied(made(horizon=1.0), 0).interference
     for field in fields(Interference):
         assert_allclose(getattr(found, field.name), getattr(expected, field.name), atol=1e-6, err_msg=field.name)
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("jammer@33%+0.4", {"start": 0.33, "duration": 0.4}),
+        ("vehicle_3:jammer=20,period=0.2,duty=0.5", {"range": 20.0, "period": 0.2, "duty": 0.5}),
+        ("jammer=17,x=-2,y=-2,z=2", {"range": 17.0, "position": [-2.0, -2.0, 2.0]}),
+    ],
+)
+def test_jammers_of_a_recording_are_those_of_a_scenario(text: str, keys: dict[str, Any]) -> None:
+    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"jammer": {"chance": 1.0, **keys}}, "v2x.delay": 2}
+    expected = record(coopenv.load_scenario("busy_intersection", overrides), 0)
+    plain = made(horizon=1.0, v2x__delay=2)
+    after = variant_of(text).applied(plain, 0)
+    assert_array_equal(after.inbox_tick, expected.inbox_tick)
+    assert differing(plain, after) == {"inbox_tick"}
+
+
+def test_wrong_maps_of_a_recording_are_those_of_a_scenario() -> None:
+    error = {"chance": 1.0, "landmark": "SL2", "offset": 0.3, "direction": [0.0, 1.0, 0.0], "start": 0.33}
+    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"map_error": error}}
+    expected = record(coopenv.load_scenario("busy_intersection", overrides), 0)
+    after = variant_of(f"vehicle_3:map_error=SL2:0.3@33%,angle={np.pi / 2}").applied(made(horizon=1.0), 0)
+    assert expected.interference is not None and after.interference is not None
+    for field in fields(Interference):
+        found, wanted = (getattr(r.interference, field.name) for r in (after, expected))
+        assert_allclose(found, wanted, atol=1e-12, err_msg=field.name)
+    assert not differing(after, expected)
+    assert_allclose(after.interference.map_error_of(2, 20), [[0, 0, 0], [0, 0.3, 0], [0, 0, 0]], atol=1e-12)
+    assert not after.interference.map_error_of(2, 19).any() and not after.interference.map_error_of(1, 20).any()
+
+
+def test_drawn_errors_of_a_map() -> None:
+    after = variant_of("map_error=0.5,spread=0.2").applied(made(), 4)
+    assert after.interference is not None
+    size = np.linalg.norm(after.interference.map_error, axis=-1)
+    assert (size >= 0.5).all() and (size <= 0.7).all() and np.ptp(size) > 0.0
+    assert (after.interference.map_error == after.interference.map_error[:1]).all()
+    assert_array_equal(after.landmarks, made().landmarks)  # the truth, of which bounds and figures are made
+
+
+def test_a_jammer_needs_true_positions() -> None:
+    unknown = replace(made(), truth=replace(made().truth, position=np.full_like(made().truth.position, np.nan)))
+    with pytest.raises(CoopenvError, match="true positions are not known"):
+        variant_of("vehicle_2:jammer=10").applied(unknown, 0)
+    assert (variant_of("jammer").applied(unknown, 0).inbox_tick == -1).all()
+
+
+def test_the_direction_of_a_lie() -> None:
+    drift, step = (variant_of(f"lie=drift:0.5@{at},angle={angle}") for at, angle in ((0.5, 0.0), (0.25, np.pi / 2)))
+    both = step.applied(drift.applied(made(horizon=1.0), 0), 0).interference
+    assert both is not None
+    assert_allclose(both.shift[-1, 1], [0.25, 0.375, 0.0], atol=1e-12)
 
 
 def test_an_observer_adapts_its_own_entries_to_a_lie() -> None:

@@ -7,6 +7,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,19 @@ from tests.helpers.bags import MAP
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
 
-SHORT = [m for m in bags.messages(bags.drive()) if m.stamp < 500_000_000]
+
+@cache
+def short() -> list[bags.Message]:
+    """Half a second of a drive."""
+    return [m for m in bags.messages(bags.drive()) if m.stamp < 500_000_000]
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The drive `SHORT` as a file of each form."""
+    """The short drive as a file of each form."""
     folder, found = tmp_path_factory.mktemp("short"), {}
     for form in ("ros1", "sqlite3", "mcap"):
-        whole = bags.write(folder / form, SHORT, form)
+        whole = bags.write(folder / form, short(), form)
         found[form] = whole if whole.is_file() else next(whole.glob(f"{form}.*"))
     return found
 
@@ -48,9 +53,9 @@ def topics(tmp_path: Path) -> Path:
     return tmp_path / "topics.toml"
 
 
-def opened(folder: Path, text: str, drive: list[bags.Message] = SHORT, form: str = "ros1") -> Bag:
+def opened(folder: Path, text: str, drive: list[bags.Message] | None = None, form: str = "ros1") -> Bag:
     (folder / "topics.toml").write_text(text, encoding="utf-8")
-    return Bag([bags.write(folder / "drive", drive, form)], folder / "topics.toml")
+    return Bag([bags.write(folder / "drive", short() if drive is None else drive, form)], folder / "topics.toml")
 
 
 def bag_or_line(path: Path, topics: Path) -> tuple[Bag | None, list[str]]:
@@ -65,7 +70,7 @@ def bag_or_line(path: Path, topics: Path) -> tuple[Bag | None, list[str]]:
 
 
 def without(topic: str) -> list[bags.Message]:
-    return [m for m in SHORT if m.topic != topic]
+    return [m for m in short() if m.topic != topic]
 
 
 @pytest.mark.parametrize(
@@ -95,7 +100,7 @@ def test_an_empty_bag_says_so(form: str, tmp_path: Path) -> None:
 
 def test_a_bag_of_one_frame_is_too_short(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="too few for two ticks"):
-        opened(tmp_path, MAP, [m for m in SHORT if m.stamp == 0])
+        opened(tmp_path, MAP, [m for m in short() if m.stamp == 0])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
@@ -108,14 +113,14 @@ def test_a_truncated_bag_is_one_line_or_what_could_be_read(
     cut.write_bytes(data[: int(share * len(data))])
     bag, warned = bag_or_line(cut, topics)
     if bag is not None:
-        complete = len(bag.log.samples) == len(SHORT)  # only what lies behind the data is lost
+        complete = len(bag.log.samples) == len(short())  # only what lies behind the data is lost
         assert complete or any("damaged" in line for line in warned)
         assert len(list(bag.episode(None, {}))) >= 2
 
 
 @pytest.mark.parametrize(("form", "tool"), [("sqlite3", "sqlite3 FILE .recover"), ("mcap", "mcap recover")])
 def test_a_folder_whose_file_is_cut_off_names_the_tool_that_mends_it(form: str, tool: str, tmp_path: Path) -> None:
-    folder = bags.write(tmp_path / "drive", SHORT, form)
+    folder = bags.write(tmp_path / "drive", short(), form)
     file = next(folder.glob("drive*.*"))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
     assert main(["import", str(folder)]) == 2
@@ -186,7 +191,7 @@ def test_a_folder_that_is_no_bag_is_told_so(topics: Path, capsys: pytest.Capture
 
 def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:
     lost = {"twist": {"twist": ((np.nan,) * 3, (np.nan,) * 3)}}
-    drive = [replace(m, fields=lost) if "twist" in m.topic else m for m in SHORT]
+    drive = [replace(m, fields=lost) if "twist" in m.topic else m for m in short()]
     with pytest.raises(
         DataError, match=r"actuation_twist of svea3: none of 30 messages is of use: wheel: twist.linear"
     ):
@@ -211,9 +216,9 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
     matrices: dict[str, Any] = {"k": [400.0, 0, 160, 0, 410.0, 100, 0, 0, 1], "d": np.zeros(5)}
     fields = {**matrices, "height": 208, "width": 316, "distortion_model": "plumb_bob"}
     told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
-    bag = opened(tmp_path, MAP, [*SHORT, told], "mcap")
+    bag = opened(tmp_path, MAP, [*short(), told], "mcap")
     frame = next(sample.value for sample in bag.log.samples if isinstance(sample.value, Detections))
-    blocks = next(m for m in SHORT if "objectsInfo" in m.topic).fields["objects"]
+    blocks = next(m for m in short() if "objectsInfo" in m.topic).fields["objects"]
     largest = {b["signature"]: b for b in blocks if b["width"] == 9}
     assert frame.markers == tuple(sorted(largest))
     for marker, ray in zip(frame.markers, frame.bearings, strict=True):
@@ -225,7 +230,7 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
 def test_the_authors_bearings_stand_in_for_pixels(tmp_path: Path) -> None:
     """Their node's vectors, of pixels whose distortion it leaves, give what the pixels give."""
     drive = []
-    for m in SHORT:
+    for m in short():
         if "objectsInfo" not in m.topic:
             drive.append(m)
             continue
@@ -244,10 +249,10 @@ def test_the_authors_bearings_stand_in_for_pixels(tmp_path: Path) -> None:
 
 def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     turning = {"angular_velocity": (0.0, 0.0, 0.7), "linear_acceleration": (0.0, 0.0, 9.8)}
-    wheels = [m for m in SHORT if "twist" in m.topic]
+    wheels = [m for m in short() if "twist" in m.topic]
     imu = [replace(m, topic="/imu", kind="sensor_msgs/msg/Imu", fields=turning) for m in wheels]
     text = MAP.replace("agent = 8", 'agent = 8\ntopics = { imu = "/imu" }')
-    *_, last = opened(tmp_path, text, [*SHORT, *imu], "mcap").episode(None, {})
+    *_, last = opened(tmp_path, text, [*short(), *imu], "mcap").episode(None, {})
     assert_allclose(last.angular_velocity, [[0.0, 0.0, 0.7]])
 
 

@@ -24,7 +24,7 @@ VERSIONS = {
     "pinned": ("--constraint", "constraints.txt"),
     "lowest": ("--resolution", "lowest-direct"),
     "newest": ("--upgrade",),
-    "warp": ("--upgrade", "--override", "tests/newest_warp.txt"),
+    "warp": ("--upgrade", "--override", ".ci/newest_warp.txt"),
 }
 """Options of `uv pip install`."""
 CPU_FEATURES = "from numpy._core._multiarray_umath import __cpu_dispatch__ as names; print(*names)"

@@ -1,0 +1,195 @@
+"""Changes of a recording by faults: losses, delays, wrong identities, hidden landmarks, jammers, wrong maps and lies.
+
+The truth and the odometry of a recording are never changed. Every random draw is a function of the seed and the fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.base.fault_text import Fault
+from coopenv.scenario import Scenario
+from coopenv.scenario.schema import neighbour_sets, processing_order
+
+if TYPE_CHECKING:
+    from coopenv.observers.mailbox import Interference
+    from coopenv.observers.recording import Recording
+
+DIRECTION = np.array([0.6, 0.8, 0.0])
+"""Of a false position, map axes: horizontal, and along no road."""
+
+
+def with_deliveries(recording: Recording, kept: np.ndarray) -> Recording:
+    """Deliver only some messages, by a mask (K, N receiver, N sender) or less; the last received one stays known."""
+    inbox = recording.inbox_tick
+    news = np.diff(inbox, axis=0, prepend=-1) > 0
+    return replace(recording, inbox_tick=np.maximum.accumulate(np.where(news & kept, inbox, -1), axis=0))
+
+
+def with_loss(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Lose each message, per receiver, with a probability in [0, 1]."""
+    drawn = np.random.default_rng([seed, 1]).random(recording.inbox_tick.shape)
+    return with_deliveries(recording, drawn >= fault.value)
+
+
+def with_delay(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Deliver every message later, by a time that is rounded to whole ticks."""
+    ticks = min(round(fault.value / recording.dt), recording.ticks)
+    inbox = np.full_like(recording.inbox_tick, -1)
+    inbox[ticks:] = recording.inbox_tick[: recording.ticks - ticks]
+    return replace(recording, inbox_tick=inbox)
+
+
+def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Swap bearings within frames so that a share of all bearings carry the identity of another visible target.
+
+    Every bearing starts a swap with another one of its frame, drawn at random, with half that probability, so that
+    it is part of one with (nearly) the whole. A frame with a single bearing stays as it is.
+    """
+    bearings = recording.bearings.copy()
+    generator = np.random.default_rng([seed, 2])
+    starts = recording.visible & (generator.random(recording.visible.shape) < fault.value / 2)
+    partners = generator.random(recording.visible.shape)
+    for k, i, target in np.argwhere(starts):
+        others = np.flatnonzero(recording.visible[k, i])
+        others = others[others != target]
+        if len(others):
+            pair = [target, others[int(partners[k, i, target] * len(others))]]
+            bearings[k, i, pair] = bearings[k, i, pair[::-1]]
+    return replace(recording, bearings=bearings)
+
+
+def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Hide all landmarks from a time on, for a duration."""
+    start = fault.start_in(float(recording.t[-1]))
+    lost = (recording.t >= start) & (recording.t < start + fault.duration)
+    landmarks = np.arange(recording.visible.shape[2]) < recording.landmarks.shape[1]
+    hidden = lost[:, None, None] & landmarks
+    bearings = np.where(hidden[..., None], np.nan, recording.bearings)
+    return replace(recording, visible=recording.visible & ~hidden, bearings=bearings)
+
+
+def with_jammer(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Lose what arrives in the range of jammers, as `[faults.jammer]` of a scenario does.
+
+    Raises:
+        CoopenvError: the range is limited and true positions are not known.
+    """
+    options, position = fault.options, recording.truth.position
+    since = (np.arange(recording.ticks) - _first_tick(recording, fault)) * recording.dt + 1e-9
+    share = since / options.get("period", 1.0)
+    on = (since >= 0.0) & (since < fault.duration) & (share - np.floor(share) < options.get("duty", 1.0))
+    jammed = np.broadcast_to(on[:, None], position.shape[:2])
+    if fault.value < math.inf:
+        if not recording.truth.known.all():
+            raise CoopenvError(f"fault {fault.text}: true positions are not known, leave its range out")
+        origin = np.zeros(3) if recording.scenario is None else np.array(recording.scenario.map.origin)
+        fixed = np.array([[options.get(axis, 0.0) for axis in "xyz"]]) - origin
+        sources = position[:, _indices(recording, fault)] if fault.vehicles else fixed[None]
+        distance = np.linalg.norm(position[:, :, None] - sources[:, None], axis=-1).min(axis=-1)
+        jammed = jammed & (distance <= fault.value)
+    return with_deliveries(recording, ~jammed[:, :, None])
+
+
+def with_map_error(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Shift landmarks on the vehicles' maps, as `[faults.map_error]` of a scenario does; default: all of both."""
+    false, names = _interference(recording), recording.setups[0].target_names
+    marks = [names.index(fault.word)] if fault.word else [*range(recording.landmarks.shape[1])]
+    drawn = np.random.default_rng([seed, 3]).random((2, recording.landmarks.shape[1]))[:, marks]
+    angle = fault.options.get("angle", 2.0 * math.pi * drawn[0])
+    offset = fault.value + fault.options.get("spread", 0.0) * drawn[1]
+    entries = np.ix_(_indices(recording, fault), marks)
+    false.map_error[entries] = offset[:, None] * _horizontal(np.broadcast_to(angle, len(marks)))
+    false.map_tick[entries] = _first_tick(recording, fault)
+    return replace(recording, interference=false)
+
+
+def _horizontal(angle: np.ndarray) -> np.ndarray:
+    """Return (..., 3) the horizontal directions at angles (...) from the map's x axis, rad."""
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+
+
+def _indices(recording: Recording, fault: Fault) -> list[int]:
+    """Return the vehicles that have a fault; all if none is named."""
+    names = [setup.name for setup in recording.setups]
+    return [names.index(name) for name in fault.vehicles or names]
+
+
+def _first_tick(recording: Recording, fault: Fault) -> int:
+    """Return the first tick of a fault."""
+    return math.ceil(fault.start_in(float(recording.t[-1])) / recording.dt - 1e-6)
+
+
+def _interference(recording: Recording) -> Interference:
+    """Return a copy of a recording's interference that may be written to; one without any fault if it has none."""
+    from coopenv.observers.mailbox import Interference
+
+    K, N, L = recording.ticks, len(recording.setups), recording.landmarks.shape[1]
+    return deepcopy(recording.interference) or Interference(
+        shift=np.zeros((K, N, 3)),
+        turn=np.zeros((K, N, 3)),
+        std=np.zeros((K, N)),
+        replay=np.zeros((K, N), np.int64),
+        clock=np.zeros(N, np.int64),
+        restarts=np.zeros((K, N), bool),
+        kept=np.zeros(N, np.int64),
+        consistent=np.zeros(N, bool),
+        map_error=np.zeros((N, L, 3)),
+        map_tick=np.full((N, L), -1),
+    )
+
+
+def with_lie(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let vehicles broadcast another pose, as `[faults.lie]` of a scenario does; default: the usual sender."""
+    period, false = recording.period, _interference(recording)
+    senders = _indices(recording, fault) if fault.vehicles else [usual_sender(recording)]
+    since = np.arange(recording.ticks) - _first_tick(recording, fault)
+    lying = since >= 0
+    direction = _horizontal(np.array(fault.options["angle"])) if "angle" in fault.options else DIRECTION
+    for sender in senders:
+        if fault.word == "replay":
+            false.kept[sender] = period * max(1, round(fault.value / (recording.dt * period)))
+            false.replay[lying, sender] = false.kept[sender]
+        else:
+            size = fault.value * (since * recording.dt if fault.word == "drift" else np.ones(len(since)))
+            false.shift[lying, sender] += (size[:, None] * direction)[lying]
+            false.turn[lying, sender, 2] += fault.options.get("turn", 0.0)
+        false.consistent[sender] = fault.options.get("honest_odometry", 0.0) == 0.0
+        if "std" in fault.options:
+            false.std[lying, sender] = fault.options["std"]
+    return replace(recording, interference=false)
+
+
+NO_FOLLOWERS = "no vehicle has another one as its neighbour"
+
+
+def leaders_of(world: Recording | Scenario) -> list[int]:
+    """Return the vehicles, in the order of estimation, that another one has as its neighbour."""
+    sets: Sequence[Any]
+    if isinstance(world, Scenario):
+        sets, landmarks = neighbour_sets(world), len(world.landmarks)
+        order: Iterable[int] = processing_order(world, sets)
+    else:
+        sets, landmarks, order = [setup.targets for setup in world.setups], world.setups[0].landmarks, world.order
+    return [i for i in order if any(landmarks + i in targets for targets in sets)]
+
+
+def usual_sender(world: Recording | Scenario) -> int:
+    """Return the second vehicle, in the order of estimation, that has followers, or the only one.
+
+    The first one is mostly seen by vehicles that see the landmarks, too.
+
+    Raises:
+        CoopenvError: no vehicle has followers.
+    """
+    leaders = leaders_of(world)
+    if not leaders:
+        raise CoopenvError(NO_FOLLOWERS)
+    return leaders[min(1, len(leaders) - 1)]
