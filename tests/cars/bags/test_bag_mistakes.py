@@ -270,9 +270,10 @@ def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> Non
 
 
 def test_the_map_of_the_page_is_one(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "bags.md").read_text(encoding="utf-8")
-    first, *others = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    assert opened(tmp_path, "\n".join([first, *others])).capabilities.truth
+    docs = Path(__file__).parents[3] / "docs"
+    pages = [(docs / name).read_text(encoding="utf-8") for name in ("tutorials/logs.md", "bags.md")]
+    first, others = (re.findall(r"```toml[^\n]*\n(.*?)```", page, re.DOTALL) for page in pages)
+    assert opened(tmp_path, "\n".join([first[0], *others])).capabilities.truth
 
 
 def test_a_camera_with_another_rate_is_told(tmp_path: Path) -> None:

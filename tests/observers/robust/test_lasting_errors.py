@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.observers.robust.constants import GYRO_BIAS
 from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
@@ -40,15 +41,15 @@ def normalised_errors(world: World) -> np.ndarray:
 
 
 def test_a_small_bias_is_estimated_where_none_is_declared() -> None:
-    """Its prior deviation is a fifth of that of a gyro's sample, and the vehicle that sees landmarks reduces it."""
+    """Its prior deviation is that of the constants, and the vehicle that sees landmarks reduces it."""
     scenario = load_scenario("busy_intersection_tracking", ROBUST)
-    world, prior = simulate(scenario, 1), (0.2 * scenario.noise.angular_velocity) ** 2
+    world, prior = simulate(scenario, 1), GYRO_BIAS**2
     reset(world)
     memory: Any = world.memory
     assert (memory.belief.numpy()["others"] == 2).all()
     np.testing.assert_allclose(np.einsum("wnii->wni", memory.P.numpy()[:, :, 1, 1])[..., :3], prior)
-    world.advance(480)
-    assert (memory.P.numpy()[0, 0, 1, 1].diagonal()[:3] < 0.5 * prior).all()
+    world.advance(480)  # 8 s, in which it would walk by eight times as much
+    assert (memory.P.numpy()[0, 0, 1, 1].diagonal()[:3] < 0.5 * (1.0 + 8.0) * prior).all()
 
 
 @pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY])
