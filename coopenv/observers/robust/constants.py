@@ -17,10 +17,10 @@ MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on 
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
-"""s. Short: between two looks at the monitors; after which a silent sender may have restarted; for which solutions of a
-search have to be clear. Mean: of recent means; for which lasting errors and those of messages are the same in all
-frames; after which what is out of view is given up first. Long: for which an excluded source stays so, bearings may
-refuse the belief before a search begins, and a search is patient. Chosen."""
+"""s. Short: between two looks at the monitors; after which a silent sender may have restarted; for which a hypothesis is
+tracked at least. Mean: of recent means; for which lasting errors and those of messages are the same in all frames;
+after which what is out of view is given up first. Long: for which an excluded source stays so, bearings may refuse the
+belief before a search begins, and a search is patient. Chosen."""
 
 # Belief
 
@@ -60,7 +60,8 @@ and the pose is an anchor. Chosen: one wrong association of two does not exceed 
 # Messages
 
 NEWS_TIME = 0.2
-"""s between the reports of a sender that are fused; of those in between only the odometry is used. Chosen."""
+"""s between the reports of a sender that are fused; of those in between only the odometry is used. Also for which all
+solutions of a search must be well determined, and from a frame in which they are not to the next attempt. Chosen."""
 STEPS = 127  # of a correlation in a message, from 0 to 1
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
 CORRELATION_VALIDITY = 1.037

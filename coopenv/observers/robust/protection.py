@@ -23,30 +23,33 @@ QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along
 
 @wp.func
 def own_variances(up: Any, P: Any):
-    """Return (2,) horizontal variance, m^2, and angular variance, rad^2, of a left error; up: the vertical, body."""
-    level = vec2d(P[3, 3] + P[4, 4] + P[5, 5], P[0, 0] + P[1, 1] + P[2, 2])
+    """Return (2,) sums of horizontal, m^2, and angular variances, rad^2, of a left error of covariance P, 6x6.
+
+    `up` (3,) is the vertical in the body frame.
+    """
+    variances = vec2d(P[3, 3] + P[4, 4] + P[5, 5], P[0, 0] + P[1, 1] + P[2, 2])
     for i in range(3):
         for j in range(3):
-            level[0] -= up[i] * P[3 + i, 3 + j] * up[j]
-    return level
+            variances[0] -= up[i] * P[3 + i, 3 + j] * up[j]
+    return variances
 
 
 @wp.func
 def fault_variances(up: Any, Phi: Any, C: Any):
-    """Return likewise those of Phi f, with the covariance C of the fault f."""
+    """Return likewise those of Phi f: Phi 6x3, and C 3x3 the covariance of the fault f."""
     vertical = vec3d()
-    level = vec2d()
+    variances = vec2d()
     for i in range(3):
-        level[0] += wp.dot(Phi[i + 3], C * Phi[i + 3])
-        level[1] += wp.dot(Phi[i], C * Phi[i])
+        variances[0] += wp.dot(Phi[i + 3], C * Phi[i + 3])
+        variances[1] += wp.dot(Phi[i], C * Phi[i])
         vertical += up[i] * Phi[i + 3]
-    level[0] -= wp.dot(vertical, C * vertical)
-    return level
+    variances[0] -= wp.dot(vertical, C * vertical)
+    return variances
 
 
 @wp.func
 def levels(up: Any, variances: Any, mean: Any):
-    """Return (2,) bounds of the horizontal error, m, and of the angle, rad, of a left error of a mean and variances.
+    """Return (2,) bounds of horizontal, m, and angular errors, rad: a left error of mean (6,) and variances (2,).
 
     The sum of variances bounds the variance along any axis.
     """

@@ -135,15 +135,13 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
     if number > 0:
         n = (number - 1) // 10
         axis = (number - 1) % 5
-        step = wp.float64(constants.MARGIN)
-        if (number - 1) // 5 % 2 == 1:
-            step = -step
+        side = wp.where((number - 1) // 5 % 2 == 1, wp.float64(-1.0), wp.float64(1.0))
         if axis < 2:
-            across = step * wp.sqrt(frame.variance)
+            across = side * wp.float64(constants.MARGIN) * wp.sqrt(frame.variance)
             b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
         else:
-            variance = memory.measurement[world, triple[n]].variance  # with the factor of `received_variance`
-            z[n, axis - 2] = z[n, axis - 2] + wp.where(step > wp.float64(0.0), wp.sqrt(variance), -wp.sqrt(variance))
+            variance = memory.measurement[world, triple[n]].variance  # `received_variance` has the squared margin
+            z[n, axis - 2] = z[n, axis - 2] + side * wp.sqrt(variance)
             exists = variance > wp.float64(0.0)
     return exists, b, z
 
