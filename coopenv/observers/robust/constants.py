@@ -17,7 +17,7 @@ MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on 
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
-"""s. Short: between two looks at the monitors; after which a silent sender may have restarted; for which a hypothesis is
+"""s. Short: between two looks at the monitors; after which a silent sender may restart; for which a hypothesis is
 tracked at least. Mean: of recent means; for which lasting errors and those of messages are the same in all frames;
 after which what is out of view is given up first. Long: for which an excluded source stays so, bearings may refuse the
 belief before a search begins, and a search is patient. Chosen."""
