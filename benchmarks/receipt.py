@@ -28,8 +28,9 @@ LIAR = 1
 """The vehicle that lies."""
 AT = 12.0
 """s, from when on there is a fault, but for one of the map."""
-CASES = ("nominal", "landmark", "bias", "random", "jump", "drift")
-"""In busy_intersection_tracking and on the road of `benchmarks.evidence`; the last two are lies, in the first scene."""
+LIES = {"jump": f"lie=jump:1@{AT:g}", "drift": f"lie=drift:0.2@{AT:g},honest_odometry=1"}
+CASES = ("nominal", "landmark", "bias", "random", *LIES)
+"""In busy_intersection_tracking and on the road of `benchmarks.evidence`; lies in the first scene alone."""
 
 
 def parts() -> dict[str, list[tuple[Any, str, Any]]]:
@@ -43,15 +44,14 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     from coopenv.world.warp_internals import device_function
 
     @device_function
-    def no_landmark(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any) -> int:
+    def no_landmark(memory: Any, world: int, i: int, target: int, tick: int, landmark: bool, period: Any):  # type: ignore[no-untyped-def]
         if landmark:
             return -1
-        slot: int = take_slot(memory, world, i, target, tick, landmark, period)
-        return slot
+        return take_slot(memory, world, i, target, tick, landmark, period)
 
     @device_function
-    def no_offsets(memory: Any, world: int, i: int, time: Any) -> int:
-        count: int = end_block(memory, world, i, time)
+    def no_offsets(memory: Any, world: int, i: int, time: Any):  # type: ignore[no-untyped-def]
+        count = end_block(memory, world, i, time)
         for q in range(1, 1 + SENDER_SLOTS):
             memory.source[world, i, q].ratio = wp.float64(0.0)
         return count
@@ -104,8 +104,8 @@ def numbers() -> list[str]:
     return [n for n, value in vars(constants).items() if n.isupper() and isinstance(value, float) and n != "THIRD"]
 
 
-def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
-    """Return, for a part that is left out or CONSTANT*FACTOR, the values by case of every seed."""
+def leave_out(variant: str) -> None:
+    """Replace what a part consists of, or multiply a constant, before anything is compiled: a part, or NAME*FACTOR."""
     if "*" in variant:
         from coopenv.observers.robust import constants
 
@@ -114,49 +114,63 @@ def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
     else:
         for module, name, value in parts()[variant]:
             setattr(module, name, value)
+
+
+def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
+    """Return the values by case of every seed, with a part left out or a constant changed."""
+    leave_out(variant)
     from benchmarks import evidence
-    from coopenv.bench.observers.faults import variant_of
-    from coopenv.observers import run
-    from coopenv.observers.robust.observer import robust
     from coopenv.runs import record
 
-    changes: dict[str, Callable[..., Any]] = {
-        "nominal": evidence.unchanged,
-        "landmark": evidence.landmark_moved(3.0),
-        "bias": evidence.bias_step(np.radians(1.0)),
-        "random": evidence.random_bearings(0.1),
-    }
-    lies = {"jump": f"lie=jump:1@{AT:g}", "drift": f"lie=drift:0.2@{AT:g},honest_odometry=1"}
     found: dict[str, Any] = {"exclusions": 0.0, "hours": 0.0, "delay": [], "rmse": {}}
     begin = time.process_time()
     for scene, made in (("tracking", evidence.tracking()), ("road", evidence.road())):
         for seed in seeds:
             recording = record(made, seed)
-            names = [setup.name for setup in recording.setups]
             for case in CASES if scene == "tracking" else CASES[:4]:
-                watched: list[Any] = []
-
-                def factory(setup: Any, watched: list[Any] = watched) -> Any:
-                    watched.append(Watched(robust(setup)))
-                    return watched[-1]
-
-                if case in lies:
-                    changed = variant_of(f"{names[LIAR]}:{lies[case]}").applied(recording, seed)
-                else:
-                    changed = changes[case](recording, np.random.default_rng(seed))
-                result = run(factory, changed)
-                honest = np.arange(len(names)) != LIAR if case in lies else np.full(len(names), True)
-                error = result.position_rmse(evidence.JUDGED_FROM)[honest].mean()
-                found["rmse"].setdefault(f"{scene} {case}", []).append(float(error))
-                if case == "nominal":
-                    found["exclusions"] += sum(len(observer.times) for observer in watched)
-                    found["hours"] += len(names) * float(recording.t[-1]) / 3600.0
-                if case in lies:
-                    target = len(recording.landmarks[0]) + LIAR
-                    first = [next((t for t, q in w.times if q == target), np.inf) for w in watched]
-                    found["delay"] += [t - AT for w, t in zip(watched, first, strict=True) if w.sees(target)]
+                add_case(found, scene, case, recording, seed)
     found["seconds"] = time.process_time() - begin
     return found
+
+
+def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed: int) -> None:
+    """Run the observers on a changed recording, and add what they show to the values found."""
+    from benchmarks import evidence
+    from coopenv.observers import run
+    from coopenv.observers.robust.observer import robust
+
+    names = [setup.name for setup in recording.setups]
+    watched = [Watched(robust(setup)) for setup in recording.setups]
+    changed = change_of(case, names[LIAR])(recording, np.random.default_rng(seed))
+    result = run(lambda setup: watched[names.index(setup.name)], changed)
+    if result.failure:
+        raise RuntimeError(result.failure)
+    lies = case in LIES
+    honest = np.arange(len(names)) != LIAR if lies else np.full(len(names), True)
+    errors = result.position_rmse(evidence.JUDGED_FROM)[honest]
+    found["rmse"].setdefault(f"{scene} {case}", []).append(float(errors.mean()))
+    if case == "nominal":
+        found["exclusions"] += sum(len(observer.times) for observer in watched)
+        found["hours"] += len(names) * float(recording.t[-1]) / 3600.0
+    if lies:
+        target = len(recording.landmarks[0]) + LIAR
+        first = [next((t for t, q in w.times if q == target), np.inf) for w in watched]
+        found["delay"] += [t - AT for w, t in zip(watched, first, strict=True) if w.sees(target)]
+
+
+def change_of(case: str, liar: str) -> Callable[..., Any]:
+    """Return what changes a recording as in a case; its arguments are the recording and a generator."""
+    from benchmarks import evidence
+    from coopenv.bench.observers.faults import variant_of
+
+    if case in LIES:
+        return lambda recording, random: variant_of(f"{liar}:{LIES[case]}").applied(recording, 0)
+    return {
+        "nominal": evidence.unchanged,
+        "landmark": evidence.landmark_moved(3.0),
+        "bias": evidence.bias_step(np.radians(1.0)),
+        "random": evidence.random_bearings(0.1),
+    }[case]
 
 
 class Watched:

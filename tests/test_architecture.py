@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3080, 12),
     "training": (1160, 5),
     "viz": (4450, 17),
-    "world": (4300, 17),
+    "world": (4310, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -1,8 +1,8 @@
 """The pipeline of one camera tick as kernels: those of a source of ticks, and those of an observer.
 
-A decision is `decide`, then per tick `sense` (the source) and `follow` (the observer: receive, estimate, send). Neither
-knows the other, so that each is compiled once per precision. For a small observer of simulated worlds
-(`Embedded.fused`) one kernel of its own, `advance`, runs all ticks of a decision without leaving a world.
+An episode starts with `begin`. A decision is `decide`, then per tick `sense` (the source) and `follow` (the observer:
+receive, estimate, send). Neither knows the other, so that each is compiled once per precision. For a small observer of
+simulated worlds (`Embedded.fused`) one kernel, `advance`, runs all ticks of a decision without leaving a world.
 """
 
 from functools import cache
@@ -60,9 +60,11 @@ def _follow_tick(observer: Embedded) -> Any:
     return follow_tick
 
 
-@cache
-def begin_kernel(source: Source, p: Precision) -> wp.Kernel:
-    """Return the kernel that starts the next episode in every world whose mask is set; the observer starts then."""
+def _begin(source: Source, p: Precision) -> Any:
+    """Return the function of the kernel that starts the next episode in every world whose mask is set.
+
+    Observers start then. It shares most functions with the kernels that sense, and so their modules.
+    """
     Model, State, Record, begin_episode = model_struct(p), state_struct(p), source.record(p), source.begin
 
     def begin(model: Model, state: State, record: Record, mask: wp.array(dtype=wp.int32)):
@@ -76,12 +78,12 @@ def begin_kernel(source: Source, p: Precision) -> wp.Kernel:
                 deliver(model, state, world, vehicle, 0)
                 broadcast_estimate(model, state, world, vehicle, 0)
 
-    return module_kernels(f"begin_{source.name}", p, begin, max_unroll=1)["begin"]
+    return begin
 
 
 @cache
 def source_kernels(source: Source, p: Precision) -> Kernels:
-    """Return `decide` and `sense`, the stages before the observers; worlds marked in `hold` stay as they are."""
+    """Return `begin`, `decide` and `sense`, the stages before observers; worlds marked in `hold` stay as they are."""
     Model, State, Record, Hold = model_struct(p), state_struct(p), source.record(p), wp.array(dtype=wp.int32)
     sense_tick = source.sense
 
@@ -97,7 +99,7 @@ def source_kernels(source: Source, p: Precision) -> Kernels:
         if is_active(model, state, hold, world):
             sense_tick(model, state, record, world, state.tick[world] + 1)
 
-    return module_kernels(f"sense_{source.name}", p, decide, sense, max_unroll=1)
+    return module_kernels(f"sense_{source.name}", p, _begin(source, p), decide, sense, max_unroll=1)
 
 
 @cache
@@ -169,8 +171,8 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
 
 
 @cache
-def fused_kernel(source: Source, observer: Embedded, p: Precision) -> wp.Kernel:
-    """Return the kernel that runs whole decisions of a source and an observer."""
+def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
+    """Return `begin`, and `advance`, which runs whole decisions of a source and an observer."""
     Model, State, Memory, Record = model_struct(p), state_struct(p), observer.memory, source.record(p)
     sense_tick, follow_tick = source.sense, _follow_tick(observer)
 
@@ -193,7 +195,7 @@ def fused_kernel(source: Source, observer: Embedded, p: Precision) -> wp.Kernel:
             sense_tick(model, state, record, world, tick)
             follow_tick(model, state, memory, world, tick)
 
-    return module_kernels(f"advance_{source.name}_{observer.name}", p, advance, **observer.options)["advance"]
+    return module_kernels(f"{source.name}_{observer.name}", p, _begin(source, p), advance, **observer.options)
 
 
 @cache

@@ -28,7 +28,7 @@ from coopenv.world.state import (
     state_sizes,
     state_struct,
 )
-from coopenv.world.step import begin_kernel, fused_kernel, host_kernels, observer_kernels, source_kernels
+from coopenv.world.step import Kernels, fused_kernels, host_kernels, observer_kernels, source_kernels
 
 Keys = Sequence[int | None] | np.ndarray | None
 Options = Mapping[str, Any] | None
@@ -159,9 +159,16 @@ class World:
         self.restart()
         self.mask.zero_()
 
+    @property
+    def _world_kernels(self) -> Kernels:
+        """Those of the source with the observer, or without it."""
+        if self.observer.fused and self.source.fused:
+            return fused_kernels(self.source, self.observer, self.precision)
+        return source_kernels(self.source, self.precision)
+
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
-        self._run("begin", begin_kernel(self.source, self.precision), self._record, PerWorld(self.mask))
+        self._run("begin", self._world_kernels["begin"], self._record, PerWorld(self.mask))
         if self.observer.starts:
             start = observer_kernels(self.observer, self.precision)["start"]
             self._run("start", start, PerWorld(self.memory), PerWorld(self.mask))
@@ -172,12 +179,12 @@ class World:
         if self.model.restarts == 1:
             revive = observer_kernels(self.observer, self.precision)["revive"]
             self._run(("revive", ticks), revive, memory, hold, ticks)
-        if self.observer.fused and self.source.fused:
-            kernel = fused_kernel(self.source, self.observer, self.precision)
+        sensing = self._world_kernels
+        if "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
-            self._run(("advance", ticks), kernel, *arguments)
+            self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
-            world, sensing = [self.model, PerWorld(self.state)], source_kernels(self.source, self.precision)
+            world = [self.model, PerWorld(self.state)]
             decide = sensing["decide"], [*world, PerWorld(self.actions), hold]
             sense = sensing["sense"], [*world, self._record, hold]
             follow = observer_kernels(self.observer, self.precision)["follow"], [*world, memory, hold]

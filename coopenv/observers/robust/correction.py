@@ -56,18 +56,18 @@ def set_gain(memory: Any, world: int, i: int, n: int):
 
 @device_function
 def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool, projecting: bool):
-    """Find the correction by all bearings that fit, without a change of the covariance; return the sum of their NIS.
+    """Find the correction by all bearings that fit, without a change of the covariance.
 
     A sequential update with the residuals that the earlier bearings leave equals the batch update. With `gating`, the
     bearings are those that the gate has linearised and projected; bearings to members are gated again sequentially.
-    Considered members are not corrected.
+    Rejected bearings correct nothing; for the monitors, their innovation is limited to the gate. Considered members are
+    not corrected.
     """
-    total = wp.float64(0.0)
     members = memory.belief[world, i].members
     for k in range(members):
         memory.scratch[world, k].correction = vec6d()
     for n in range(bearings):
-        if memory.measurement[world, n].fits == 1:
+        if memory.measurement[world, n].fits != 0:
             if projecting:
                 project(memory, world, i, n)
             set_gain(memory, world, i, n)
@@ -78,20 +78,20 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                 if k >= 0:
                     left = memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
                     residual = residual + memory.derivative[world, n, part].jacobian * left
-            memory.measurement[world, n].innovation = residual
             weighted = memory.measurement[world, n].weight * residual
             nis = wp.dot(weighted, residual)
             if gating and member > 0 and nis > wp.float64(constants.BEARING_GATE):
-                memory.measurement[world, n].fits = 0
-            else:
-                total += nis
+                memory.measurement[world, n].fits = -1
+            if memory.measurement[world, n].fits == -1:
+                residual = residual * wp.sqrt(wp.min(wp.float64(constants.BEARING_GATE) / nis, wp.float64(1.0)))
+            memory.measurement[world, n].innovation = residual
+            if memory.measurement[world, n].fits == 1:
                 for k in range(members):
                     correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
                     memory.scratch[world, k].correction = correction
     for k in range(members):
         if not is_free(memory, world, i, k):
             memory.scratch[world, k].correction = vec6d()
-    return total
 
 
 @device_function

@@ -343,17 +343,13 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, rec
     memory.known[world, 0] = Regressor(n, after, mat66d())
     sure = note_correlations(model, memory, world, i, n, after, received, count, True)
     count = note_correlations(model, memory, world, i, n, after, received, sure, False)
-    more = mat66d()
-    growth = wp.float64(0.0)
-    if count > 0:
+    left = solve_for(memory, world, i, after, count)
+    if sure > 0 and sure < count and not is_positive(left - wp.float64(constants.LEAST_SHARE) * after):
+        count = sure
         left = solve_for(memory, world, i, after, count)
-        if sure > 0 and sure < count:
-            if not is_positive(left - wp.float64(constants.LEAST_SHARE) * after):
-                count = sure
-                left = solve_for(memory, world, i, after, count)
-        larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
-        more = larger * (after + excess(left, after)) - after
-        growth = wp.sqrt(larger)
+    larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
+    more = larger * (after + excess(left, after)) - after
+    growth = wp.sqrt(larger)
     if count > wp.where(received, 1, 0):
         memory.member[world, i, n].correlation_unknown = 0
     for k in range(memory.belief[world, i].members):

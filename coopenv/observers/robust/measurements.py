@@ -142,6 +142,8 @@ def set_measurement_of_target(
     """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, target))
     sender = target - model.landmarks
+    if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
+        return False
     if sender < 0:
         point = vec3d(mapped_position(model, state, world, i, target))
         set_bearing_measurement(memory, world, frame.bearings, 0, b, point, wp.float64(0.0))
@@ -151,7 +153,6 @@ def set_measurement_of_target(
         return True
     received = is_received(model, state, memory, world, i, sender, frame.tick)
     if frame.purpose == SEARCH:
-        received = received and not is_excluded(memory, world, i, slot_of(memory, world, i, target))
         if received:
             variance = received_variance(model, memory, world, i, sender, frame)
             point = memory.inbox[world, i, sender].pose.p

@@ -49,7 +49,6 @@ from coopenv.observers.robust.measurements import (
     RESECTION,
     TRACKING,
     innovation_squared,
-    innovation_weight,
     set_bearing_measurements,
 )
 from coopenv.observers.robust.memory import (
@@ -117,13 +116,8 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
             memory.measurement[world, n].fits = 1
             fitting += 1
             total += nis
-        elif used and ahead and frame.purpose == TRACKING:  # for the monitors, limited to the gate
+        elif used and ahead and frame.purpose == TRACKING:  # for the monitors
             memory.measurement[world, n].fits = -1
-            memory.measurement[world, n].weight = innovation_weight(
-                memory, world, n, memory.measurement[world, n].noise
-            )
-            limit = wp.sqrt(wp.float64(constants.BEARING_GATE) / nis)
-            memory.measurement[world, n].innovation = limit * memory.measurement[world, n].residual
     share = wp.float64(-1.0)
     if counted > 0:
         share = wp.float64(missed) / wp.float64(counted)
