@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,18 @@ from coopenv.base.format import in_parentheses
 from coopenv.runs.console import Progress
 from coopenv.runs.page import table
 
-LIAR = 1
-"""The vehicle that lies."""
 AT = 12.0
-"""s, from when on there is a fault, but for one of the map."""
-LIES = {"jump": f"lie=jump:1@{AT:g}", "drift": f"lie=drift:0.2@{AT:g},honest_odometry=1"}
-CASES = ("nominal", "landmark", "bias", "random", *LIES)
-"""In busy_intersection_tracking and on the road of `benchmarks.evidence`; lies in the first scene alone."""
+"""s, from when on there is a fault, but for some of the map and of the scale."""
+CASES = ("nominal", "landmark", "bias", "random")
+"""In both scenes: busy_intersection_tracking, and the road of `benchmarks.evidence`."""
+LIES = {
+    "jump": f"vehicle_2:lie=jump:1@{AT:g}",
+    "drift": f"vehicle_2:lie=drift:0.2@{AT:g},honest_odometry=1",
+    "collusion": f"vehicle_1,vehicle_2:lie=collude:1@{AT:g}",
+}
+"""See `--fault` of `coopenv bench observers`."""
+TRACKING_CASES = (*CASES, "passing", "large bias", "scale", *LIES)
+"""In the first scene; passing: a landmark that is wrong for 4 s."""
 
 
 def parts() -> dict[str, list[tuple[Any, str, Any]]]:
@@ -127,7 +133,7 @@ def measure(variant: str, seeds: Sequence[int]) -> dict[str, Any]:
     for scene, made in (("tracking", evidence.tracking()), ("road", evidence.road())):
         for seed in seeds:
             recording = record(made, seed)
-            for case in CASES if scene == "tracking" else CASES[:4]:
+            for case in TRACKING_CASES if scene == "tracking" else CASES:
                 add_case(found, scene, case, recording, seed)
     found["seconds"] = time.process_time() - begin
     return found
@@ -141,36 +147,45 @@ def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed:
 
     names = [setup.name for setup in recording.setups]
     watched = [Watched(robust(setup)) for setup in recording.setups]
-    changed = change_of(case, names[LIAR])(recording, np.random.default_rng(seed))
+    changed = change_of(case)(recording, np.random.default_rng(seed))
     result = run(lambda setup: watched[names.index(setup.name)], changed)
     if result.failure:
         raise RuntimeError(result.failure)
-    lies = case in LIES
-    honest = np.arange(len(names)) != LIAR if lies else np.full(len(names), True)
-    errors = result.position_rmse(evidence.JUDGED_FROM)[honest]
-    found["rmse"].setdefault(f"{scene} {case}", []).append(float(errors.mean()))
+    liars = [n for n, name in enumerate(names) if name in LIES.get(case, "")]
+    errors = np.delete(result.position_rmse(evidence.JUDGED_FROM), liars)
+    found["rmse"].setdefault(f"{scene}: {case}", []).append(float(errors.mean()))
     if case == "nominal":
         found["exclusions"] += sum(len(observer.times) for observer in watched)
         found["hours"] += len(names) * float(recording.t[-1]) / 3600.0
-    if lies:
-        target = len(recording.landmarks[0]) + LIAR
+    for liar in liars:
+        target = len(recording.landmarks[0]) + liar
         first = [next((t for t, q in w.times if q == target), np.inf) for w in watched]
         found["delay"] += [t - AT for w, t in zip(watched, first, strict=True) if w.sees(target)]
 
 
-def change_of(case: str, liar: str) -> Callable[..., Any]:
+def change_of(case: str) -> Callable[..., Any]:
     """Return what changes a recording as in a case; its arguments are the recording and a generator."""
     from benchmarks import evidence
     from coopenv.bench.observers.faults import variant_of
 
     if case in LIES:
-        return lambda recording, random: variant_of(f"{liar}:{LIES[case]}").applied(recording, 0)
+        return lambda recording, random: variant_of(LIES[case]).applied(recording, 0)
     return {
         "nominal": evidence.unchanged,
         "landmark": evidence.landmark_moved(3.0),
+        "passing": passing,
         "bias": evidence.bias_step(np.radians(1.0)),
+        "large bias": evidence.bias_step(np.radians(5.0)),
+        "scale": evidence.scale_drift(0.1),
         "random": evidence.random_bearings(0.1),
     }[case]
+
+
+def passing(recording: Any, random: Any) -> Any:
+    """Return a recording in which the second landmark of the maps is 3 m off from `AT` on for 4 s."""
+    landmarks = recording.landmarks.copy()
+    landmarks[(recording.t >= AT) & (recording.t < AT + 4.0), 1] += (1.8, 2.4, 0.0)
+    return replace(recording, landmarks=landmarks)
 
 
 class Watched:
@@ -214,8 +229,8 @@ def constant_table(results: dict[str, dict[str, Any]]) -> str:
     base, rows = results["nothing"]["rmse"], []
     for variant, found in results.items():
         ratio = {case: float(np.mean(values) / np.mean(base[case])) for case, values in found["rmse"].items()}
-        nominal = [r for case, r in ratio.items() if case.endswith("nominal")]
-        faults = [r for case, r in ratio.items() if not case.endswith("nominal")]
+        nominal = [r for case, r in ratio.items() if case.endswith(": nominal")]
+        faults = [r for case, r in ratio.items() if not case.endswith(": nominal")]
         cells = (f"{np.mean(nominal):.2f}", f"{np.mean(faults):.2f}", f"{max(faults):.2f}")
         rows.append([variant, *cells, f"{found['exclusions'] / found['hours']:.1f}"])
     return table(["number", "without fault", "faults, mean", "faults, worst", "false exclusions, 1/h"], rows)
