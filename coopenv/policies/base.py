@@ -53,10 +53,14 @@ def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarr
 def act(policy: Policy, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the action of every agent of a `ParallelEnv` that a policy chooses from its flat observations.
 
-    As agents end, rows vanish, so the policy must remember nothing.
+    A policy with an attribute `agents` (their names in order) gets a row for each of them, 0 for those that have ended.
     """
-    actions = policy(np.stack(list(observations.values())))
-    return dict(zip(observations, actions, strict=True))
+    names = [*observations]
+    if {*names} <= {*(all_names := getattr(policy, "agents", ()))}:
+        names = [*all_names]
+    ended = np.zeros_like(next(iter(observations.values())))
+    actions = policy(np.stack([observations.get(name, ended) for name in names]))
+    return {name: action for name, action in zip(names, actions, strict=True) if name in observations}
 
 
 def zero_policy(seed: int = 0, width: int = 2) -> Policy:

@@ -6,6 +6,7 @@ import numpy as np
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.scenario import Scenario
+from coopenv.scenario.schema import neighbour_sets
 
 MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
 """Of `observation.route_step`: how far ahead the entries of `route_ahead` are."""
@@ -38,6 +39,8 @@ class Driver(ABC):
         if scenario.action.longitudinal != "speed":
             raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
         self.layout = observation_layout(scenario)
+        self.agents = scenario.target_names[len(scenario.landmarks) :]
+        """Names of the vehicles in the order of rows."""
         known = {*self.layout, "route" if {"route_ahead", "goal"} & {*self.layout} else ""}
         if missing := [name for name in (*self.needs, "route") if name not in known]:
             raise ValueError(f"the observation lacks {', '.join(missing)} (route: the group route or goal)")
@@ -139,6 +142,8 @@ class RouteFollower(Driver):
     """Pure pursuit of the route by the vehicle's own estimate; stops where driving on comes too close to vehicles.
 
     In the leader-follower order a vehicle receives from its leaders only, so giving way to senders cannot deadlock.
+    Where all driven vehicles receive each other's messages, those before it in order have the right of way, and it
+    waits for the others only while they block its way.
     """
 
     clearance = 0.9
@@ -154,6 +159,10 @@ class RouteFollower(Driver):
         self.clearance, self.closest = max(self.clearance, least), max(self.closest, least)
         stopping = self.cruise / scenario.dynamics.max_acceleration
         nimble = stopping <= SOON
+        self.goes_first = right_of_way(scenario)
+        """(N, N - 1), whether a vehicle has the right of way over the sender of each message."""
+        self.blocking = (self.length + self.width) / 2.0 + 0.4 * GAP
+        """Distance, m, below which a vehicle blocks the way."""
         self.foresight = 6.0 if nimble else stopping + REACTION
         """How far ahead to look for others, s."""
         self.paces = (1.0,) if nimble else (0.0, 0.5, 1.0)
@@ -183,13 +192,20 @@ class RouteFollower(Driver):
         points, distance = self.route_points(observations)
         velocities = [pace * self.cruise * forward for pace in self.paces]
 
+        keep, times = self.distance_to_keep(observations), distance / self.cruise
+        clear, first = np.ones(len(mask), dtype=bool), self.goes_first
+        if first.any() and len(mask) % len(first) == 0:
+            near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
+            clear = nearest(points, times, place, 0.0 * forward, mask, SOON) >= np.minimum(self.blocking, near)
+            mask = mask & ~np.tile(first, (len(mask) // len(first), 1))
+
         def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
             found = [nearest(path, times, place, velocity, mask, self.foresight) for velocity in velocities]
             return np.asarray(np.min(found, axis=0))
 
-        going = least(points, distance / self.cruise)
+        going = least(points, times)
         waiting = least(np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0]))
-        return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
+        return np.where(clear & ((going >= keep) | (going > waiting)), self.cruise, 0.0)
 
     def distance_to_keep(self, observations: np.ndarray) -> np.ndarray:
         """Return the distances to keep, (rows,) in m: they grow with the standard deviation of the own position."""
@@ -197,6 +213,19 @@ class RouteFollower(Driver):
             return np.full(len(observations), self.clearance)
         std = 10.0 ** self.read(observations, "position_std")[:, 0]
         return np.asarray(np.minimum(self.closest + std, self.clearance))
+
+
+def right_of_way(scenario: Scenario) -> np.ndarray:
+    """Return over whose messages each vehicle has the right of way, (N, N - 1): of driven vehicles after it in order.
+
+    None, where some driven vehicle does not receive another one's messages.
+    """
+    driven = np.array([vehicle.motion.kind == "driven" for vehicle in scenario.vehicles])
+    first, landmarks = np.triu(driven[:, None] & driven, 1), len(scenario.landmarks)
+    if scenario.v2x.links != "all":
+        receives = np.array([np.isin(np.arange(len(driven)) + landmarks, row) for row in neighbour_sets(scenario)])
+        first &= bool((receives | ~(driven[:, None] & driven) | np.eye(len(driven), dtype=bool)).all())
+    return np.asarray(first[~np.eye(len(driven), dtype=bool)].reshape(len(driven), -1))
 
 
 def nearest(

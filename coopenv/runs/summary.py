@@ -162,7 +162,7 @@ def _v2x(scenario: Scenario) -> str:
         f"loss {number(100 * radio.loss)} %",
         radio.range is not None and f"range {number(radio.range)} m",
         radio.staleness is not None and f"unused when older than {number(radio.staleness)} s",
-        scenario.topology.acyclic and "leaders to followers only",
+        scenario.topology.acyclic and radio.links == "neighbours" and "leaders to followers only",
     )
 
 

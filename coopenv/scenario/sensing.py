@@ -186,6 +186,9 @@ class Topology(Section):
 class V2x(Section):
     """The radio that carries pose estimates between vehicles."""
 
+    links: Literal["neighbours", "all"] = "neighbours"
+    """Whose messages a vehicle receives: those of the vehicles that it may measure, or of all in range. Its estimator
+    uses the former alone; its driver all, for the right of way."""
     delay: int = Field(default=0, ge=0, le=600)
     """Camera ticks from sending to receiving; 0: a leader's estimate of the same tick."""
     period: int = Field(default=1, ge=1, le=100_000)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coopenv.api.terms.layout import observation_layout
-from coopenv.policies import load_agent
+from coopenv.policies import act, load_agent
 from coopenv.policies.look_ahead import LookAhead, Peek
 from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost, nearest
@@ -73,6 +73,43 @@ def other(x: float, y: float, angle: float) -> dict[str, object]:
 )
 def test_giving_way(x: float, y: float, angle: float, speed: float) -> None:
     assert RouteFollower(SCENARIO).speed(observation(**other(x, y, angle)))[0] == speed
+
+
+MUTUAL = square(v2x={"links": "all"})
+
+
+def rows(present: int, **fields: object) -> np.ndarray:
+    """Return the rows of the four vehicles of a world; one of them observes these values."""
+    batch = np.repeat(observation(MUTUAL), 4, axis=0)
+    batch[present] = observation(MUTUAL, **fields)[0]
+    return batch
+
+
+def test_the_right_of_way_is_that_of_the_order_where_all_receive_each_other() -> None:
+    """Slot 1 of the messages is vehicle_3 for the first two, and vehicle_2 for the others."""
+    crossing: dict[str, Any] = {name: np.roll(value, 1, axis=0) for name, value in other(3.0, -3.0, np.pi / 2).items()}
+    speeds = [RouteFollower(MUTUAL).speed(rows(vehicle, **crossing))[vehicle] for vehicle in range(4)]
+    assert speeds == [1.0, 1.0, 0.0, 0.0]
+    alone = [RouteFollower(SCENARIO).speed(rows(vehicle, **crossing))[vehicle] for vehicle in range(4)]
+    assert alone == [0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("x", "speed"), [(0.9, 0.0), (2.5, 1.0)])
+def test_it_waits_for_what_blocks_its_way(x: float, speed: float) -> None:
+    assert RouteFollower(MUTUAL).speed(rows(0, **other(x, 0.0, np.pi / 2)))[0] == speed
+
+
+def test_traffic_that_does_not_react_has_the_right_of_way() -> None:
+    driven = RouteFollower(MUTUAL).goes_first
+    assert driven.tolist() == [[True, True, True], [False, True, True], [False, False, True], [False, False, False]]
+    assert not RouteFollower(SCENARIO).goes_first.any()
+    assert not RouteFollower(load_scenario("behind_truck", {"v2x.links": "all"})).goes_first.any()
+
+
+def test_rows_keep_their_vehicle_when_others_have_ended() -> None:
+    driver, row = RouteFollower(MUTUAL), rows(3, **other(3.0, -3.0, np.pi / 2))[3]
+    assert act(driver, {"vehicle_1": row})["vehicle_1"][0] > 0.9 and act(driver, {"vehicle_4": row})["vehicle_4"][0] < 0
+    assert set(act(lambda rows: rows[:, :2], {"other": row})) == {"other"}
 
 
 @pytest.mark.parametrize(("away", "speed"), [(2.0, 0.0), (4.8, 1.0)])

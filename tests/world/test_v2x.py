@@ -174,3 +174,16 @@ def test_messages_carry_the_marker() -> None:
     estimate = estimated_position(states[-1])[0]
     assert_allclose(estimate[1], estimate[2], atol=1e-4)
     assert np.linalg.norm(estimate[1] - estimated_position(states[0])[0, 1]) > 0.05
+
+
+def test_with_links_to_all_every_message_arrives_and_estimates_are_the_same() -> None:
+    """Estimators use the messages of neighbours alone."""
+    states = [run(start(fleet(v2x={"delay": 1, "links": links})), 20)[-1] for links in ("neighbours", "all")]
+    assert (states[0]["inbox_tick"][0] >= 0).tolist() == np.tri(3, k=-1, dtype=bool).tolist()
+    assert (states[1]["inbox_tick"][0] >= 0).tolist() == (~np.eye(3, dtype=bool)).tolist()
+    assert_allclose(states[0]["estimate_position"], states[1]["estimate_position"], atol=0)
+
+
+def test_links_to_all_end_at_the_range_of_the_radio() -> None:
+    state = run(start(fleet(v2x={"links": "all", "range": 3.0})), 5)[-1]  # 2 m apart, 4 m from first to last
+    assert (state["inbox_tick"][0] >= 0).tolist() == [[False, True, False], [True, False, True], [False, True, False]]
