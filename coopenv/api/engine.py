@@ -17,7 +17,7 @@ import warp as wp
 from coopenv.api.arguments import RewardFunction, Step, check_function, reward_of
 from coopenv.api.terms.layout import Layout, observation_layout
 from coopenv.api.terms.own import OwnTerms
-from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results
+from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results, team_results
 from coopenv.backends.base import Backend, SensingWorld
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
@@ -87,6 +87,7 @@ class Engine:
         self._own_terms = OwnTerms(scenario, self.world, self.layout, self.results)
         check_function(reward, device)
         self._reward, self._step = reward, Step(self.view, scenario)
+        self._team = scenario.reward.team
         self._table = results_table(scenario, self.layout, device)
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
@@ -185,6 +186,10 @@ class Engine:
         arguments = [world.model, PerWorld(world.state), self._table, *parts]
         world.launch(key, step_results, arguments, inner=(world.model.vehicles,))
         self._own_terms.fill(key, fresh, chosen)
+        if self._team != "own":
+            least = int(self._team == "min")
+            arguments = [world.model, PerWorld(world.state), PerWorld(self.results), least, PerWorld(chosen)]
+            world.launch(f"{key} of the team", team_results, arguments)
         if world.device == "cpu":  # reading from a GPU would wait for it
             self._own_terms.check(self.view)
 

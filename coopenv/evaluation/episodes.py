@@ -205,7 +205,6 @@ def drive(
     return Episodes(
         vehicles=tuple(scenario.vehicle_names[i] for i in chosen),
         period=scenario.ticks_per_decision / scenario.rates.camera,
-        under_way=record.pop("alive"),
         **errors,
         **record,
         position=np.stack(place),
@@ -216,7 +215,7 @@ def drive(
 
 
 ERRORS = ("position_error", "orientation_error")
-KEPT = ("alive", *ERRORS, "targets_in_view", "reward", "arrivals", "pan")
+KEPT = ("under_way", *ERRORS, "targets_in_view", "reward", "arrivals", "pan")
 
 
 def _routes(points: np.ndarray, count: np.ndarray) -> np.ndarray:

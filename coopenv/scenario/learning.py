@@ -160,6 +160,10 @@ class Reward(Section):
     model_config = ConfigDict(json_schema_extra=_only_those_of_coopenv(REWARD_TERMS.built_in, "weights"))
 
     weights: RewardWeights = RewardWeights()
+    team: Literal["own", "mean", "min"] = "own"
+    """Whose weighted sum a driven vehicle is rewarded for: its own, or the mean or the least of all driven vehicles.
+    For the latter two an episode goes on, without actions, until it is over for all of them; the mean is over all that
+    are there, the least over those under way."""
     uncertainty_threshold: NonNegative = 0.02
     """m; terms per metre count what is above it"""
     uncertainty_cap: Positive = 1.0

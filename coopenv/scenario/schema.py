@@ -276,19 +276,22 @@ def _problems(s: Scenario) -> Iterator[str]:
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
-    if s.action.pan is not None and s.cosimulator is not None:
-        yield f"action.pan: cameras of vehicles of {s.cosimulator.title} do not turn"
     parts = {"faults": s.faults, **{f"vehicles.{i}.faults": v.faults for i, v in enumerate(s.vehicles) if v.faults}}
     marks = [landmark.name for landmark in s.landmarks]
     for where, faults in parts.items():
         mark = faults.map_error.landmark
         if mark is not None and mark not in marks:
             yield f"{where}.map_error.landmark: unknown landmark {shown(mark)}{suggest(mark, marks)}"
-    yield from _beyond_limits(s)
+    yield from _problems_of_driving(s)
 
 
-def _beyond_limits(s: Scenario) -> Iterator[str]:
-    """Yield what of the vehicles' motion and action is beyond their own limits."""
+def _problems_of_driving(s: Scenario) -> Iterator[str]:
+    """Yield what of action and reward does not fit to the vehicles, and what is beyond their own limits."""
+    if s.action.pan is not None and s.cosimulator is not None:
+        yield f"action.pan: cameras of vehicles of {s.cosimulator.title} do not turn"
+    driven = sum(vehicle.motion.kind == "driven" for vehicle in s.vehicles)
+    if s.reward.team != "own" and driven < 2:
+        yield f"reward.team: '{s.reward.team}' needs at least two driven vehicles, got {driven}"
     steering, decision = s.action.steering, 1.0 / s.rates.decision
     for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
         own = vehicle.dynamics is not None

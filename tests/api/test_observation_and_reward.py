@@ -11,6 +11,7 @@ import pytest
 
 import coopenv
 from coopenv.bench.pages import has_value_of_sensing
+from coopenv.policies import load_agent
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
@@ -122,3 +123,40 @@ def test_standing_still_earns_least(name: str) -> None:
     still, times = run(name, "stand").total, TIMES.get(name, 1)
     times_of = {"follow": times, "slow": 1, "look around": times}  # as above, so that nothing is driven twice
     assert all(run(name, driver, times=times_of[driver]).total > still for driver in times_of)
+
+
+def returns_of(team: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rewards, flags of termination and of being alive, (steps, 2, 4), of worlds that `peek` drives."""
+    scenario = load_scenario("open_square", {"reward.team": team, "horizon": 30.0})
+    env = coopenv.make_vec(scenario, num_worlds=2, autoreset="disabled")
+    policy, (observation, _) = load_agent("peek", scenario), env.reset(seed=1)
+    steps = []
+    for _ in range(300):
+        actions = policy(observation).astype(np.float32)
+        observation, reward, terminated, truncated, infos = env.step(actions)
+        steps.append((reward, terminated, infos["alive"]))
+        if (terminated | truncated).reshape(2, 4).any(axis=1).all() and team != "own":
+            break
+    env.close()
+    return tuple(np.array(part).reshape(-1, 2, 4) for part in zip(*steps, strict=True))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("team", ["mean", "min"])
+def test_a_team_has_one_reward_and_one_end(team: str) -> None:
+    own, _, under_way = returns_of("own")
+    shared, terminated, alive = returns_of(team)
+    count = len(shared)
+    assert (shared == shared[..., :1]).all() and (terminated == terminated[..., :1]).all()
+    wanted = own[:count].mean(axis=-1)
+    if team == "min":
+        wanted = np.min(own[:count], axis=-1, where=under_way[:count] == 1, initial=np.inf)
+        wanted = np.where(np.isinf(wanted), 0.0, wanted)
+    np.testing.assert_allclose(shared[..., 0], wanted, atol=1e-5)
+    last = np.argmax(terminated[..., 0], axis=0)
+    assert terminated[..., 0].sum() == 2 and (under_way[last, np.arange(2)].sum(axis=-1) >= 1).all()
+    assert not under_way[count:].any() and (alive.sum(axis=0) == last[:, None] + 1).all()
+
+
+def test_a_team_reward_needs_a_team() -> None:
+    with pytest.raises(coopenv.CoopenvError, match=r"reward\.team: 'mean' needs at least two driven vehicles, got 1"):
+        load_scenario("facade", {"reward.team": "mean"})

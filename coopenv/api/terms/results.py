@@ -37,7 +37,7 @@ from coopenv.estimation.linalg import rotation_angle
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.world.dynamics import UNDER_WAY
-from coopenv.world.model import Precision
+from coopenv.world.model import DRIVEN, Precision
 from coopenv.world.quality import (
     cholesky_of,
     gramian_smallest_eigenvalue,
@@ -64,8 +64,9 @@ def results_struct(p: Precision) -> Any:
         observation: array("WND", wp.float32)
         terms: array("WNK", wp.float32)
         reward: array("WN", wp.float32)  # 0 for vehicles that had ended before, and right after a reset
-        alive: array("WN", wp.bool)  # had not ended before this step
-        terminated: array("WN", wp.bool)  # ended in this step
+        under_way: array("WN", wp.bool)  # had not ended before this step
+        alive: array("WN", wp.bool)  # the same; with a team reward: that somebody of the team had not
+        terminated: array("WN", wp.bool)  # ended in this step; with a team reward: all of the team had
         truncated: array("WN", wp.bool)  # the world is over and this vehicle has not just terminated
         over: array("W", wp.int32)  # 1: at the horizon, or every vehicle has ended
         position_error: array("WN", scalar)  # m
@@ -201,9 +202,21 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
 
 
 @device_function
+def at_end(model: Any, state: Any, world: int) -> bool:
+    """Return whether a world is at its horizon, or without further ticks."""
+    return state.tick[world] >= model.horizon_ticks or state.exhausted[world] != 0
+
+
+@device_function
+def is_of_team(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle is driven and in this episode."""
+    return model.motion.kind[model.landmarks + vehicle] == DRIVEN and state.ended[world, vehicle] >= UNDER_WAY
+
+
+@device_function
 def is_over(model: Any, state: Any, world: int) -> bool:
-    """Return whether a world is at its horizon, without further ticks, or has no vehicle under way."""
-    if state.tick[world] >= model.horizon_ticks or state.exhausted[world] != 0:
+    """Return whether a world is at its end, or has no vehicle under way."""
+    if at_end(model, state, world):
         return True
     for vehicle in range(model.vehicles):
         if state.ended[world, vehicle] == UNDER_WAY:
@@ -248,6 +261,7 @@ def step_results(
     waiting = results.last_tick[world, vehicle] >= model.horizon_ticks
     alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
     terminated = alive and state.ended[world, vehicle] != UNDER_WAY
+    results.under_way[world, vehicle] = alive
     results.alive[world, vehicle] = alive
     results.terminated[world, vehicle] = terminated
     results.truncated[world, vehicle] = over and not terminated
@@ -287,6 +301,33 @@ def step_results(
         write_entries(results.observation, world, vehicle, n, table.landmark, landmark_values(landmark))
         if records.landmark.shape[2] > 0:
             records.landmark[world, vehicle, n] = landmark
+
+
+def team_results(model: Any, state: Any, results: Any, least: int, chosen: wp.array(dtype=wp.int32)):
+    """Give every driven vehicle the team's reward, and an episode that ends with the world; one thread per world.
+
+    The reward is the mean over the driven vehicles that are there or, if `least` is 1, the least of those under way.
+    """
+    world = wp.tid()
+    if chosen[world] == 0:
+        return
+    there = int(0)  # noqa: RUF046
+    total = float(0.0)
+    smallest = float(wp.inf)
+    for vehicle in range(model.vehicles):
+        if is_of_team(model, state, world, vehicle):
+            there += 1
+            total += results.reward[world, vehicle]
+            if results.under_way[world, vehicle]:
+                smallest = wp.min(smallest, results.reward[world, vehicle])
+    if smallest == wp.inf:
+        return
+    for vehicle in range(model.vehicles):
+        if is_of_team(model, state, world, vehicle):
+            results.reward[world, vehicle] = wp.where(least == 1, smallest, total / float(there))
+            results.alive[world, vehicle] = True
+            results.terminated[world, vehicle] = results.over[world] != 0 and not at_end(model, state, world)
+            results.truncated[world, vehicle] = at_end(model, state, world)
 
 
 def write_records(model: Any, state: Any, records: Records, results: Any):
