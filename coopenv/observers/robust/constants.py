@@ -17,10 +17,10 @@ MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on 
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
-"""s. Short: between two looks at the monitors; after which a silent sender may restart; for which a hypothesis is
-tracked at least. Mean: of recent means; for which lasting errors and those of messages are the same in all frames;
-after which what is out of view is given up first. Long: for which an excluded source stays so, bearings may refuse the
-belief before a search begins, and a search is patient. Chosen."""
+"""s. Short: of a block of the monitors; after which a silent sender may restart; for which a hypothesis is
+tracked at least. Mean: of recent means; for which calibration errors and those of messages are the same in all frames;
+after which what is out of view is given up first. Long: for which an excluded source stays so, most bearings
+may fail the gate before a search begins, and a search requires well determined solutions. Chosen."""
 
 # Belief
 
@@ -77,7 +77,7 @@ LEAST_NEWS = 0.1
 Tuned."""
 LEAST_SHARE = 0.003
 """Share of a sender's variance: least one that known correlations leave, inflation of a sender that depends on others,
-because messages hold only some of the correlations, and what a monitor adds to a step. Tuned."""
+because messages hold only some of the correlations, and what a monitor adds to an increment. Tuned."""
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
 
 # Search

@@ -96,12 +96,12 @@ def write_broadcast(observer: Any) -> Message:
         return message
     extra: dict[str, Any] = {**message.extra, "odometry": message.extra["odometry"].astype(np.float32)}
     report = observer.memory.outbox[0]
-    if report["news"]:
+    if report["carries_correlations"]:
         broadcast = observer.memory.outbox_correlation[0]
         broadcast = broadcast[broadcast["vehicle"] >= 0]
         ages = (int(report["tick"]) - broadcast["tick"]) * observer.unit
         extra |= {
-            "told": broadcast["vehicle"].astype(np.uint16),
+            "correlated_vehicles": broadcast["vehicle"].astype(np.uint16),
             "ages": ages.astype(np.float32),
             "correlations": broadcast["matrix"].astype(np.int8),
         }
@@ -112,17 +112,17 @@ def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> N
     """Put a message into the inbox; a CoopenvError or LookupError means that it is malformed."""
     m = observer.memory
     read(observer, sender, message, sent)
-    m.inbox[sender]["news"] = 0
-    if not m.inbox[sender]["valid"] or "told" not in message.extra:
+    m.inbox[sender]["carries_correlations"] = 0
+    if not m.inbox[sender]["valid"] or "correlated_vehicles" not in message.extra:
         return
     m.inbox[sender]["valid"] = 0
-    broadcast = _others(observer, sender, message, "told", MAX_CORRELATIONS)
+    broadcast = _others(observer, sender, message, "correlated_vehicles", MAX_CORRELATIONS)
     ages, matrices = np.asarray(message.extra["ages"]), np.asarray(message.extra["correlations"])
     if matrices.shape != (len(broadcast), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
         raise CoopenvError("message: correlations")
     if ages.shape != broadcast.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():
         raise CoopenvError("message: ages")
-    m.inbox[sender]["valid"] = m.inbox[sender]["news"] = 1
+    m.inbox[sender]["valid"] = m.inbox[sender]["carries_correlations"] = 1
     kept = m.correlation[sender]
     kept["vehicle"] = -1
     for n, (vehicle, age, matrix) in enumerate(zip(broadcast.tolist(), ages.tolist(), matrices, strict=True)):
