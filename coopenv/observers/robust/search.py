@@ -98,36 +98,6 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
 
 
 @device_function
-def solve(
-    frame: BearingFrame,
-    memory: Any,
-    world: int,
-    i: int,
-    triple: Any,
-    b: Any,
-    z: Any,
-    require_determined: bool,
-    tracking: bool,
-):
-    """Make hypotheses of the solutions of one problem of bearings b and points z, rows, if `tracking`.
-
-    Return False if `require_determined` and a solution is not well determined.
-    """
-    count, distances = solve_triangle(b, z)
-    for n in range(count):
-        R, camera = camera_pose(b, z, distances[n])
-        if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
-            pose = Pose(R, camera - R * frame.lever)
-            begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
-            determined, P = covariance_of(frame, memory, world, i, triple, require_determined)
-            if require_determined and not determined:
-                return False
-            if tracking and determined:
-                add_hypothesis(memory, world, i, PoseEstimate(pose, P))
-    return True
-
-
-@device_function
 def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: int):
     """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
@@ -165,9 +135,19 @@ def solve_triple(
     memory.search[world, i].hypotheses = 0
     for number in range(PROBLEMS):
         exists, b, z = problem(frame, memory, world, triple, number)
-        if exists:
-            if not solve(frame, memory, world, i, triple, b, z, require_determined, tracking):
-                return False
+        if not exists:
+            continue
+        count, distances = solve_triangle(b, z)
+        for n in range(count):
+            R, camera = camera_pose(b, z, distances[n])
+            if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
+                pose = Pose(R, camera - R * frame.lever)
+                begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
+                determined, P = covariance_of(frame, memory, world, i, triple, require_determined)
+                if require_determined and not determined:
+                    return False
+                if tracking and determined:
+                    add_hypothesis(memory, world, i, PoseEstimate(pose, P))
     return True
 
 
