@@ -181,7 +181,7 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 @device_function
 def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member that has been out of view for longest, 0 if all have been in view for `MAX_UNSEEN_TIME`."""
+    """Return the member that has been out of view for longest, 0 if all have been in view within `MAX_UNSEEN_TIME`."""
     found = int(0)
     for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         unseen = wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period

@@ -54,7 +54,7 @@ ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hyp
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 ODOMETRY_FAULT = 0.1  # standard deviation of the fault of the odometry's velocity, as a share of the speed. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
-"""Share of bearings that fail the gate from which on all bearings count, and share below which the gate is closed again
+"""Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
 and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
 
 # Messages

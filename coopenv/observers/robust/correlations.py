@@ -7,10 +7,10 @@ more slowly than errors.
 
 Regression gives the covariance of a sender's new error e+ with all errors of the belief. Known are its own covariance
 P+, the broadcast covariances with other members, and that with the sender's previous error. The last is P+, too,
-because the step from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the known
-errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if that of
-w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in blocks of
-6x6.
+because the increment from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the
+known errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if
+that of w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in
+blocks of 6x6.
 """
 
 from typing import Any
@@ -45,7 +45,7 @@ def factor(P: Any):
 
 @device_function
 def rank(model: Any, vehicle: int, report: SenderReport) -> int:
-    """Return a number that is larger for vehicles that depend on more others, and then for later ones."""
+    """Return a number that is larger for vehicles that depend on more vehicles, and then for later ones."""
     return int(wp.bit_count(report.depends_on)) * model.vehicles + vehicle
 
 
@@ -104,7 +104,7 @@ def start_news_interval(model: Any, memory: Any, world: int, i: int, tick: int) 
 
 @device_function
 def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: int):
-    """Broadcast the correlations with the members that depend on most others."""
+    """Broadcast the correlations with the members that depend on most vehicles."""
     memory.outbox[world, i, slot].carries_correlations = 1
     fill(memory.outbox_correlation[world, i, slot], no_correlation())
     n = int(0)

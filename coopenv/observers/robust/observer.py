@@ -91,7 +91,7 @@ ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
 
 @device_function
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
-    """Linearise the bearings and gate them; return the share of rejected ones, the number of the others, and their NIS.
+    """Linearise the bearings and gate them; return the share of rejected ones, the number of used ones, and their NIS.
 
     Bearings to excluded sources are not used and do not count in the share, which is -1 if none counts.
     """
@@ -216,7 +216,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
 
 @device_function
 def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
-    """Resect the own pose from a frame by least squares, from the current pose; return whether it is determined."""
+    """Resect the own pose from a frame by least squares; return whether in all steps three bearings determine it."""
     bearings = frame.bearings
     inverse = mat66d()
     for step in range(constants.MAX_ITERATIONS):

@@ -145,9 +145,9 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
 
 @device_function
 def calibration_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
-    """Return the variances (rotation, translation) of an increment over dt by lasting odometry errors, taken as noise.
+    """Return the variances (rotation, translation) of an increment over dt by the odometry's calibration, as noise.
 
-    They have the covariance of the vehicle's own calibration. A lasting error adds up like noise that is constant over
+    The calibration errors have the covariance of the vehicle's own ones. They add up like noise that is constant over
     the time `correlated`, s.
     """
     P = memory.P[world, i, ERRORS, ERRORS]
@@ -158,7 +158,7 @@ def calibration_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, corr
 
 @device_function
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return the variances (rotation, translation) of an increment over dt, lasting errors included."""
+    """Return the variances (rotation, translation) of an increment over dt, calibration errors included."""
     noise = odometry_noise(model, i, dt)
     return noise + calibration_noise(memory, world, i, step, dt, wp.float64(constants.MEAN_TIME))
 

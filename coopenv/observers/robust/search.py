@@ -230,8 +230,8 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, n: int):
     if memory.measurement[world, n].variance > wp.float64(0.0):
         time = wp.float64(constants.MEAN_TIME)
     noise = memory.measurement[world, n].noise
-    lasting = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
-    return wp.float64(2.0) * (frame.variance + lasting) / noise
+    persistent = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
+    return wp.float64(2.0) * (frame.variance + persistent) / noise
 
 
 @device_function
