@@ -71,7 +71,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         return wp.float64(0.0), 0
 
     @device_function
-    def no_doubt(memory: Any, world: int, i: int, most: Any, total: Any):  # type: ignore[no-untyped-def]
+    def no_mixture(memory: Any, world: int, i: int, most: Any, total: Any):  # type: ignore[no-untyped-def]
         pass
 
     @device_function
@@ -89,8 +89,8 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
         "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
-        "several senders at once": [(fault_hypotheses, "judge_senders", not_several)],
-        "covariance of likely faults": [(fault_hypotheses, "set_doubt", no_doubt)],
+        "several senders at once": [(fault_hypotheses, "test_several_faulty_senders", not_several)],
+        "covariance of likely faults": [(fault_hypotheses, "set_fault_mixture", no_mixture)],
         "readmission": [(observer, "test_excluded", no_readmission)],
         "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
         "gyro bias": [(constants, "GYRO_BIAS", 1e-6)],

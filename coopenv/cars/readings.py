@@ -332,7 +332,7 @@ def _report(message: Any) -> Message:
     extra: dict[str, Any] = {
         "odometry": np.concatenate([turned, moved]),
         "depends_on": np.array([message.depends_on], dtype=np.uint64),
-        "told": np.zeros(0, np.uint16),  # a report counts; of correlations it has none
+        "correlated_vehicles": np.zeros(0, np.uint16),  # a report counts; of correlations it has none
         "ages": np.zeros(0, np.float32),
         "correlations": np.zeros((0, 6, 6), np.int8),
     }

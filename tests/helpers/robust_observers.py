@@ -24,7 +24,7 @@ class OpenRobust(KernelObserver):
     @property
     def others(self) -> np.ndarray:
         """Records of the members that are other vehicles."""
-        return self.members[self.memory.belief["others"] :]
+        return self.members[self.memory.belief["first_sender"] :]
 
     @property
     def member_numbers(self) -> list[int]:

@@ -146,15 +146,11 @@ def lower_blocks(A: Any, C: Any, D: Any):
 
 
 @wp.func
-def transition(step: Pose):
-    """Return F of the left error over an increment of odometry."""
-    E = wp.transpose(step.R)
-    return lower_blocks(E, -E * skew(step.p), E)
-
-
-@wp.func
 def forward(step: Pose, M: Any):
-    """Return F M for a 6x6 matrix M, see `transition`: by rows, a fourth of the time that the product of two takes."""
+    """Return F M for a matrix M of six rows: by rows, a fourth of the time that the product of two takes.
+
+    F = [[E, 0], [-E [p]x, E]] with E = R^T is the transition of the left error over an increment (R, p) of odometry.
+    """
     R = step.R
     p = step.p
     u = M[3] + p[2] * M[1] - p[1] * M[2]
@@ -172,7 +168,7 @@ def forward(step: Pose, M: Any):
 
 @wp.func
 def forward_error(step: Pose, e: Any):
-    """Return F e for an error (6,), see `transition`."""
+    """Return F e for an error (6,), see `forward`."""
     Rt = wp.transpose(step.R)
     result = vec6d()
     result[:3] = Rt * e[:3]
@@ -182,7 +178,7 @@ def forward_error(step: Pose, e: Any):
 
 @wp.func
 def propagated(P: Any, step: Pose):
-    """Return F P F^T for a symmetric 6x6 matrix P, see `transition`."""
+    """Return F P F^T for a symmetric 6x6 matrix P, see `forward`."""
     return forward(step, wp.transpose(forward(step, P)))
 
 

@@ -30,8 +30,8 @@ MAX_UNSEEN_TIME = constants.MEAN_TIME + constants.SAME_TIME
 
 @device_function
 def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
-    """Return the index of a vehicle among the members of i's belief, 0 if it is not one of the others."""
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    """Return the index of a vehicle among the members of i's belief, 0 if it is none, or i itself."""
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if memory.member[world, i, n].vehicle == vehicle:
             return n
     return 0
@@ -54,11 +54,12 @@ def decorrelate(memory: Any, world: int, i: int, n: int):
 @device_function
 def begin_belief(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Begin the belief with the vehicle itself; the calibration states are kept without correlations."""
-    memory.belief[world, i].members = memory.belief[world, i].others
-    for k in range(1, memory.belief[world, i].others):
+    memory.belief[world, i].members = memory.belief[world, i].first_sender
+    for k in range(1, memory.belief[world, i].first_sender):
         decorrelate(memory, world, i, k)
     memory.member[world, i, 0].vehicle = i
-    put_own(memory, world, i, estimate)
+    memory.member[world, i, 0].pose = estimate.pose
+    memory.P[world, i, 0, 0] = estimate.P
 
 
 @device_function
@@ -68,16 +69,9 @@ def own_estimate(memory: Any, world: int, i: int):
 
 
 @device_function
-def doubted_estimate(memory: Any, world: int, i: int):
-    """Return the own estimate with a covariance that includes what faults of sources add that are not certain."""
-    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.doubt[world, i])
-
-
-@device_function
-def put_own(memory: Any, world: int, i: int, estimate: PoseEstimate):
-    """Set the own pose and covariance to an estimate."""
-    memory.member[world, i, 0].pose = estimate.pose
-    memory.P[world, i, 0, 0] = estimate.P
+def estimate_with_faults(memory: Any, world: int, i: int):
+    """Return the own estimate with a covariance that includes the mixture of likely faults."""
+    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
 
 
 @device_function
@@ -97,17 +91,17 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 
 @device_function
-def is_free(memory: Any, world: int, i: int, k: int) -> bool:
-    """Return whether bearings correct a member; another vehicle keeps its reported pose."""
-    return k < memory.belief[world, i].others
+def is_estimated(memory: Any, world: int, i: int, k: int) -> bool:
+    """Return whether bearings correct a member; a sender is considered and keeps its reported pose."""
+    return k < memory.belief[world, i].first_sender
 
 
 @device_function
 def correct_member(memory: Any, world: int, i: int, k: int):
-    """Apply a free member's correction, and set the derivative of errors about the new pose by those about the old."""
+    """Apply an estimated member's correction, and set `recentring`, of errors about its new pose by those before."""
     correction = memory.scratch[world, k].correction
     G = wp.identity(6, wp.float64)
-    if k == ERRORS and memory.belief[world, i].others > ERRORS:
+    if k == ERRORS and memory.belief[world, i].first_sender > ERRORS:
         memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
         memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
     else:
@@ -118,20 +112,20 @@ def correct_member(memory: Any, world: int, i: int, k: int):
 
 @device_function
 def apply_corrections(memory: Any, world: int, i: int):
-    """Apply the corrections of all free members, and recentre the covariance about the new poses."""
+    """Apply the corrections of all estimated members, and recentre the covariance about the new poses."""
     for k in range(memory.belief[world, i].members):
-        free = is_free(memory, world, i, k)
-        if free:
+        estimated = is_estimated(memory, world, i, k)
+        if estimated:
             correct_member(memory, world, i, k)
         for j in range(k + 1):
             block = memory.P[world, i, k, j]
-            if free and is_free(memory, world, i, j):
+            if estimated and is_estimated(memory, world, i, j):
                 block = recentred(memory.scratch[world, k].recentring, block, memory.scratch[world, j].recentring)
                 if k == j:
                     block = symmetric_part(block)
-            elif free:
+            elif estimated:
                 block = diagonal_by_rows(memory.scratch[world, k].recentring, block)
-            elif is_free(memory, world, i, j):
+            elif is_estimated(memory, world, i, j):
                 block = wp.transpose(diagonal_by_rows(memory.scratch[world, j].recentring, wp.transpose(block)))
             else:
                 continue
@@ -149,7 +143,7 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
 
 @device_function
 def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: Any):
-    """Add a member whose error is independent of those of the others; there must be room. Nothing else is set."""
+    """Add a member whose error is independent of the other members' errors; there must be room. Nothing else is set."""
     n = memory.belief[world, i].members
     decorrelate(memory, world, i, n)
     memory.P[world, i, n, n] = P
@@ -186,24 +180,19 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 
 @device_function
-def is_unseen(model: Any, memory: Any, world: int, i: int, n: int, tick: int):
-    """Return whether a member has been out of view for so long that it may be evicted."""
-    return wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period > wp.float64(MAX_UNSEEN_TIME)
-
-
-@device_function
 def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member that has been out of view for longest, 0 if all have been in view lately."""
+    """Return the member that has been out of view for longest, 0 if all have been in view within `MAX_UNSEEN_TIME`."""
     found = int(0)
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if is_unseen(model, memory, world, i, n, tick):
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
+        unseen = wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period
+        if unseen > wp.float64(MAX_UNSEEN_TIME):
             if found == 0 or memory.member[world, i, n].seen_tick < memory.member[world, i, found].seen_tick:
                 found = n
     return found
 
 
 @device_function
-def most_others(memory: Any) -> int:
+def sender_capacity(memory: Any) -> int:
     """Return how many other vehicles there is room for in a belief."""
     return memory.member.shape[2] - 1 - MOUNTING
 
@@ -211,7 +200,7 @@ def most_others(memory: Any) -> int:
 @device_function
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
-    if memory.belief[world, i].members - memory.belief[world, i].others < most_others(memory):
+    if memory.belief[world, i].members - memory.belief[world, i].first_sender < sender_capacity(memory):
         return True
     n = longest_unseen(model, memory, world, i, tick)
     if n > 0:

@@ -17,10 +17,10 @@ MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on 
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a covariance is malformed: 0.1 um
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 SHORT_TIME, MEAN_TIME, LONG_TIME = 0.5, 1.0, 2.0
-"""s. Short: between two looks at the monitors; after which a silent sender may restart; for which a hypothesis is
-tracked at least. Mean: of recent means; for which lasting errors and those of messages are the same in all frames;
-after which what is out of view is given up first. Long: for which an excluded source stays so, bearings may refuse the
-belief before a search begins, and a search is patient. Chosen."""
+"""s. Short: of a block of the monitors; after which a silent sender may restart; for which a hypothesis is
+tracked at least. Mean: of recent means; for which calibration errors and those of messages are the same in all frames;
+after which what is out of view is given up first. Long: for which an excluded source stays so, most bearings
+may fail the gate before a search begins, and a search requires well determined solutions. Chosen."""
 
 # Belief
 
@@ -54,7 +54,7 @@ ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hyp
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
 ODOMETRY_FAULT = 0.1  # standard deviation of the fault of the odometry's velocity, as a share of the speed. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
-"""Share of bearings that fail the gate from which on all bearings count, and share below which the gate is closed again
+"""Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
 and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""
 
 # Messages
@@ -77,7 +77,7 @@ LEAST_NEWS = 0.1
 Tuned."""
 LEAST_SHARE = 0.003
 """Share of a sender's variance: least one that known correlations leave, inflation of a sender that depends on others,
-because messages hold only some of the correlations, and what a monitor adds to a step. Tuned."""
+because messages hold only some of the correlations, and what a monitor adds to an increment. Tuned."""
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
 
 # Search

@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
-from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
+from coopenv.observers.robust.belief import apply_corrections, is_estimated, subtract_block
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function
@@ -27,7 +27,7 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
     Considered members stay.
     """
     for k in range(memory.belief[world, i].members):
-        if is_free(memory, world, i, k):
+        if is_estimated(memory, world, i, k):
             correction = share * memory.scratch[world, k].correction
             memory.scratch[world, k].last_correction = correction
             memory.scratch[world, k].recentring = recentring(correction)
@@ -37,20 +37,20 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
             linearise(frame, memory, world, i, n)
             for part in range(DERIVATIVES):
                 member = memory.derivative[world, n, part].member
-                if member >= 0 and is_free(memory, world, i, wp.max(member, 0)):
+                if member >= 0 and is_estimated(memory, world, i, wp.max(member, 0)):
                     H = by_rows(memory.derivative[world, n, part].jacobian, memory.scratch[world, member].recentring)
                     memory.derivative[world, n, part].jacobian = H
 
 
 @device_function
-def set_gain(memory: Any, world: int, i: int, n: int):
-    """Set a bearing's `gain` H P, with P after the earlier bearings, and its `weight` S^-1."""
+def set_projection(memory: Any, world: int, i: int, n: int):
+    """Set a bearing's `projection` H P, with P after the earlier bearings, and its `weight` S^-1."""
     members = memory.belief[world, i].members
     for m in range(n):
         if memory.measurement[world, m].fits == 1:
             share = innovation_cross_covariance(memory, world, n, m) * memory.measurement[world, m].weight
             for k in range(members):
-                memory.gain[world, n, k] = memory.gain[world, n, k] - share * memory.gain[world, m, k]
+                memory.projection[world, n, k] = memory.projection[world, n, k] - share * memory.projection[world, m, k]
     memory.measurement[world, n].weight = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
 
 
@@ -70,7 +70,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
         if memory.measurement[world, n].fits != 0:
             if projecting:
                 project(memory, world, i, n)
-            set_gain(memory, world, i, n)
+            set_projection(memory, world, i, n)
             member = memory.measurement[world, n].member
             residual = memory.measurement[world, n].residual
             for part in range(DERIVATIVES):
@@ -87,24 +87,24 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
             memory.measurement[world, n].innovation = residual
             if memory.measurement[world, n].fits == 1:
                 for k in range(members):
-                    correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
+                    correction = memory.scratch[world, k].correction + weighted * memory.projection[world, n, k]
                     memory.scratch[world, k].correction = correction
     for k in range(members):
-        if not is_free(memory, world, i, k):
+        if not is_estimated(memory, world, i, k):
             memory.scratch[world, k].correction = vec6d()
 
 
 @device_function
-def condense(memory: Any, world: int, i: int, bearings: int):
+def update_covariance(memory: Any, world: int, i: int, bearings: int):
     """Update the covariance by the bearings that fit; that of considered errors stays."""
     for k in range(memory.belief[world, i].members):
         for j in range(k + 1):
-            if is_free(memory, world, i, k) or is_free(memory, world, i, j):
+            if is_estimated(memory, world, i, k) or is_estimated(memory, world, i, j):
                 block = mat66d()
                 for n in range(bearings):
                     if memory.measurement[world, n].fits == 1:
-                        K = memory.measurement[world, n].weight * memory.gain[world, n, k]
-                        block = block + transposed_by_rows(K, memory.gain[world, n, j])
+                        K = memory.measurement[world, n].weight * memory.projection[world, n, k]
+                        block = block + transposed_by_rows(K, memory.projection[world, n, j])
                 subtract_block(memory, world, i, k, j, block)
 
 
@@ -117,7 +117,7 @@ def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, la
             distance = wp.min(distance, memory.measurement[world, n].distance)
     turn = wp.float64(0.0)
     for k in range(memory.belief[world, i].members):
-        if is_free(memory, world, i, k):
+        if is_estimated(memory, world, i, k):
             further = share * memory.scratch[world, k].correction - last * memory.scratch[world, k].last_correction
             size = wp.abs(further)
             turn = wp.max(turn, wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance))
@@ -152,7 +152,7 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """
     bearings = frame.bearings
     store_poses(memory, world, i)
-    correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].open == 0, False)
+    correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].gate_disabled == 0, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)
     while share > wp.float64(0.0) and step < constants.MAX_ITERATIONS:
@@ -162,5 +162,5 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
         step += 1
     for k in range(memory.belief[world, i].members):
         memory.member[world, i, k].pose = memory.scratch[world, k].pose
-    condense(memory, world, i, bearings)
+    update_covariance(memory, world, i, bearings)
     apply_corrections(memory, world, i)

@@ -20,9 +20,9 @@ from coopenv.observers.robust.belief import append_member, apply_corrections, in
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import PoseEstimate, mat33d, mat66d, vec6d
-from coopenv.observers.robust.source_monitor import add_step
+from coopenv.observers.robust.reports import bit_of, depends_on_own, includes, propagate_member
+from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
-from coopenv.observers.robust.tracklets import bit_of, depends_on_own, includes, propagate_member
 from coopenv.world.camera import VISIBLE
 from coopenv.world.warp_internals import device_function
 
@@ -31,14 +31,14 @@ from coopenv.world.warp_internals import device_function
 def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the covariance, 6x6, of member n's error by clock offsets; zero before its velocity is known."""
     std = wp.float64(model.fault[i].clock)
-    v = memory.member[world, i, n].dated_v
+    v = memory.member[world, i, n].clock_v
     P = mat66d()
     P[3:, 3:] = (wp.float64(2.0) * std * std) * wp.outer(v, v)
     return P
 
 
 @device_function
-def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
+def update_clock_velocity(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
     """Update the velocity at which clock offsets count, if member n's velocity has changed much; return whether it has.
 
     An update at every change would count each of them as a new error.
@@ -46,11 +46,11 @@ def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
     if model.fault[i].clock == type(model.fault[i].clock)(0.0):
         return False
     v = memory.member[world, i, n].v
-    dated = memory.member[world, i, n].dated_v
+    before = memory.member[world, i, n].clock_v
     share = wp.float64(constants.SHARE_OF_CHANGE * constants.SHARE_OF_CHANGE)
-    if wp.length_sq(v - dated) <= share * wp.length_sq(dated) + memory.member[world, i, n].velocity_variance:
+    if wp.length_sq(v - before) <= share * wp.length_sq(before) + memory.member[world, i, n].velocity_variance:
         return False
-    memory.member[world, i, n].dated_v = v
+    memory.member[world, i, n].clock_v = v
     P = memory.P[world, i, n, n] + by_clocks(model, memory, world, i, n)
     memory.P[world, i, n, n] = symmetric_part(P)
     return True
@@ -97,32 +97,31 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
 def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     """Correct the own pose by a sender's increment d (covariance N); `scratch.column` holds cov(d, y) for errors y."""
     members = memory.belief[world, i].members
-    others = memory.belief[world, i].others
+    first_sender = memory.belief[world, i].first_sender
     inverse = algebra.inverse6(N)
-    for k in range(others):
+    for k in range(first_sender):
         gain = wp.transpose(memory.scratch[world, k].column) * inverse
         memory.scratch[world, k].correction = gain * d
         for j in range(k, members):
             set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, j].column)
     q = memory.member[world, i, n].source
-    if q >= 0:
-        for k in range(others):
-            e = memory.steps_effect[world, i, q - 1, k] - memory.scratch[world, k].correction
-            memory.steps_effect[world, i, q - 1, k] = e
-    for k in range(others, members):
+    for k in range(first_sender):
+        e = memory.drift_effect[world, i, q - 1, k] - memory.scratch[world, k].correction
+        memory.drift_effect[world, i, q - 1, k] = e
+    for k in range(first_sender, members):
         memory.scratch[world, k].correction = vec6d()
     apply_corrections(memory, world, i)
 
 
 @device_function
-def note_step(memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any):
-    """Hand a step of member n's report to its monitor."""
+def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any):
+    """Add an increment d of member n's report to the monitor of its drift."""
     R = memory.member[world, i, n].pose.R
     N = block3(before - after + more, 3, 3)
     if wp.trace(N) < wp.float64(0.0):
         N = mat33d()
     N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
-    add_step(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
+    add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
 @device_function
@@ -130,13 +129,13 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
-    news = algebra.left_error(memory.member[world, i, n].pose, report.pose)
-    G = algebra.recentring(news)
+    shift = algebra.left_error(memory.member[world, i, n].pose, report.pose)
+    G = algebra.recentring(shift)
     members = memory.belief[world, i].members
     for k in range(members):
         if k != n:
             set_block(memory, world, i, n, k, algebra.diagonal_by_rows(G, memory.P[world, i, n, k]))
-    d = G * news
+    d = G * shift
     before = algebra.recentred(G, memory.P[world, i, n, n], G)
     memory.P[world, i, n, n] = before
     memory.member[world, i, n].pose = report.pose
@@ -146,7 +145,7 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
     N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
-    note_step(memory, world, i, n, d, before, after, more)
+    monitor_increment(memory, world, i, n, d, before, after, more)
     variance = algebra.position_variance(before)
     reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
@@ -199,7 +198,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
     propagate_member(model, memory, world, i, n, step, dt, white)
-    steady = not changes_speed(model, memory, world, i, n)
+    steady = not update_clock_velocity(model, memory, world, i, n)
     memory.member[world, i, n].report = report
     q = memory.member[world, i, n].source
     if is_excluded(memory, world, i, q):
@@ -215,24 +214,23 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
 
 @device_function
 def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
-    """Return whether a report of member n with news is received and not yet fused."""
+    """Return whether a report of member n that carries correlations is received and not yet fused."""
     sender = memory.member[world, i, n].vehicle
     if not is_received(model, state, memory, world, i, sender, tick):
         return False
     report = memory.inbox[world, i, sender].tick
-    return memory.inbox[world, i, sender].news == 1 and report > memory.member[world, i, n].report.tick
+    return memory.inbox[world, i, sender].carries_correlations == 1 and report > memory.member[world, i, n].report.tick
 
 
 @device_function
-def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
-    """Return whether a report of member n has to wait for another one, so that broadcast correlations match reports.
+def should_follow_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
+    """Return whether to fuse a report of member n after a pending one, so that broadcast correlations match reports.
 
-    It waits if its correlations refer to another member's pending report, or if those of a pending report refer to
-    the previous report of n.
+    Its correlations refer to another member's pending report, or those of a pending report to the previous report of n.
     """
     sender = memory.member[world, i, n].vehicle
     before = memory.member[world, i, n].report.tick
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if k != n:
             if is_pending(model, state, memory, world, i, k, tick):
                 other = memory.member[world, i, k].vehicle
@@ -245,15 +243,15 @@ def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int,
 
 @device_function
 def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member whose report is fused next, 0 if there is none: leaders first, but see `has_to_wait`."""
+    """Return the member whose report is fused next, 0 if there is none: leaders first, see `should_follow_pending`."""
     found = int(0)
     best = int(0)
     waits = bool(True)
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if is_pending(model, state, memory, world, i, n, tick):
             sender = memory.member[world, i, n].vehicle
             at = rank(model, sender, memory.inbox[world, i, sender])
-            wait = has_to_wait(model, state, memory, world, i, n, tick)
+            wait = should_follow_pending(model, state, memory, world, i, n, tick)
             if found == 0 or (waits and not wait) or (waits == wait and at < best):
                 found = n
                 best = at
@@ -262,8 +260,8 @@ def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: i
 
 
 @device_function
-def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int, tick: int) -> int:
-    """Return the next rank above `last` of the vehicles that are in view, received and no members; -1 if none is left.
+def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, last: int, tick: int) -> int:
+    """Return the next rank above `last` of vehicles in view that are received and no members; -1 if none is left.
 
     The vehicle is the rank modulo the number of vehicles.
     """
@@ -281,7 +279,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
 
 @device_function
 def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Fuse the members' reports with news, then add new senders in view to the belief."""
+    """Fuse the members' reports that carry correlations, then add new senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)
     for _ in range(memory.belief[world, i].members):
         n = next_member(model, state, memory, world, i, tick)
@@ -290,7 +288,7 @@ def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick:
         fuse_report(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
     at = int(-1)
     for _ in range(model.target_count[i]):
-        at = next_met(model, state, memory, world, i, at, tick)
+        at = next_new_sender(model, state, memory, world, i, at, tick)
         if at < 0:
             break
         add_member(model, memory, world, i, at % model.vehicles, tick)

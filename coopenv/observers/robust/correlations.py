@@ -7,10 +7,10 @@ more slowly than errors.
 
 Regression gives the covariance of a sender's new error e+ with all errors of the belief. Known are its own covariance
 P+, the broadcast covariances with other members, and that with the sender's previous error. The last is P+, too,
-because the step from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the known
-errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if that of
-w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in blocks of
-6x6.
+because the increment from the old error to the new one is not correlated with e+. With e+ = L x + w regressed on the
+known errors x, the covariance with any other error y is L cov(x, y). The joint covariance stays positive definite if
+that of w is. Otherwise P+ is inflated in the directions in which it is smaller than the correlations allow. All in
+blocks of 6x6.
 """
 
 from typing import Any
@@ -30,8 +30,8 @@ from coopenv.observers.robust.memory import (
     mat66f,
     vec3d,
 )
+from coopenv.observers.robust.reports import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.observers.robust.sources import is_excluded
-from coopenv.observers.robust.tracklets import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
 
@@ -45,7 +45,7 @@ def factor(P: Any):
 
 @device_function
 def rank(model: Any, vehicle: int, report: SenderReport) -> int:
-    """Return a number that is larger for vehicles that depend on more others, and then for later ones."""
+    """Return a number that is larger for vehicles that depend on more vehicles, and then for later ones."""
     return int(wp.bit_count(report.depends_on)) * model.vehicles + vehicle
 
 
@@ -57,7 +57,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
     limit = int(2147483647)
     if last > 0:
         limit = rank(model, memory.member[world, i, last].vehicle, memory.member[world, i, last].report)
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if not is_excluded(memory, world, i, memory.member[world, i, n].source):
             at = rank(model, memory.member[world, i, n].vehicle, memory.member[world, i, n].report)
             if at > best and at < limit:
@@ -69,7 +69,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
 @device_function
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
-    P = memory.P[world, i, 0, 0] + memory.doubt[world, i]
+    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):
@@ -92,8 +92,8 @@ def no_correlation():
 
 
 @device_function
-def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
-    """Return whether a report at a tick is the first of an interval of `NEWS_TIME`, and note that it is."""
+def start_news_interval(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
+    """Begin an interval of `NEWS_TIME` if a report at a tick is its first one; return whether it is."""
     time = wp.float64(tick) * model.camera_period + wp.float64(constants.SAME_TIME)
     interval = int(wp.floor(time / wp.float64(constants.NEWS_TIME))) + 1
     if interval == memory.belief[world, i].news_interval:
@@ -104,8 +104,8 @@ def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
 
 @device_function
 def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: int):
-    """Broadcast the correlations with the members that depend on most others."""
-    memory.outbox[world, i, slot].news = 1
+    """Broadcast the correlations with the members that depend on most vehicles."""
+    memory.outbox[world, i, slot].carries_correlations = 1
     fill(memory.outbox_correlation[world, i, slot], no_correlation())
     n = int(0)
     for c in range(memory.correlation.shape[3]):
@@ -120,7 +120,7 @@ def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: in
 
 @device_function
 def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Send a report if one is due; the first of an interval has news and carries correlations."""
+    """Send a report if one is due; the first of an interval of `NEWS_TIME` carries correlations."""
     if tick % model.radio.period == 0:
         slot = tick % model.radio.slots
         report = own_report(model, state, memory, world, i, tick)
@@ -128,7 +128,7 @@ def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick
         report.odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(report.odometry.p)))
         memory.outbox[world, i, slot] = report
         if report.valid == 1:
-            if has_news(model, memory, world, i, tick):
+            if start_news_interval(model, memory, world, i, tick):
                 broadcast_correlations(model, memory, world, i, slot)
 
 
@@ -144,7 +144,7 @@ def clear_broadcasts(memory: Any, world: int, i: int):
 @device_function
 def copy_correlations(memory: Any, world: int, i: int, sender: int, slot: int, later: int):
     """Copy the correlations of a message, if it carries them, with ticks `later`: ages are broadcast, not ticks."""
-    if memory.outbox[world, sender, slot].news == 1:
+    if memory.outbox[world, sender, slot].carries_correlations == 1:
         for c in range(memory.correlation.shape[3]):
             memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
             memory.correlation[world, i, sender, c].tick += later
@@ -197,10 +197,10 @@ def is_near(model: Any, tick: int, other: int) -> bool:
 
 
 @device_function
-def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, met: bool):
+def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, use_reverse: bool):
     """Return (is known, is broadcast, matrix) of the correlation of the new error of member n with that of member k.
 
-    The source is a message of n, or a message of k if `met` is set. Without either, it is the product of both
+    The source is a message of n, or a message of k if `use_reverse` is set. Without either, it is the product of both
     correlations with the third vehicle on which n and k depend most; this value is an approximation. Correlations of
     reports too far apart in time are not used.
     """
@@ -213,7 +213,7 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     c = correlation_index(memory, world, i, other, sender)
     if c >= 0:
         near = is_near(model, memory.correlation[world, i, other, c].tick, memory.member[world, i, n].report.tick)
-        return met and near, True, wp.transpose(matrix_of(memory, world, i, other, c))
+        return use_reverse and near, True, wp.transpose(matrix_of(memory, world, i, other, c))
     most = wp.float64(-1.0)
     shared = mat66d()
     for a in range(memory.correlation.shape[3]):
@@ -237,7 +237,7 @@ def note_correlations(
 ):
     """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors."""
     A = factor(after)
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if k != n:
             known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
             if known and is_broadcast == broadcast:

@@ -25,31 +25,31 @@ from coopenv.observers.robust.memory import (
     mat66d,
     vec3d,
 )
+from coopenv.observers.robust.reports import includes
 from coopenv.observers.robust.source_monitor import (
+    block_between,
     end_block,
     invert_blocks,
-    joint_between,
     reported_covariance,
     source_at,
 )
-from coopenv.observers.robust.sources import ODOMETRY, clear_source, clear_steps, is_active, is_sender
-from coopenv.observers.robust.tracklets import includes
+from coopenv.observers.robust.sources import ODOMETRY, clear_drift, clear_source, is_active, is_sender, member_of
 from coopenv.world.warp_internals import device_function
 
 
 @device_function
-def judge_senders(memory: Any, world: int, i: int, count: int):
+def test_several_faulty_senders(memory: Any, world: int, i: int, count: int):
     """Return twice the log-likelihood ratio of faults of all senders to none, and how many of them deviate.
 
-    Their faults are those of the solution from landmarks and odometry alone.
+    Their faults are those of the solution from landmarks and odometry only.
     """
     least = wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)
     for a in range(count):
         q = source_at(memory, world, i, a)
         for b in range(count):
             c = source_at(memory, world, i, b)
-            memory.nuisance[world, a, b] = joint_between(memory, world, i, q, c)
-        memory.nuisance[world, a, a] += wp.float64(constants.ROUNDING) * memory.nuisance[world, a, a] + least
+            memory.block_scratch[world, a, b] = block_between(memory.joint[world, i], q - 1, c - 1)
+        memory.block_scratch[world, a, a] += wp.float64(constants.ROUNDING) * memory.block_scratch[world, a, a] + least
     invert_blocks(memory, world, count)
     deviating = int(0)
     for a in range(count):
@@ -57,16 +57,16 @@ def judge_senders(memory: Any, world: int, i: int, count: int):
         f = vec3d()
         for b in range(count):
             c = source_at(memory, world, i, b)
-            f = f + memory.nuisance[world, a, b] * memory.source[world, i, c].joint
-        memory.source[world, i, q].alone_offset = f
-        memory.source[world, i, q].alone_covariance = memory.nuisance[world, a, a]
+            f = f + memory.block_scratch[world, a, b] * memory.source[world, i, c].joint
+        memory.source[world, i, q].landmark_only_offset = f
+        memory.source[world, i, q].landmark_only_covariance = memory.block_scratch[world, a, a]
     for a in range(count):
-        k = memory.nuisance_member[world, a]
+        k = memory.block_member[world, a]
         for b in range(count):
-            memory.nuisance[world, a, b] += reported_covariance(memory, world, i, k, memory.nuisance_member[world, b])
+            memory.block_scratch[world, a, b] += reported_covariance(memory, world, i, k, memory.block_member[world, b])
         q = source_at(memory, world, i, a)
-        f = memory.source[world, i, q].alone_offset
-        size = wp.dot(f, wp.inverse(memory.nuisance[world, a, a]) * f)
+        f = memory.source[world, i, q].landmark_only_offset
+        size = wp.dot(f, wp.inverse(memory.block_scratch[world, a, a]) * f)
         memory.source[world, i, q].deviates = wp.where(size > wp.float64(constants.BEARING_GATE), 1, 0)
         deviating += memory.source[world, i, q].deviates
     invert_blocks(memory, world, count)
@@ -75,8 +75,8 @@ def judge_senders(memory: Any, world: int, i: int, count: int):
         q = source_at(memory, world, i, a)
         for b in range(count):
             c = source_at(memory, world, i, b)
-            f = memory.nuisance[world, a, b] * memory.source[world, i, c].alone_offset
-            ratio += wp.dot(memory.source[world, i, q].alone_offset, f)
+            f = memory.block_scratch[world, a, b] * memory.source[world, i, c].landmark_only_offset
+            ratio += wp.dot(memory.source[world, i, q].landmark_only_offset, f)
     return ratio, deviating
 
 
@@ -92,13 +92,13 @@ def spread_of(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
-def withdraw(memory: Any, world: int, i: int, q: int):
+def inflate_by_fault(memory: Any, world: int, i: int, q: int):
     """Add to the covariance what the solution without a source differs by, and what it is less certain.
 
     The pose stays: how much of a recent fault has passed into it is not known, and the next bearings will show it.
     """
     spread = spread_of(memory, world, i, q)
-    for o in range(memory.belief[world, i].others):
+    for o in range(memory.belief[world, i].first_sender):
         X = memory.sensitivity[world, i, q, o] * spread
         for j in range(o + 1):
             block = memory.P[world, i, o, j] + X * wp.transpose(memory.sensitivity[world, i, q, j])
@@ -107,12 +107,12 @@ def withdraw(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
-def withdraw_steps(memory: Any, world: int, i: int, q: int):
-    """Add to the covariance the square of what a sender's steps have passed into the estimate."""
-    for o in range(memory.belief[world, i].others):
+def inflate_by_drift(memory: Any, world: int, i: int, q: int):
+    """Add to the covariance the square of the own error by a sender's drift."""
+    for o in range(memory.belief[world, i].first_sender):
         for j in range(o + 1):
-            a = memory.steps_effect[world, i, q - 1, o]
-            block = memory.P[world, i, o, j] + wp.outer(a, memory.steps_effect[world, i, q - 1, j])
+            a = memory.drift_effect[world, i, q - 1, o]
+            block = memory.P[world, i, o, j] + wp.outer(a, memory.drift_effect[world, i, q - 1, j])
             set_block(memory, world, i, o, j, block)
 
 
@@ -125,33 +125,24 @@ def forget_faults(memory: Any, world: int, i: int):
             memory.source[world, i, c].information = mat33d()
             memory.source[world, i, c].joint = vec3d()
             if is_sender(c):
-                clear_steps(memory, world, i, c)
+                clear_drift(memory, world, i, c)
     for a in range(SENDER_SLOTS):
         for b in range(SENDER_SLOTS):
             memory.joint[world, i, a, b] = mat33d()
 
 
 @device_function
-def member_of(memory: Any, world: int, i: int, q: int) -> int:
-    """Return the member whose slot one is, 0 if there is none."""
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if memory.member[world, i, k].source == q:
-            return k
-    return 0
-
-
-@device_function
 def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; the own odometry is used on, with an uncertain scale."""
     if q == ODOMETRY:
-        withdraw(memory, world, i, q)
-        admit_scale_error(memory, world, i)
+        inflate_by_fault(memory, world, i, q)
+        correct_scale(memory, world, i)
         return
     if drifts(memory, world, i, q):
-        withdraw_steps(memory, world, i, q)
-        memory.source[world, i, q].offset = -memory.source[world, i, q].steps
+        inflate_by_drift(memory, world, i, q)
+        memory.source[world, i, q].offset = -memory.source[world, i, q].drift
     else:
-        withdraw(memory, world, i, q)
+        inflate_by_fault(memory, world, i, q)
     f = memory.source[world, i, q].offset
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
@@ -167,17 +158,17 @@ def exclude(memory: Any, world: int, i: int, q: int):
 def drifts(memory: Any, world: int, i: int, q: int) -> bool:
     """Return whether a sender nearly certainly drifts from its own odometry."""
     certain = wp.float64(constants.FAULT_GATE + constants.ODDS)
-    return is_sender(q) and is_active(memory, world, i, q) and memory.source[world, i, q].steps_ratio > certain
+    return is_sender(q) and is_active(memory, world, i, q) and memory.source[world, i, q].drift_ratio > certain
 
 
 @device_function
-def is_misled(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
+def upstream_fault_explains_drift(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
     """Return whether a sender depends on another one whose fault would explain its drift."""
     depends_on = memory.member[world, i, member_of(memory, world, i, q)].report.depends_on
     for c in range(1, 1 + SENDER_SLOTS):
         vehicle = memory.source[world, i, c].target - landmarks
         if c != q and is_active(memory, world, i, c) and includes(depends_on, vehicle):
-            evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].steps_ratio)
+            evidence = wp.max(memory.source[world, i, c].ratio, memory.source[world, i, c].drift_ratio)
             if evidence > wp.float64(constants.ODDS):
                 return True
     return False
@@ -185,51 +176,51 @@ def is_misled(memory: Any, world: int, i: int, q: int, landmarks: int) -> bool:
 
 @device_function
 def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
-    """Exclude all senders that drift, and return whether there are any; no other fault explains their steps."""
+    """Exclude all senders that drift, and return whether there are any; no other fault explains their drift."""
     found = bool(False)
     for q in range(1, 1 + SENDER_SLOTS):
-        if drifts(memory, world, i, q) and not is_misled(memory, world, i, q, landmarks):
+        if drifts(memory, world, i, q) and not upstream_fault_explains_drift(memory, world, i, q, landmarks):
             exclude(memory, world, i, q)
             found = True
     return found
 
 
 @device_function
-def exclude_senders(memory: Any, world: int, i: int):
+def exclude_deviating_senders(memory: Any, world: int, i: int):
     """Exclude all senders that deviate from landmarks and odometry."""
     for q in range(1, 1 + SENDER_SLOTS):
         if is_active(memory, world, i, q) and memory.source[world, i, q].deviates == 1:
-            memory.source[world, i, q].offset = memory.source[world, i, q].alone_offset
-            memory.source[world, i, q].covariance = memory.source[world, i, q].alone_covariance
+            memory.source[world, i, q].offset = memory.source[world, i, q].landmark_only_offset
+            memory.source[world, i, q].covariance = memory.source[world, i, q].landmark_only_covariance
             exclude(memory, world, i, q)
 
 
 @device_function
-def set_doubt(memory: Any, world: int, i: int, most: Any, total: Any):
-    """Set `doubt`, what the hypotheses of single faults add to the covariance of the own pose.
+def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
+    """Set the mixture covariance, which the hypotheses of single faults add to the covariance of the own pose.
 
     A hypothesis of a probability w adds the covariance of the solution without the source and the square of its
     distance, both times w.
     """
-    doubt = mat66d()
+    mixture = mat66d()
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             w = weight_of(memory.source[world, i, q].ratio, most) / total
             Phi = memory.sensitivity[world, i, q, 0]
-            doubt += w * (Phi * spread_of(memory, world, i, q) * wp.transpose(Phi))
-    memory.doubt[world, i] = symmetric_part(doubt)
+            mixture += w * (Phi * spread_of(memory, world, i, q) * wp.transpose(Phi))
+    memory.fault_mixture[world, i] = symmetric_part(mixture)
 
 
 @device_function
-def judge_sources(memory: Any, world: int, i: int, time: Any, landmarks: int):
+def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source, or the senders, of one nearly certain.
 
-    Each hypothesis has the same prior odds, and that of several senders those of as many faults; that one is looked at
-    only where one source alone is suspicious.
+    Each hypothesis has the same prior odds, and that of several senders those of as many faults; it is tested only if
+    a single source is suspect.
     """
     count = end_block(memory, world, i, time)
-    memory.doubt[world, i] = mat66d()
-    if memory.belief[world, i].open == 1:  # bearings refuse the belief, which is no judge then
+    memory.fault_mixture[world, i] = mat66d()
+    if memory.belief[world, i].gate_disabled == 1:  # innovations of a wrong pose show no faults
         forget_faults(memory, world, i)
         return
     if exclude_drifting(memory, world, i, landmarks):
@@ -246,7 +237,7 @@ def judge_sources(memory: Any, world: int, i: int, time: Any, landmarks: int):
         return
     several = wp.float64(0.0)
     if count > 1:
-        ratio, deviating = judge_senders(memory, world, i, count)
+        ratio, deviating = test_several_faulty_senders(memory, world, i, count)
         if deviating > 1:
             several = ratio - gate * wp.float64(deviating - 1)
     total = weight_of(gate, most) + weight_of(several, most)
@@ -254,13 +245,13 @@ def judge_sources(memory: Any, world: int, i: int, time: Any, landmarks: int):
         if is_active(memory, world, i, q):
             total += weight_of(memory.source[world, i, q].ratio, most)
     if several > most + wp.float64(constants.ODDS):
-        exclude_senders(memory, world, i)
+        exclude_deviating_senders(memory, world, i)
         forget_faults(memory, world, i)
     elif total < wp.float64(1.0 + constants.FAULT_RISK):
         exclude(memory, world, i, worst)
         forget_faults(memory, world, i)
     else:
-        set_doubt(memory, world, i, most, total)
+        set_fault_mixture(memory, world, i, most, total)
 
 
 @wp.func
@@ -270,8 +261,8 @@ def weight_of(ratio: Any, most: Any):
 
 
 @device_function
-def admit_scale_error(memory: Any, world: int, i: int):
-    """Let the odometry's scale have the error that its velocity seems to have."""
+def correct_scale(memory: Any, world: int, i: int):
+    """Correct the odometry's scale by the estimated fault of its velocity, and add the uncertainty to its variance."""
     f = memory.source[world, i, ODOMETRY].offset
     covariance = memory.source[world, i, ODOMETRY].covariance
     v = memory.belief[world, i].mean_v

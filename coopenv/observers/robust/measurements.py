@@ -14,8 +14,8 @@ from coopenv.observers.robust.algebra import averaging_time, between, by_rows, o
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, vec3d
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
+from coopenv.observers.robust.reports import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
-from coopenv.observers.robust.tracklets import only_returns
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
@@ -162,7 +162,7 @@ def set_measurement_of_target(
     if member == 0:
         return False
     q = memory.member[world, i, member].source
-    if frame.purpose == TRACKING and only_returns(memory, world, i, member) and not is_excluded(memory, world, i, q):
+    if frame.purpose == TRACKING and is_circular(memory, world, i, member) and not is_excluded(memory, world, i, q):
         return False
     usable = set_measurement_of_member(model, memory, world, i, frame, member, received, b)
     if frame.purpose == TRACKING:
@@ -275,7 +275,7 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
-    """Set a measurement's `gain` to H P; without a loop over the derivatives, which compilers make slower code of."""
+    """Set a measurement's `projection` to H P; a loop over the derivatives would be slower."""
     H = memory.derivative[world, n, 0].jacobian
     member = memory.derivative[world, n, 1].member
     mounting = memory.derivative[world, n, 2].member
@@ -285,19 +285,19 @@ def project(memory: Any, world: int, i: int, n: int):
             rows = rows + by_rows(memory.derivative[world, n, 1].jacobian, memory.P[world, i, member, k])
         if mounting > 0:
             rows = rows + by_rows(memory.derivative[world, n, 2].jacobian, memory.P[world, i, mounting, k])
-        memory.gain[world, n, k] = rows
+        memory.projection[world, n, k] = rows
 
 
 @device_function
 def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
     """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
-    S = memory.derivative[world, n, 0].jacobian * wp.transpose(memory.gain[world, m, 0])
+    S = memory.derivative[world, n, 0].jacobian * wp.transpose(memory.projection[world, m, 0])
     member = memory.derivative[world, n, 1].member
     if member > 0:
-        S = S + memory.derivative[world, n, 1].jacobian * wp.transpose(memory.gain[world, m, member])
+        S = S + memory.derivative[world, n, 1].jacobian * wp.transpose(memory.projection[world, m, member])
     mounting = memory.derivative[world, n, 2].member
     if mounting > 0:
-        S = S + memory.derivative[world, n, 2].jacobian * wp.transpose(memory.gain[world, m, mounting])
+        S = S + memory.derivative[world, n, 2].jacobian * wp.transpose(memory.projection[world, m, mounting])
     return S
 
 
@@ -318,7 +318,7 @@ def innovation_with(memory: Any, world: int, n: int, noise: Any):
 def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise a bearing and return its normalised innovation squared, infinite for a target behind the camera.
 
-    Its `gain` is set to H P.
+    Its `projection` is set to H P.
     """
     if not linearise(frame, memory, world, i, n):
         return wp.float64(wp.inf)

@@ -1,7 +1,7 @@
 """The state of every vehicle's observer: small records, one record of arrays of them, and rules for saved states.
 
 Covariances are of left errors (theta, rho), rad and m; positions are in the map frame. Numbers are float64 in worlds of
-any precision, because the new information in a message is a small difference of large inverses.
+any precision, because the covariance of a sender's increment is a small difference of two large ones.
 """
 
 from typing import Any
@@ -64,7 +64,7 @@ class SenderReport:
     P: mat66f  # at the marker
     odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
     depends_on: wp.uint64  # bits of the vehicles whose messages are in it
-    news: wp.int32  # whether it carries correlations and is fused
+    carries_correlations: wp.int32  # those that do are fused
 
 
 @wp.struct
@@ -76,11 +76,11 @@ class Member:
     has_twist: wp.int32
     v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
-    dated_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
+    clock_v: vec3d  # m/s, body: velocity at which clock offsets count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: SenderReport  # its last one, at which it stands
-    source: wp.int32  # the slot of its monitor, see source_monitor.py
+    source: wp.int32  # the slot of a sender's monitor, see source_monitor.py
     correlation_unknown: wp.int32  # whether it is an earlier source of information whose correlation is not known
 
 
@@ -99,14 +99,14 @@ class Source:
     ratio: wp.float64  # twice the logarithm of the likelihood ratio of its fault to none
     offset: vec3d  # f: its most likely fault, of an excluded one when it was excluded
     covariance: mat33d  # of that fault
-    steps: vec3d  # m, sum of the steps of a sender's report that its odometry does not explain, of late
-    steps_vector: vec3d  # their sum, weighted by the inverse of the covariance that each has without a fault
-    steps_information: mat33d  # the sum of these weights
-    steps_ratio: wp.float64  # like `ratio`, of a drift of the sender
+    drift: vec3d  # m, sum of a sender's increments since `drift_ratio` was last small; does not decay
+    drift_vector: vec3d  # their decaying sum, weighted by the inverse of the covariance that each has without a fault
+    drift_information: mat33d  # the decaying sum of these weights
+    drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
     joint: vec3d  # a of the blocks of late
     deviates: wp.int32  # whether a sender deviates from landmarks and odometry
-    alone_offset: vec3d  # its fault if all senders have one
-    alone_covariance: mat33d  # of that fault
+    landmark_only_offset: vec3d  # its fault if all senders have one
+    landmark_only_covariance: mat33d  # of that fault
     time: wp.float64  # s for which it has been excluded and in view
 
 
@@ -120,14 +120,14 @@ class JointBelief:
     sample_w: vec3d  # rad/s, body
     mean_v: vec3d  # m/s, body: of the samples of late, see propagation.py
     members: wp.int32  # how many
-    others: wp.int32  # the first of them that is another vehicle; before it the odometry's errors and the mounting
+    first_sender: wp.int32  # the first of them that is another vehicle; before it the calibration states
     depends_on: wp.uint64  # bits of vehicles
     rejected_share: wp.float64  # mean share of bearings that fail the gate
     healthy_time: wp.float64  # s for which it has been low
-    open: wp.int32  # whether all bearings count, because most have failed the gate
-    open_time: wp.float64  # s for which they have counted
-    judged_time: wp.float64  # s since the monitors have last been looked at
-    news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
+    gate_disabled: wp.int32  # whether all bearings count, because most have failed the gate
+    gate_disabled_time: wp.float64  # s for which they have counted
+    block_time: wp.float64  # s since the monitors' present block began
+    news_interval: wp.int32  # of `NEWS_TIME`, the last with a report that carries correlations, from 1 on
 
 
 @wp.struct
@@ -149,7 +149,7 @@ class Search:
     tracked_time: wp.float64  # s for which hypotheses have been tracked
     least_time: wp.float64  # s for which they have to be tracked before one is accepted
     waited_time: wp.float64  # s for which there were none
-    clear_time: wp.float64  # s for which the frames' solutions have been well determined; below 0: s to the next look
+    determined_time: wp.float64  # s for which all solutions have been well determined; below 0: s to the next attempt
     attempts: wp.int32
 
 
@@ -247,20 +247,20 @@ class RobustMemory:
     search: array("WN", Search)
     source: array("WNQ", Source)
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
-    steps_effect: array("WNTO", vec6d)  # likewise, by all steps of a sender as they have come
+    drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
     joint: array("WNTT", mat33d)  # on the faults of senders, likewise, of the blocks of late
-    doubt: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
+    fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
     effect: array("WAQ", mat23d)  # scratch: of an innovation by the fault of a source
-    nuisance: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors
-    nuisance_member: array("WK", wp.int32)  # scratch: the members whose errors they are
+    block_scratch: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors or faults
+    block_member: array("WK", wp.int32)  # scratch: the members to which they belong
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", SenderReport)
     inbox: array("WNN", SenderReport)  # per receiver and sender
     measurement: array("WA", BearingMeasurement)
     derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WK", Scratch)
-    gain: array("WAK", mat26d)  # scratch: of a bearing in a member, transposed and not yet weighted, see correction.py
+    projection: array("WAK", mat26d)  # scratch: H P, of a bearing and a member, see correction.py
     outbox_correlation: array("WNSC", Correlation)
     correlation: array("WNNC", Correlation)  # per receiver and sender
     known: array("WK", Regressor)  # scratch
@@ -313,10 +313,10 @@ def clear(memory: Any, world: int, i: int):
     fill(memory.scratch[world], Scratch())
     fill(memory.measurement[world], BearingMeasurement())
     fill_rows(memory.derivative[world], Derivative())
-    fill_rows(memory.gain[world], mat26d())
+    fill_rows(memory.projection[world], mat26d())
     fill_rows(memory.effect[world], mat23d())
-    fill_rows(memory.nuisance[world], mat33d())
-    fill(memory.nuisance_member[world], 0)
+    fill_rows(memory.block_scratch[world], mat33d())
+    fill(memory.block_member[world], 0)
 
 
 LARGE = numbers(LARGEST**3)
@@ -336,13 +336,12 @@ def where(used: str, rules: dict[str, Rule]) -> dict[str, Rule]:
     return {name: rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
 
 
-def _others(rule: Rule) -> Rule:
+def _of_senders(rule: Rule) -> Rule:
     """Return a rule that applies to members that are other vehicles."""
 
     def holds(values: Any, fields: Any, model: Any) -> Any:
-        others = fields["observer_belief.others"][..., None]
         mask = np.asarray(rule.holds(values, fields, model))
-        of_own = np.arange(values.shape[2]) < others
+        of_own = np.arange(values.shape[2]) < fields["observer_belief.first_sender"][..., None]
         return mask | of_own.reshape(*of_own.shape, *(1,) * (mask.ndim - of_own.ndim))
 
     return rule._replace(holds=holds)
@@ -357,16 +356,15 @@ def robust_rules() -> dict[str, Rule]:
     members = ROBUST_SIZES["K"]
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
-        "member.correlation_unknown outbox.news inbox.news member.report.news member.report.valid "
-        "belief.open"
+        "member.correlation_unknown member.report.valid belief.gate_disabled outbox.carries_correlations "
+        "inbox.carries_correlations member.report.carries_correlations"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
-        "measurement.common_noise measurement.weight scratch.column gain doubt effect sensitivity information "
-        "steps_effect source.steps source.steps_vector source.steps_information source.steps_ratio source.vector "
-        "source.ratio source.sum source.information source.covariance "
-        "source.offset"
+        "measurement.common_noise measurement.weight scratch.column projection fault_mixture effect sensitivity "
+        "information drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio "
+        "source.vector source.ratio source.sum source.information source.covariance source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
@@ -377,26 +375,26 @@ def robust_rules() -> dict[str, Rule]:
         "source.target": whole(-1, "agents"),
         "source.exclusions": whole(0, 10**9),
         "source.deviates": FLAG,
-        "nuisance_member": whole(0, members - 1),
+        "block_member": whole(0, members - 1),
         "belief.members": whole(1, members),
-        "belief.others": whole(1, MOUNTING + 1),
+        "belief.first_sender": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
         "measurement.member": whole(0, members - 1),
         "measurement.fits": whole(-1, 1),
         "measurement.source": whole(-1, SOURCES - 1),
-        "member.source": whole(-1, SOURCES - 1),
         "derivative.member": whole(-1, members - 1),
         "known.member": whole(0, members - 1),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
+        **where("belief.members", {"member.source": _of_senders(whole(1, SENDER_SLOTS))}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
     }
     reports = {"pose.R": ROTATION, "P": COVARIANCE, "odometry.R": ROTATION}
     for box in ("outbox", "inbox"):
         rules |= where(f"{box}.valid", {f"{box}.{name}": rule for name, rule in reports.items()})
-    rules |= where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})
+    rules |= where("belief.members", {f"member.report.{name}": _of_senders(rule) for name, rule in reports.items()})
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
     return rules

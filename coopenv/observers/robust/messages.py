@@ -14,11 +14,23 @@ from coopenv.world.embedded import Messages
 
 
 def write(observer: Any) -> Message:
-    """Return pose, covariance (single precision), dead reckoning and a mask, or nothing while the pose is not known."""
+    """Return pose, covariance, dead reckoning (single precision) and a mask; at times correlations in whole steps, too.
+
+    While the pose is not known, the message is empty.
+    """
     report = observer.memory.outbox[0]
     if not report["valid"]:
         return Message()
-    extra = {"odometry": six_of(report["odometry"]), "depends_on": np.array([report["depends_on"]])}
+    extra = {"odometry": six_of(report["odometry"]).astype(np.float32), "depends_on": np.array([report["depends_on"]])}
+    if report["carries_correlations"]:
+        broadcast = observer.memory.outbox_correlation[0]
+        broadcast = broadcast[broadcast["vehicle"] >= 0]
+        ages = (int(report["tick"]) - broadcast["tick"]) * observer.unit
+        extra |= {
+            "correlated_vehicles": broadcast["vehicle"].astype(np.uint16),
+            "ages": ages.astype(np.float32),
+            "correlations": broadcast["matrix"].astype(np.int8),
+        }
     return Message(report["pose"]["p"].copy(), report["pose"]["R"].copy(), report["P"].copy(), extra)
 
 
@@ -35,13 +47,16 @@ def from_six(values: Array) -> tuple[Array, Array]:
 def read(observer: Any, sender: int, message: Message, sent: int) -> None:
     """Put a message into the inbox; a CoopenvError or LookupError means that it is malformed."""
     report = observer.memory.inbox[sender]
-    report["tick"], report["valid"] = sent, 0
+    report["tick"], report["valid"], report["carries_correlations"] = sent, 0, 0
     if message.position is None and not message.extra:  # the sender is searching for its pose
         return
     check_pose(message)
     odometry, depends_on = _numbers(message, "odometry", (6,)), np.asarray(message.extra["depends_on"])
     if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
         raise CoopenvError("message: depends_on")
+    if "correlated_vehicles" in message.extra:
+        _read_correlations(observer, sender, message, sent)
+        report["carries_correlations"] = 1
     report["pose"], report["P"] = (message.rotation, message.position), message.covariance
     report["odometry"], report["depends_on"], report["valid"] = from_six(odometry), depends_on[0], 1
 
@@ -54,19 +69,19 @@ def _numbers(message: Message, name: str, shape: tuple[int, ...]) -> Array:
     return values
 
 
-def _others(observer: Any, sender: int, message: Message, name: str, most: int) -> Array:
+def _vehicles(observer: Any, sender: int, message: Message, name: str, most: int) -> Array:
     """Return an entry of a message that lists vehicles; a CoopenvError means that it cannot.
 
     These are at most so many vehicles, different from each other and from the sender.
     """
-    others = np.asarray(message.extra[name])
+    listed = np.asarray(message.extra[name])
     count = len(observer.setup.target_names) - observer.setup.landmarks
-    if others.ndim != 1 or others.dtype.kind not in "iu" or len(others) > most:
+    if listed.ndim != 1 or listed.dtype.kind not in "iu" or len(listed) > most:
         raise CoopenvError(f"message: {name}")
-    vehicles = {sender, *others.tolist()}
-    if len(vehicles) <= len(others) or not vehicles <= set(range(count)):
+    vehicles = {sender, *listed.tolist()}
+    if len(vehicles) <= len(listed) or not vehicles <= set(range(count)):
         raise CoopenvError(f"message: {name}")
-    return others
+    return listed
 
 
 def lead_along(made: Message, honest: Message) -> Message:
@@ -89,44 +104,18 @@ def check_pose(message: Message) -> None:
         raise CoopenvError("message: covariance is not positive definite, or not plausible")
 
 
-def write_broadcast(observer: Any) -> Message:
-    """Return pose, covariance and dead reckoning (single precision), at times also correlations in whole steps."""
-    message = write(observer)
-    if message.position is None:
-        return message
-    extra: dict[str, Any] = {**message.extra, "odometry": message.extra["odometry"].astype(np.float32)}
-    report = observer.memory.outbox[0]
-    if report["news"]:
-        broadcast = observer.memory.outbox_correlation[0]
-        broadcast = broadcast[broadcast["vehicle"] >= 0]
-        ages = (int(report["tick"]) - broadcast["tick"]) * observer.unit
-        extra |= {
-            "told": broadcast["vehicle"].astype(np.uint16),
-            "ages": ages.astype(np.float32),
-            "correlations": broadcast["matrix"].astype(np.int8),
-        }
-    return replace(message, extra=extra)
-
-
-def read_broadcast(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message into the inbox; a CoopenvError or LookupError means that it is malformed."""
-    m = observer.memory
-    read(observer, sender, message, sent)
-    m.inbox[sender]["news"] = 0
-    if not m.inbox[sender]["valid"] or "told" not in message.extra:
-        return
-    m.inbox[sender]["valid"] = 0
-    broadcast = _others(observer, sender, message, "told", MAX_CORRELATIONS)
+def _read_correlations(observer: Any, sender: int, message: Message, sent: int) -> None:
+    """Store the correlations of a message; a CoopenvError or LookupError means that they are malformed."""
+    broadcast = _vehicles(observer, sender, message, "correlated_vehicles", MAX_CORRELATIONS)
     ages, matrices = np.asarray(message.extra["ages"]), np.asarray(message.extra["correlations"])
     if matrices.shape != (len(broadcast), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
         raise CoopenvError("message: correlations")
     if ages.shape != broadcast.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():
         raise CoopenvError("message: ages")
-    m.inbox[sender]["valid"] = m.inbox[sender]["news"] = 1
-    kept = m.correlation[sender]
+    kept = observer.memory.correlation[sender]
     kept["vehicle"] = -1
     for n, (vehicle, age, matrix) in enumerate(zip(broadcast.tolist(), ages.tolist(), matrices, strict=True)):
         kept[n] = vehicle, sent - observer.units(age), matrix
 
 
-ROBUST_MESSAGES = Messages(write_broadcast, read_broadcast, lead_along)
+ROBUST_MESSAGES = Messages(write, read, lead_along)

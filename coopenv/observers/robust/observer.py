@@ -36,7 +36,7 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.belief import (
     apply_error,
     begin_belief,
-    doubted_estimate,
+    estimate_with_faults,
     own_estimate,
     set_anchor,
     set_block,
@@ -44,7 +44,7 @@ from coopenv.observers.robust.belief import (
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
-from coopenv.observers.robust.fault_hypotheses import judge_sources, test_excluded
+from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
 from coopenv.observers.robust.measurements import (
     RESECTION,
     TRACKING,
@@ -68,18 +68,18 @@ from coopenv.observers.robust.memory import (
 from coopenv.observers.robust.messages import ROBUST_MESSAGES
 from coopenv.observers.robust.propagation import (
     begin_errors,
+    calibration_noise,
     increment_noise,
-    lasting_noise,
     propagate_own,
     take_odometry,
     walk_errors,
     walk_mounting,
 )
 from coopenv.observers.robust.protection import protection_level
+from coopenv.observers.robust.reports import bit_of
 from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
 from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
-from coopenv.observers.robust.tracklets import bit_of
 from coopenv.world.embedded import Embedded
 from coopenv.world.v2x import start_covariance
 from coopenv.world.warp_internals import device_function
@@ -91,7 +91,7 @@ ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
 
 @device_function
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
-    """Linearise the bearings and gate them; return the share of rejected ones, the number of the others, and their NIS.
+    """Linearise the bearings and gate them; return the share of rejected ones, the number of used ones, and their NIS.
 
     Bearings to excluded sources are not used and do not count in the share, which is -1 if none counts.
     """
@@ -99,7 +99,7 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     missed = int(0)
     fitting = int(0)
     total = wp.float64(0.0)
-    all_count = frame.purpose == TRACKING and memory.belief[world, i].open == 1
+    all_count = frame.purpose == TRACKING and memory.belief[world, i].gate_disabled == 1
     for n in range(frame.bearings):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
@@ -138,7 +138,7 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
     begin_errors(model, memory, world, i)  # their estimates may be wrong, too
-    noise = odometry_noise(model, i, elapsed) + lasting_noise(memory, world, i, step, elapsed, elapsed)
+    noise = odometry_noise(model, i, elapsed) + calibration_noise(memory, world, i, step, elapsed, elapsed)
     begin_search(memory, world, i, carried(anchor.estimate, step, noise))
 
 
@@ -149,16 +149,16 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
     missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
     memory.belief[world, i].rejected_share = missed
     if missed > wp.float64(constants.LOST_SHARE):
-        memory.belief[world, i].open = 1
+        memory.belief[world, i].gate_disabled = 1
     elif missed < wp.float64(constants.FOUND_SHARE):
-        memory.belief[world, i].open = 0
-        memory.belief[world, i].open_time = wp.float64(0.0)
-    memory.belief[world, i].open_time += wp.float64(memory.belief[world, i].open) * now.period
+        memory.belief[world, i].gate_disabled = 0
+        memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
+    memory.belief[world, i].gate_disabled_time += wp.float64(memory.belief[world, i].gate_disabled) * now.period
     healthy = memory.belief[world, i].healthy_time + now.period
     if missed >= wp.float64(constants.FOUND_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].healthy_time = healthy
-    if memory.belief[world, i].open_time > wp.float64(constants.LONG_TIME) and missed > wp.float64(
+    if memory.belief[world, i].gate_disabled_time > wp.float64(constants.LONG_TIME) and missed > wp.float64(
         constants.LOST_SHARE
     ):
         declare_lost(model, memory, world, i, now.tick)
@@ -182,11 +182,11 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     if fitting > 0:
         iterated_update(frame, memory, world, i)
         correct_sources(frame, memory, world, i)
-    memory.belief[world, i].judged_time += frame.period
-    block = memory.belief[world, i].judged_time
+    memory.belief[world, i].block_time += frame.period
+    block = memory.belief[world, i].block_time
     if block > wp.float64(constants.SHORT_TIME - constants.SAME_TIME):
-        memory.belief[world, i].judged_time = wp.float64(0.0)
-        judge_sources(memory, world, i, block, model.landmarks)
+        memory.belief[world, i].block_time = wp.float64(0.0)
+        detect_and_exclude(memory, world, i, block, model.landmarks)
     if share >= wp.float64(0.0):
         note_rejections(model, memory, world, i, share, now)
 
@@ -216,7 +216,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
 
 @device_function
 def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
-    """Resect the own pose from a frame by least squares, from the current pose; return whether that converges."""
+    """Resect the own pose from a frame by least squares; return whether in all steps three bearings determine it."""
     bearings = frame.bearings
     inverse = mat66d()
     for step in range(constants.MAX_ITERATIONS):
@@ -255,8 +255,8 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     begin_belief(memory, world, i, estimate)
     begin_sources(memory, world, i)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
-    memory.belief[world, i].open = 0
-    memory.belief[world, i].open_time = wp.float64(0.0)
+    memory.belief[world, i].gate_disabled = 0
+    memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
     bits = wp.uint64(0)
     for n in range(model.target_count[i]):
         if model.targets[i, n] >= model.landmarks:
@@ -270,7 +270,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
-    estimate = doubted_estimate(memory, world, i)
+    estimate = estimate_with_faults(memory, world, i)
     if memory.search[world, i].active == 1:
         estimate = memory.search[world, i].prior
         if memory.search[world, i].hypotheses > 0:
@@ -292,7 +292,7 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     An estimate that is too uncertain to linearise about is only a prior for the search.
     """
     clear(memory, world, i)
-    memory.belief[world, i].others = 1
+    memory.belief[world, i].first_sender = 1
     begin_errors(model, memory, world, i)
     R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
     initial = PoseEstimate(
@@ -369,8 +369,7 @@ def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 
 
 OPTIONS = {"max_unroll": 1}
-"""Of the Warp module; without the first two there is long straight code, which takes long to compile and is no faster;
-with the last one, which is Warp's on a GPU, steps take a twentieth less than with Warp's 2."""
+"""Of the Warp module. Unrolled loops make long code, which takes long to compile and is no faster."""
 
 ROBUST = Embedded(
     "robust",

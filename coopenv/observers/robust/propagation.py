@@ -35,7 +35,7 @@ def mounting_variances(model: Any, i: int):
 @device_function
 def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
     """Begin calibration state n with declared variances (6,)."""
-    memory.belief[world, i].others = n + 1
+    memory.belief[world, i].first_sender = n + 1
     calibration = Member()
     calibration.vehicle = i
     calibration.pose.R = wp.identity(3, wp.float64)
@@ -56,14 +56,14 @@ def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
 @device_function
 def mounting_of(memory: Any, world: int, i: int) -> int:
     """Return the member with the calibration state of the mounting, 0 if there is none."""
-    return wp.where(memory.belief[world, i].others > MOUNTING, MOUNTING, 0)
+    return wp.where(memory.belief[world, i].first_sender > MOUNTING, MOUNTING, 0)
 
 
 TWELFTH = 1.0 / 12.0
 
 
 @device_function
-def lasting_variances(model: Any, i: int):
+def calibration_variances(model: Any, i: int):
     """Return the variances of the gyro's bias per axis, `GYRO_BIAS` at least, and of the odometry's scale (4,)."""
     bias = wp.max(vec3d(model.noise[i].gyro_bias), vec3d(wp.float64(constants.GYRO_BIAS)))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale))
@@ -81,10 +81,10 @@ def walk_variances(model: Any, i: int):
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
     """Begin the calibration states of odometry, member 1, and of the mounting, member 2, if its errors are declared."""
-    lasting = lasting_variances(model, i)
+    odometry = calibration_variances(model, i)
     mounting = mounting_variances(model, i)
     one = wp.float64(1.0)  # entries without a state are arbitrary
-    begin_calibration(memory, world, i, ERRORS, vec6d(lasting[0], lasting[1], lasting[2], lasting[3], one, one))
+    begin_calibration(memory, world, i, ERRORS, vec6d(odometry[0], odometry[1], odometry[2], odometry[3], one, one))
     if wp.max(mounting) > wp.float64(0.0):
         variances = vec6d(mounting[0], mounting[0], mounting[0], mounting[1], mounting[1], mounting[1])
         begin_calibration(memory, world, i, MOUNTING, variances)
@@ -144,10 +144,10 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
 
 
 @device_function
-def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
-    """Return the variances (rotation, translation) of an increment over dt by lasting odometry errors, taken as noise.
+def calibration_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
+    """Return the variances (rotation, translation) of an increment over dt by the odometry's calibration, as noise.
 
-    They have the covariance of the vehicle's own calibration. A lasting error adds up like noise that is constant over
+    The calibration errors have the covariance of the vehicle's own ones. They add up like noise that is constant over
     the time `correlated`, s.
     """
     P = memory.P[world, i, ERRORS, ERRORS]
@@ -158,9 +158,9 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
 
 @device_function
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return the variances (rotation, translation) of an increment over dt, lasting errors included."""
+    """Return the variances (rotation, translation) of an increment over dt, calibration errors included."""
     noise = odometry_noise(model, i, dt)
-    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(constants.MEAN_TIME))
+    return noise + calibration_noise(memory, world, i, step, dt, wp.float64(constants.MEAN_TIME))
 
 
 @wp.func

@@ -62,7 +62,7 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
 
 
 @device_function
-def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool):
+def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, require_determined: bool):
     """Return whether three bearings determine the present pose well enough, and its covariance."""
     M = mat66d()
     for n in range(3):
@@ -70,7 +70,7 @@ def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: 
         H = memory.derivative[world, triple[n], 0].jacobian
         M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, triple[n]].noise)) * H
     P = symmetric_part(inverse6(M))
-    if patient:
+    if require_determined:
         return is_known(P), P
     angles = wp.vec3d(P[0, 0], P[1, 1], P[2, 2])
     determined = wp.min(angles) > wp.float64(0.0) and wp.max(angles) <= wp.float64(1.0)
@@ -95,28 +95,6 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
         memory.hypothesis[world, i, h].estimate = estimate
         if is_new(memory, world, i, h, h):
             memory.search[world, i].hypotheses = h + 1
-
-
-@device_function
-def solve(
-    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, b: Any, z: Any, patient: bool, tracking: bool
-):
-    """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
-
-    With `tracking` they become hypotheses.
-    """
-    count, distances = solve_triangle(b, z)
-    for n in range(count):
-        R, camera = camera_pose(b, z, distances[n])
-        if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
-            pose = Pose(R, camera - R * frame.lever)
-            begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
-            determined, P = covariance_of(frame, memory, world, i, triple, patient)
-            if patient and not determined:
-                return False
-            if tracking and determined:
-                add_hypothesis(memory, world, i, PoseEstimate(pose, P))
-    return True
 
 
 @device_function
@@ -148,18 +126,28 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
 
 @device_function
 def solve_triple(
-    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, patient: bool, tracking: bool
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, require_determined: bool, tracking: bool
 ) -> bool:
     """Make hypotheses of the poses that agree with three bearings, in their order, if `tracking`.
 
-    Return False if `patient` and a solution is not well determined.
+    Return False if `require_determined` and a solution is not well determined.
     """
     memory.search[world, i].hypotheses = 0
     for number in range(PROBLEMS):
         exists, b, z = problem(frame, memory, world, triple, number)
-        if exists:
-            if not solve(frame, memory, world, i, triple, b, z, patient, tracking):
-                return False
+        if not exists:
+            continue
+        count, distances = solve_triangle(b, z)
+        for n in range(count):
+            R, camera = camera_pose(b, z, distances[n])
+            if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
+                pose = Pose(R, camera - R * frame.lever)
+                begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
+                determined, P = covariance_of(frame, memory, world, i, triple, require_determined)
+                if require_determined and not determined:
+                    return False
+                if tracking and determined:
+                    add_hypothesis(memory, world, i, PoseEstimate(pose, P))
     return True
 
 
@@ -242,8 +230,8 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, n: int):
     if memory.measurement[world, n].variance > wp.float64(0.0):
         time = wp.float64(constants.MEAN_TIME)
     noise = memory.measurement[world, n].noise
-    lasting = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
-    return wp.float64(2.0) * (frame.variance + lasting) / noise
+    persistent = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
+    return wp.float64(2.0) * (frame.variance + persistent) / noise
 
 
 @device_function
@@ -294,16 +282,18 @@ def chosen_triple(frame: BearingFrame, memory: Any, world: int, i: int):
 
 
 @device_function
-def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, period: Any, patient: bool) -> bool:
+def solve_chosen(
+    frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, period: Any, require_determined: bool
+) -> bool:
     """Solve a triple; return whether its solutions are hypotheses now: if all were well determined for some time.
 
     Near a double solution the error has no ellipsoidal region, and noise makes the solutions appear and vanish. With
     time the estimates of a follower's leaders improve, which separates the solutions.
     """
-    clear = wp.max(memory.search[world, i].clear_time, period)
-    tracking = not patient or clear >= wp.float64(constants.NEWS_TIME)
-    if not solve_triple(frame, memory, world, i, triple, patient, tracking):
-        clear = wp.float64(-constants.NEWS_TIME)
+    determined = wp.max(memory.search[world, i].determined_time, period)
+    tracking = not require_determined or determined >= wp.float64(constants.NEWS_TIME)
+    if not solve_triple(frame, memory, world, i, triple, require_determined, tracking):
+        determined = wp.float64(-constants.NEWS_TIME)
         tracking = False
     if tracking:
         for h in range(memory.search[world, i].hypotheses):
@@ -311,12 +301,12 @@ def solve_chosen(frame: BearingFrame, memory: Any, world: int, i: int, triple: A
             memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].misfit = wp.float64(0.0)
-        clear = wp.float64(0.0)
-        least = wp.where(patient, wp.float64(constants.SHORT_TIME), wp.float64(constants.LONG_TIME))
+        determined = wp.float64(0.0)
+        least = wp.where(require_determined, wp.float64(constants.SHORT_TIME), wp.float64(constants.LONG_TIME))
         memory.search[world, i].least_time = least
     else:
         memory.search[world, i].hypotheses = 0
-    memory.search[world, i].clear_time = clear
+    memory.search[world, i].determined_time = determined
     return tracking
 
 
@@ -331,12 +321,12 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
     tracking = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
     if not tracking:
         memory.search[world, i].waited_time += period
-        memory.search[world, i].clear_time += period
-        patient = memory.search[world, i].waited_time < wp.float64(constants.LONG_TIME)
+        memory.search[world, i].determined_time += period
+        require_determined = memory.search[world, i].waited_time < wp.float64(constants.LONG_TIME)
         # not soon after a frame that did not determine the pose
-        if not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME):
+        if not require_determined or memory.search[world, i].determined_time > wp.float64(-constants.SAME_TIME):
             triple = chosen_triple(frame, memory, world, i)
-            tracking = solve_chosen(frame, memory, world, i, triple, period, patient)
+            tracking = solve_chosen(frame, memory, world, i, triple, period, require_determined)
             solved = memory.search[world, i].hypotheses
     if tracking:
         add_prior(memory, world, i)

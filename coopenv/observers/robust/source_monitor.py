@@ -10,9 +10,9 @@ Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = 
 f = V^-1 v, and twice the logarithm of its likelihood ratio to none is v^T f. The solution without the source is
 x + Phi f with the covariance P + Phi V^-1 Phi^T; it needs no filter of its own.
 
-A sender's reports are also held against its own odometry. A step d of a report that the odometry does not explain has
-the covariance N that fuse_increment derives; a drift gives all steps the same mean. If the steps are a fault, the own
-error that they have caused is `steps_effect`.
+A sender's reports are also compared with its own odometry. The increment d of a report, which the odometry does not
+explain, has the covariance N that fuse_increment derives; a drift gives all increments the same mean. If their sum
+`drift` is a fault, the own error that it has caused is `drift_effect`.
 Source: Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear
 systems, IEEE Transactions on Automatic Control 21(1), 1976; Blanch et al., Baseline advanced RAIM user algorithm and
 possible improvements, IEEE Transactions on Aerospace and Electronic Systems 51(1), 2015, for solution separation.
@@ -34,7 +34,7 @@ from coopenv.observers.robust.memory import (
     mat63d,
     vec3d,
 )
-from coopenv.observers.robust.sources import ODOMETRY, clear_steps, is_active, is_sender
+from coopenv.observers.robust.sources import ODOMETRY, clear_drift, is_active, is_sender
 from coopenv.world.warp_internals import device_function
 
 
@@ -58,7 +58,7 @@ def share_of(frame: BearingFrame, memory: Any, world: int, n: int):
 @device_function
 def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
     """Add the innovations of a frame to the vector of a source, and correct its sensitivities."""
-    others = memory.belief[world, i].others
+    first_sender = memory.belief[world, i].first_sender
     turn = wp.transpose(memory.scratch[world, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
     errors = memory.sensitivity[world, i, q, ERRORS]
@@ -79,61 +79,59 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
                 wp.transpose(WM) * memory.measurement[world, n].innovation
             )
             if fits == 1:
-                own = own - wp.transpose(memory.gain[world, n, 0]) * WM
-                errors = errors - wp.transpose(memory.gain[world, n, ERRORS]) * WM
-                if others > MOUNTING:
-                    mounting = mounting - wp.transpose(memory.gain[world, n, MOUNTING]) * WM
+                own = own - wp.transpose(memory.projection[world, n, 0]) * WM
+                errors = errors - wp.transpose(memory.projection[world, n, ERRORS]) * WM
+                if first_sender > MOUNTING:
+                    mounting = mounting - wp.transpose(memory.projection[world, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
     memory.sensitivity[world, i, q, 0] = by_blocks(memory.scratch[world, 0].recentring, own)
     memory.sensitivity[world, i, q, ERRORS] = errors
-    if others > MOUNTING:
+    if first_sender > MOUNTING:
         memory.sensitivity[world, i, q, MOUNTING] = by_blocks(memory.scratch[world, MOUNTING].recentring, mounting)
 
 
 @device_function
-def correct_steps_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
-    """Correct the own and the calibration errors that a sender's steps cause, if they are a fault."""
-    others = memory.belief[world, i].others
-    f = -(wp.transpose(memory.scratch[world, 0].pose.R) * memory.source[world, i, q].steps)
+def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
+    """Correct the own and the calibration errors by a sender's drift, if that is a fault."""
+    f = -(wp.transpose(memory.scratch[world, 0].pose.R) * memory.source[world, i, q].drift)
     for n in range(frame.bearings):
         if memory.measurement[world, n].fits == 1:
-            r = memory.derivative[world, n, 0].jacobian * memory.steps_effect[world, i, q - 1, 0]
+            r = memory.derivative[world, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
             if frame.mounting > 0:
-                r = r + memory.derivative[world, n, 2].jacobian * memory.steps_effect[world, i, q - 1, MOUNTING]
+                r = r + memory.derivative[world, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
             if memory.measurement[world, n].source == q:
                 r = r - memory.derivative[world, n, 0].jacobian[:, 3:] * f
             r = memory.measurement[world, n].weight * r
-            for k in range(others):
-                e = memory.steps_effect[world, i, q - 1, k] - wp.transpose(memory.gain[world, n, k]) * r
-                memory.steps_effect[world, i, q - 1, k] = e
+            for k in range(memory.belief[world, i].first_sender):
+                e = memory.drift_effect[world, i, q - 1, k] - wp.transpose(memory.projection[world, n, k]) * r
+                memory.drift_effect[world, i, q - 1, k] = e
 
 
 @device_function
-def add_step(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
-    """Add a step of a sender's report that its odometry does not explain, d (m, map) of covariance N, to its sums."""
-    if q >= 0:
-        W = wp.inverse(N + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64))
-        memory.source[world, i, q].steps = memory.source[world, i, q].steps + d
-        memory.source[world, i, q].steps_vector = memory.source[world, i, q].steps_vector + W * d
-        memory.source[world, i, q].steps_information = memory.source[world, i, q].steps_information + W
+def add_to_drift(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
+    """Add the increment d (m, map) of a sender's report, of covariance N, to the sums of its drift."""
+    W = wp.inverse(N + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64))
+    memory.source[world, i, q].drift = memory.source[world, i, q].drift + d
+    memory.source[world, i, q].drift_vector = memory.source[world, i, q].drift_vector + W * d
+    memory.source[world, i, q].drift_information = memory.source[world, i, q].drift_information + W
 
 
 @device_function
-def end_steps(memory: Any, world: int, i: int, q: int, kept: Any):
-    """Set the likelihood ratio of a sender's drift, which gives all steps the same mean, at the end of a block.
+def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
+    """Set the likelihood ratio of a sender's drift, which gives all increments the same mean, at the end of a block.
 
     A drift begins where the ratio is last as small as without a fault.
     Source: Page, Continuous inspection schemes, Biometrika 41, 1954.
     """
-    v = memory.source[world, i, q].steps_vector
-    V = memory.source[world, i, q].steps_information
+    v = memory.source[world, i, q].drift_vector
+    V = memory.source[world, i, q].drift_information
     ratio = wp.dot(v, wp.inverse(V + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)) * v)
-    memory.source[world, i, q].steps_ratio = ratio
+    memory.source[world, i, q].drift_ratio = ratio
     if ratio < wp.float64(3.0):
-        clear_steps(memory, world, i, q)
+        clear_drift(memory, world, i, q)
     else:
-        memory.source[world, i, q].steps_vector = kept * v
-        memory.source[world, i, q].steps_information = kept * V
+        memory.source[world, i, q].drift_vector = kept * v
+        memory.source[world, i, q].drift_information = kept * V
 
 
 @device_function
@@ -143,7 +141,7 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
         if is_active(memory, world, i, q):
             correct_source(frame, memory, world, i, q)
             if is_sender(q):
-                correct_steps_effect(frame, memory, world, i, q)
+                correct_drift_effect(frame, memory, world, i, q)
     weight = wp.min(frame.period / wp.float64(constants.MEAN_TIME), wp.float64(1.0))
     for n in range(frame.bearings):
         q = memory.measurement[world, n].source
@@ -163,30 +161,31 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
                             memory.information[world, i, q, c] = A
 
 
-@device_function
-def information_between(memory: Any, world: int, i: int, q: int, c: int):
-    """Return A at (q, c); only one triangle is stored."""
+@wp.func
+def block_between(blocks: Any, q: int, c: int):
+    """Return the block (q, c) of a symmetric matrix of which only the triangle c <= q is stored."""
     if c <= q:
-        return memory.information[world, i, q, c]
-    return wp.transpose(memory.information[world, i, c, q])
+        return blocks[q, c]
+    return wp.transpose(blocks[c, q])
 
 
 @device_function
 def invert_blocks(memory: Any, world: int, n: int):
-    """Invert the symmetric positive definite matrix of n x n blocks in `nuisance` by Gauss and Jordan's elimination."""
+    """Invert the symmetric positive definite matrix of n x n blocks in `block_scratch` (Gauss-Jordan)."""
     for p in range(n):
-        D = wp.inverse(memory.nuisance[world, p, p])
+        D = wp.inverse(memory.block_scratch[world, p, p])
         for j in range(n):
             if j != p:
-                memory.nuisance[world, p, j] = D * memory.nuisance[world, p, j]
+                memory.block_scratch[world, p, j] = D * memory.block_scratch[world, p, j]
         for k in range(n):
             if k != p:
-                X = memory.nuisance[world, k, p]
+                X = memory.block_scratch[world, k, p]
                 for j in range(n):
                     if j != p:
-                        memory.nuisance[world, k, j] = memory.nuisance[world, k, j] - X * memory.nuisance[world, p, j]
-                memory.nuisance[world, k, p] = -(X * D)
-        memory.nuisance[world, p, p] = D
+                        left = memory.block_scratch[world, k, j] - X * memory.block_scratch[world, p, j]
+                        memory.block_scratch[world, k, j] = left
+                memory.block_scratch[world, k, p] = -(X * D)
+        memory.block_scratch[world, p, p] = D
 
 
 @device_function
@@ -198,27 +197,28 @@ def reported_covariance(memory: Any, world: int, i: int, k: int, j: int):
 
 @device_function
 def source_at(memory: Any, world: int, i: int, a: int) -> int:
-    """Return the slot of the a-th sender in `nuisance`."""
-    return memory.member[world, i, memory.nuisance_member[world, a]].source
+    """Return the slot of the a-th sender in `block_scratch`."""
+    return memory.member[world, i, memory.block_member[world, a]].source
 
 
 @device_function
 def eliminate_senders(memory: Any, world: int, i: int, scale: Any) -> int:
-    """Set `nuisance` to Pi, the covariance of the used senders' errors given all innovations; return how many."""
+    """Set `block_scratch` to Pi, the covariance of the used senders' errors given all innovations; return how many."""
     count = int(0)
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if is_active(memory, world, i, memory.member[world, i, k].source):
-            memory.nuisance_member[world, count] = k
+            memory.block_member[world, count] = k
             for b in range(count + 1):
-                X = scale * reported_covariance(memory, world, i, k, memory.nuisance_member[world, b])
-                memory.nuisance[world, count, b] = X
-                memory.nuisance[world, b, count] = wp.transpose(X)
+                X = scale * reported_covariance(memory, world, i, k, memory.block_member[world, b])
+                memory.block_scratch[world, count, b] = X
+                memory.block_scratch[world, b, count] = wp.transpose(X)
             count += 1
     invert_blocks(memory, world, count)
     for a in range(count):
         for b in range(count):
-            X = information_between(memory, world, i, source_at(memory, world, i, a), source_at(memory, world, i, b))
-            memory.nuisance[world, a, b] += X
+            q = source_at(memory, world, i, a)
+            c = source_at(memory, world, i, b)
+            memory.block_scratch[world, a, b] += block_between(memory.information[world, i], q, c)
     invert_blocks(memory, world, count)
     return count
 
@@ -229,7 +229,7 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
     X = mat33d()
     for a in range(count):
         c = source_at(memory, world, i, a)
-        X = X + information_between(memory, world, i, q, c) * memory.nuisance[world, a, b]
+        X = X + block_between(memory.information[world, i], q, c) * memory.block_scratch[world, a, b]
     return X
 
 
@@ -245,7 +245,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             for b in range(count):
                 c = source_at(memory, world, i, b)
                 X = coupling(memory, world, i, count, q, b)
-                V = V - X * information_between(memory, world, i, c, q)
+                V = V - X * block_between(memory.information[world, i], c, q)
                 v = v - X * memory.source[world, i, c].vector
             V = kept * memory.source[world, i, q].information + wp.float64(0.5) * (V + wp.transpose(V))
             v = kept * memory.source[world, i, q].sum + v
@@ -253,20 +253,21 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].sum = v
             least = wp.float64(constants.ROUNDING) * wp.trace(V) + wp.float64(constants.MIN_VARIANCE)
             if q == ODOMETRY:
-                least = wp.float64(1.0) / wp.max(speed_error(memory, world, i), wp.float64(constants.MIN_VARIANCE))
+                variance = odometry_fault_variance(memory, world, i)
+                least = wp.float64(1.0) / wp.max(variance, wp.float64(constants.MIN_VARIANCE))
             covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
             memory.source[world, i, q].covariance = covariance
             memory.source[world, i, q].offset = covariance * v
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
             if is_sender(q):
-                end_steps(memory, world, i, q, kept)
-    keep_joint(memory, world, i, kept)
+                end_drift_block(memory, world, i, q, kept)
+    add_joint_information(memory, world, i, kept)
     clear_block(memory, world, i)
     return count
 
 
 @device_function
-def keep_joint(memory: Any, world: int, i: int, kept: Any):
+def add_joint_information(memory: Any, world: int, i: int, kept: Any):
     """Add the information of a block on the faults of all senders together to its sums."""
     for a in range(1, 1 + SENDER_SLOTS):
         if is_active(memory, world, i, a):
@@ -279,15 +280,7 @@ def keep_joint(memory: Any, world: int, i: int, kept: Any):
 
 
 @device_function
-def joint_between(memory: Any, world: int, i: int, q: int, c: int):
-    """Return the joint information on the faults of two senders."""
-    if c <= q:
-        return memory.joint[world, i, q - 1, c - 1]
-    return wp.transpose(memory.joint[world, i, c - 1, q - 1])
-
-
-@device_function
-def speed_error(memory: Any, world: int, i: int):
+def odometry_fault_variance(memory: Any, world: int, i: int):
     """Return the variance, (m/s)^2, of the fault of the odometry's velocity: a share of the speed."""
     share = wp.float64(constants.ODOMETRY_FAULT * constants.ODOMETRY_FAULT)
     return share * wp.length_sq(memory.belief[world, i].mean_v)

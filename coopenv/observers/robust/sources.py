@@ -32,13 +32,13 @@ def is_sender(q: int) -> bool:
 
 
 @device_function
-def clear_steps(memory: Any, world: int, i: int, q: int):
-    """Begin the sum of a sender's steps anew."""
-    memory.source[world, i, q].steps = vec3d()
-    memory.source[world, i, q].steps_vector = vec3d()
-    memory.source[world, i, q].steps_ratio = wp.float64(0.0)
-    memory.source[world, i, q].steps_information = mat33d()
-    fill(memory.steps_effect[world, i, q - 1], vec6d())
+def clear_drift(memory: Any, world: int, i: int, q: int):
+    """Begin the sums of a sender's drift anew."""
+    memory.source[world, i, q].drift = vec3d()
+    memory.source[world, i, q].drift_vector = vec3d()
+    memory.source[world, i, q].drift_ratio = wp.float64(0.0)
+    memory.source[world, i, q].drift_information = mat33d()
+    fill(memory.drift_effect[world, i, q - 1], vec6d())
 
 
 @device_function
@@ -49,7 +49,7 @@ def clear_source(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].sum = vec3d()
     memory.source[world, i, q].joint = vec3d()
     if is_sender(q):
-        clear_steps(memory, world, i, q)
+        clear_drift(memory, world, i, q)
         for c in range(SENDER_SLOTS):
             memory.joint[world, i, q - 1, c] = mat33d()
             memory.joint[world, i, c, q - 1] = mat33d()
@@ -61,7 +61,7 @@ def clear_source(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
-def free_source(memory: Any, world: int, i: int, q: int):
+def release_slot(memory: Any, world: int, i: int, q: int):
     """Empty a slot."""
     clear_source(memory, world, i, q)
     memory.source[world, i, q] = Source()
@@ -71,9 +71,9 @@ def free_source(memory: Any, world: int, i: int, q: int):
 @device_function
 def begin_sources(memory: Any, world: int, i: int):
     """Begin without any information about sources; all are used."""
-    memory.doubt[world, i] = mat66d()
+    memory.fault_mixture[world, i] = mat66d()
     for q in range(SOURCES):
-        free_source(memory, world, i, q)
+        release_slot(memory, world, i, q)
 
 
 @device_function
@@ -86,12 +86,12 @@ def slot_of(memory: Any, world: int, i: int, target: int) -> int:
 
 
 @device_function
-def is_held(memory: Any, world: int, i: int, q: int) -> bool:
-    """Return whether a slot is that of a member."""
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+def member_of(memory: Any, world: int, i: int, q: int) -> int:
+    """Return the member that has a slot, 0 if there is none."""
+    for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if memory.member[world, i, k].source == q:
-            return True
-    return False
+            return k
+    return 0
 
 
 @device_function
@@ -101,7 +101,7 @@ def longest_unseen_slot(memory: Any, world: int, i: int, first: int, last: int) 
     for q in range(first, last):
         if memory.source[world, i, q].target == NO_TARGET:
             return q
-        if not is_held(memory, world, i, q):
+        if member_of(memory, world, i, q) == 0:
             if found < 0 or memory.source[world, i, q].seen_tick < memory.source[world, i, found].seen_tick:
                 found = q
     return found
@@ -122,7 +122,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
             unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
             q = wp.where(unseen > wp.float64(constants.MEAN_TIME), q, -1)
         if q >= 0:
-            free_source(memory, world, i, q)
+            release_slot(memory, world, i, q)
             memory.source[world, i, q].target = target
     if q >= 0:
         memory.source[world, i, q].seen_tick = tick
@@ -156,5 +156,5 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
                     Phi[k + 3] = Phi[k + 3] + E[k]
             memory.sensitivity[world, i, q, 0] = Phi
             if is_sender(q):
-                e = forward_error(step, memory.steps_effect[world, i, q - 1, 0])
-                memory.steps_effect[world, i, q - 1, 0] = e + G * memory.steps_effect[world, i, q - 1, ERRORS]
+                e = forward_error(step, memory.drift_effect[world, i, q - 1, 0])
+                memory.drift_effect[world, i, q - 1, 0] = e + G * memory.drift_effect[world, i, q - 1, ERRORS]

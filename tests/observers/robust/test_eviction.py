@@ -50,7 +50,7 @@ def standing(vehicle: int, others: list[int]) -> Message:
     extra = {"odometry": np.zeros(6, np.float32), "depends_on": np.zeros(1, np.uint64)}
     others = others[:2]
     extra["correlations"] = np.tile(np.diag(np.full(6, 60)).astype(np.int8), (len(others), 1, 1))
-    extra["told"] = np.array(others, np.uint16)
+    extra["correlated_vehicles"] = np.array(others, np.uint16)
     extra["ages"] = np.zeros(len(others), np.float32)
     return Message(place(vehicle), np.eye(3), 1e-2 * np.eye(6, dtype=np.float32), extra)
 

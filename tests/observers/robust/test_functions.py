@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
+from coopenv.observers.robust.algebra import forward, inverse6, is_regular, left_error, log_so3
 from coopenv.observers.robust.constants import LEAST_SHARE
 from coopenv.observers.robust.correlations import excess
 from coopenv.observers.robust.memory import Pose
@@ -27,7 +27,7 @@ def error_of(R: Any, p: Any, other_R: Any, other_p: Any):
 @wp.func
 def transition_of(R: Any, p: Any):
     """Return the transition over an increment."""
-    return transition(Pose(R, p))
+    return forward(Pose(R, p), wp.identity(6, wp.float64))
 
 
 CALLS = Calls(

@@ -46,7 +46,7 @@ def test_a_small_bias_is_estimated_where_none_is_declared() -> None:
     world, prior = simulate(scenario, 1), GYRO_BIAS**2
     reset(world)
     memory: Any = world.memory
-    assert (memory.belief.numpy()["others"] == 2).all()
+    assert (memory.belief.numpy()["first_sender"] == 2).all()
     np.testing.assert_allclose(np.einsum("wnii->wni", memory.P.numpy()[:, :, 1, 1])[..., :3], prior)
     world.advance(480)  # 8 s, in which it would walk by eight times as much
     assert (memory.P.numpy()[0, 0, 1, 1].diagonal()[:3] < 0.5 * (1.0 + 8.0) * prior).all()

@@ -107,7 +107,7 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
         if k == last:
             information, vector = observer.memory.information.copy(), observer.memory.source["vector"].copy()
         observer.update(by_hand.tick(observer, k, bearings=bearings, messages=messages))
-    others = observer.memory.belief["others"]
+    others = observer.memory.belief["first_sender"]
     slots = observer.others["source"].tolist()
     assert sorted(slots) == [1, 2]
     to_map = np.zeros((6, len(observer.P)))

@@ -1,8 +1,8 @@
-"""Reports that vehicles broadcast, and the new information in them.
+"""Reports that vehicles broadcast, and their propagation.
 
 A report holds a pose, its covariance, and the sender's dead reckoning. With the dead reckoning a receiver propagates
-the sender's last report to the new one as the sender itself did, P- = F P F^T + Q. The new information is P^-1 - P-^-1,
-whatever messages were lost.
+the sender's last report to the new one as the sender itself did, P- = F P F^T + Q, whatever messages were lost. The
+increment from there to the new report is fused, see correlated_fusion.py.
 Source: the information decorrelation of tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE
 3163, 1997; the channel filter of Grime and Durrant-Whyte, Data fusion in decentralized sensor networks, Control
 Engineering Practice 2(5), 1994.
@@ -47,7 +47,7 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     """
     report = SenderReport()
     report.tick = tick
-    P = memory.P[world, i, 0, 0] + memory.doubt[world, i]
+    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):
@@ -97,14 +97,14 @@ def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
 def dependents(memory: Any, world: int, i: int) -> int:
     """Return how many members' reports may contain this vehicle's own information."""
     count = int(0)
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if depends_on_own(memory, world, i, n):
             count += 1
     return count
 
 
 @device_function
-def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
+def is_circular(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n may return this vehicle's own information, and has no much smaller variance.
 
     It may if it depends on this vehicle, or if this vehicle depends on it with an unknown correlation. In a circle of
