@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (130, 2),
-    "api": (3880, 19),
+    "api": (3830, 19),
     "backends": (3275, 17),
     "base": (1395, 9),
     "bench": (4455, 18),
@@ -95,12 +95,12 @@ LINES_AND_FILES = {
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
-    "policies": (1205, 7),
+    "policies": (1370, 8),
     "runs": (3060, 13),
-    "scenario": (3080, 12),
+    "scenario": (3090, 12),
     "training": (1160, 5),
     "viz": (4450, 17),
-    "world": (4310, 17),
+    "world": (4312, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

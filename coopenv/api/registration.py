@@ -50,7 +50,7 @@ def register_all() -> None:
         if identity not in gymnasium.registry:
             gymnasium.register(
                 identity,
-                entry_point="coopenv.api.make:SingleVehicleEnv",
+                entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
                 vector_entry_point="coopenv.api.make:make_rows",
                 kwargs={"name_or_path": name},
             )

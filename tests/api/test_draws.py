@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-import coopenv.api.make
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs import Rollout
 from coopenv.runs.rollouts import outcome_line
 from coopenv.scenario import Scenario
@@ -51,7 +51,7 @@ def test_absent_vehicles_are_no_agents() -> None:
 
 
 def test_the_vehicle_of_a_single_environment_is_there() -> None:
-    env = coopenv.api.make.SingleVehicleEnv(FOUR_WAY, vehicle="vehicle_3", overrides=HALF)
+    env = SingleVehicleEnv(FOUR_WAY, vehicle="vehicle_3", overrides=HALF)
     for seed in range(12):
         _, info = env.reset(seed=seed)
         assert info["outcome"] == "under way"
@@ -137,7 +137,7 @@ WRONG = [
 @pytest.mark.parametrize(("options", "message"), WRONG)
 def test_wrong_options_are_one_error_in_all_interfaces(options: Any, message: str) -> None:
     made = sometimes()
-    one = coopenv.api.make.SingleVehicleEnv(FOUR_WAY)
+    one = SingleVehicleEnv(FOUR_WAY)
     for env in (CooperativeLocalisationEnv(made, "test"), batch(made, 2), one):
         with pytest.raises(CoopenvError, match=message):
             env.reset(seed=0, options=options)
