@@ -33,7 +33,15 @@ from coopenv.observers.robust.source_monitor import (
     reported_covariance,
     source_at,
 )
-from coopenv.observers.robust.sources import ODOMETRY, clear_drift, clear_source, is_active, is_sender, member_of
+from coopenv.observers.robust.sources import (
+    ODOMETRY,
+    clear_drift,
+    clear_source,
+    is_active,
+    is_rejected,
+    is_sender,
+    member_of,
+)
 from coopenv.world.warp_internals import device_function
 
 
@@ -84,11 +92,13 @@ def test_several_faulty_senders(memory: Any, world: int, i: int, count: int):
 def spread_of(memory: Any, world: int, i: int, q: int):
     """Return what a fault of a source adds to the covariance of the source's error.
 
-    Bearings that the gate rejects do not pass into the estimate.
+    Nothing, where the gate rejects its bearings: they do not pass into the estimate.
     """
-    passed = wp.float64(1.0) - memory.source[world, i, q].rejected
     f = memory.source[world, i, q].offset
-    return (passed * passed) * (memory.source[world, i, q].covariance + wp.outer(f, f))
+    spread = memory.source[world, i, q].covariance + wp.outer(f, f)
+    if is_rejected(memory, world, i, q):
+        spread = mat33d()
+    return spread
 
 
 @device_function

@@ -34,7 +34,14 @@ from coopenv.observers.robust.memory import (
     mat63d,
     vec3d,
 )
-from coopenv.observers.robust.sources import ODOMETRY, clear_drift, is_active, is_sender
+from coopenv.observers.robust.sources import (
+    ODOMETRY,
+    clear_drift,
+    gate_locates_fault,
+    is_active,
+    is_rejected,
+    is_sender,
+)
 from coopenv.world.warp_internals import device_function
 
 
@@ -235,18 +242,25 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
 
 @device_function
 def end_block(memory: Any, world: int, i: int, time: Any):
-    """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block."""
+    """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
+
+    While the gate rejects bearings to some sources, it has located the fault: the block tells of those sources alone.
+    """
+    located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
     kept = wp.exp(-time / wp.float64(constants.MONITOR_TIME))
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
-            V = memory.information[world, i, q, q]
-            v = memory.source[world, i, q].vector
-            for b in range(count):
-                c = source_at(memory, world, i, b)
-                X = coupling(memory, world, i, count, q, b)
-                V = V - X * block_between(memory.information[world, i], c, q)
-                v = v - X * memory.source[world, i, c].vector
+            V = mat33d()
+            v = vec3d()
+            if is_rejected(memory, world, i, q) or not located:
+                V = memory.information[world, i, q, q]
+                v = memory.source[world, i, q].vector
+                for b in range(count):
+                    c = source_at(memory, world, i, b)
+                    X = coupling(memory, world, i, count, q, b)
+                    V = V - X * block_between(memory.information[world, i], c, q)
+                    v = v - X * memory.source[world, i, c].vector
             V = kept * memory.source[world, i, q].information + wp.float64(0.5) * (V + wp.transpose(V))
             v = kept * memory.source[world, i, q].sum + v
             memory.source[world, i, q].information = V

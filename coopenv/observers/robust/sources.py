@@ -145,6 +145,21 @@ def is_excluded(memory: Any, world: int, i: int, q: int) -> bool:
 
 
 @device_function
+def is_rejected(memory: Any, world: int, i: int, q: int) -> bool:
+    """Return whether the gate rejects many bearings to a source."""
+    return memory.source[world, i, q].rejected > wp.float64(constants.FOUND_SHARE)
+
+
+@device_function
+def gate_locates_fault(memory: Any, world: int, i: int) -> bool:
+    """Return whether the gate rejects many bearings to some source that is used."""
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q) and is_rejected(memory, world, i, q):
+            return True
+    return False
+
+
+@device_function
 def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: Any):
     """Carry the sensitivities through an increment of odometry over dt; G: of the own error by the odometry's."""
     for q in range(SOURCES):
