@@ -1,9 +1,9 @@
-"""Tables that can be read on a phone: cells with sentences keep a width, numbers stay whole and with their units."""
+"""Tables that can be read on a phone: cells with sentences keep a width, long names break, numbers keep their units."""
 
 import re
 from collections.abc import Sequence
 
-from sitegen.markup import Tag, changed, names
+from sitegen.markup import JOINT, Tag, changed, names
 
 CELL = re.compile(r"<(t[dh])\b([^>]*)>(.*?)</\1>", re.DOTALL)
 EMPTY_HEAD = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>\s*</thead>\s*")
@@ -31,7 +31,7 @@ def marked(html: str) -> str:
         name, attributes, content = match.groups()
         kind = _kind(name, TAG.sub("", content).strip())
         if kind != "numbers":
-            content = changed(content, _whole_quantities)
+            content = changed(content, _with_breaks)
         given = f' class="{kind}"' if kind and "class=" not in attributes else ""
         return f"<{name}{attributes}{given}>{content}</{name}>"
 
@@ -45,10 +45,10 @@ def _kind(name: str, text: str) -> str:
     return "words" if name == "td" and len(text) > LONG else ""
 
 
-def _whole_quantities(text: str, inside: Sequence[Tag]) -> str:
-    """Return a text whose numbers stay on one line with their signs and units."""
+def _with_breaks(text: str, inside: Sequence[Tag]) -> str:
+    """Return a text whose names in code may break, and whose numbers stay on one line with their signs and units."""
 
     def whole(match: re.Match[str]) -> str:
         return f'<span class="quantity">{match[0]}</span>' if BREAKS.search(match[0]) else match[0]
 
-    return text if "code" in names(inside) else QUANTITY.sub(whole, text)
+    return JOINT.sub("<wbr>", text) if "code" in names(inside) else QUANTITY.sub(whole, text)

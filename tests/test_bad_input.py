@@ -67,6 +67,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["page", "facade", "--out", "file"], "cannot write to file"),
         (["page", "facade", "busy_intersection", "--measure"], "there is nothing to drive"),
         (["page", "raises.py"], "unknown environment 'raises.py'"),
+        (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
+        (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
+        (["bench", "observers", "overtaking", "--fault", ""], "fault '': expected [VEHICLE:]NAME"),
     ],
 )
 def test_one_line_and_nothing_is_left(

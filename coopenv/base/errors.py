@@ -132,7 +132,7 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def listed(names: Sequence[str], most: int = 12) -> str:
+def listed(names: Sequence[str], most: int = 16) -> str:
     """Return names with commas between; of very many the first few and how many there are."""
     few = names if len(names) <= most else [*names[:most], f"... ({len(names)} in all)"]
     return ", ".join(few)
@@ -148,5 +148,5 @@ def check_one_of(what: str, name: object, valid: Iterable[object], error: type[V
 
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
-    near = get_close_matches(word[:MAX_MESSAGE], list(valid), n=1, cutoff=0.5)
+    near = get_close_matches(word[:MAX_MESSAGE], list(valid), n=1)
     return f" (did you mean '{near[0]}'?)" if near else ""

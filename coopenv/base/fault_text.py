@@ -90,14 +90,15 @@ def parse_fault(text: str, kinds: Mapping[str, FaultKind]) -> Fault:
     options = {}
     for option in found["options"].split(",")[1:]:
         key, equals, given = option.partition("=")
-        if not equals:
-            raise FaultError(f"{where}: {shown(option)} is not OPTION=VALUE")
+        if not equals or key in options:
+            raise FaultError(f"{where}: {shown(option)} is not OPTION=VALUE, each option once")
         if key not in kind.options:
             raise FaultError(f"{where}: no option {shown(key)}; allowed: {listed(kind.options) or 'none'}")
         options[key] = _number(given, f"{where}: {key}", -inf if key in kind.signed else 0.0)
     start = found["start"]
     is_share = start is not None and start.endswith("%")
-    begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", 0.0, 1e6)
+    most = 100.0 if is_share else 1e6
+    begin = None if start is None else _number(start.removesuffix("%"), f"{where}: start", 0.0, most)
     return Fault(
         text,
         name,

@@ -125,7 +125,8 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if unknown:
         valid = _valid_keys(first["loc"][:-1], model)
-        hint = suggest(str(keys[-1]), valid) or f"; allowed: {', '.join(valid)}"
+        several = sum(detail["type"] == "extra_forbidden" for detail in details) > 2  # it is another kind of file
+        hint = (not several and suggest(str(keys[-1]), valid)) or f"; allowed: {', '.join(valid)}"
         return f"{where}: {field}: unknown key{hint}{more}"
     if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
         return f"{where}: {field}.{_kind_message(first)}{more}"

@@ -103,7 +103,7 @@ class ObserverOptions:
     @property
     def names(self) -> list[str] | None:
         """The observers that were given; None: all that suit."""
-        return [word.strip() for word in self.observers.split(",")] if self.observers else None
+        return [word.strip() for word in self.observers.split(",")] if self.observers is not None else None
 
     def plan(self) -> "Plan":
         """Return the comparison, everything in it checked."""

@@ -102,7 +102,7 @@ def known_agents(names: str | None) -> str | None:
 
 def known_observers(names: str | None) -> str | None:
     """Return observers with commas between. Raises CoopenvError: there is no such observer."""
-    for name in names.split(",") if names else ():
+    for name in names.split(",") if names is not None else ():
         from coopenv.observers.registry import check_known
 
         check_known(name.strip())

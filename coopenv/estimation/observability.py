@@ -36,6 +36,7 @@ from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 
+from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.npz import read_npz
 from coopenv.estimation.poses import Array, skew
@@ -126,7 +127,10 @@ class Trajectory(RecordedGeometry):
         Raises:
             DataError: the file is no such record, an array is missing or of another shape, or it is too large.
         """
-        return cls(**read_npz(path, "trajectory", cls.kinds()))
+        found = cls(**read_npz(path, "trajectory", cls.kinds()))
+        if not len(found.t) or not np.isfinite(found.t).all() or (np.diff(found.t) < 0.0).any():
+            raise DataError(f"{path}: t: expected finite times, s, in order")
+        return found
 
 
 @dataclass(frozen=True)

@@ -281,6 +281,8 @@ IDENTITY = np.eye(3)
 
 def check_estimate(estimate: Estimate) -> None:
     """Refuse an invalid estimate with a CoopenvError that names the field and the reason."""
+    if not isinstance(estimate, Estimate):
+        raise CoopenvError(f"update returned {shown(estimate)}, expected an Estimate")
     _check_rotation(_checked_array("rotation", estimate.rotation, LARGEST, ROTATION))
     _checked_array("position", estimate.position, LARGEST, POSITION)
     if not isinstance(estimate.coordinates, Coordinates):

@@ -4,13 +4,15 @@ A source of ticks drives a group: the runner on a record, the environment on a w
 """
 
 import copy
+from pathlib import Path
 from time import perf_counter
+from traceback import extract_tb
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.base.errors import CoopenvError, error_text
+from coopenv.base.errors import CoopenvError, error_text, shown
 from coopenv.estimation.outcomes import UNKNOWN
 from coopenv.estimation.poses import Array, Coordinates
 from coopenv.observers.contract import (
@@ -122,6 +124,8 @@ class ObserverGroup:
 
         A CoopenvError names why it is invalid. An unchanged valid message is checked by the mailbox alone.
         """
+        if not isinstance(message, Message):
+            raise CoopenvError(f"message returned {shown(message)}, expected a Message")
         unchanged = interference is None and tamper is None
         if not unchanged:
             check_message(message)
@@ -170,7 +174,9 @@ class ObserverGroup:
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
         """Return an error that names the vehicle, the time and the reason."""
         whose = "" if vehicle is None else f"of {self.observer_init.setups[vehicle].name} "
-        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}")
+        last = extract_tb(error.__traceback__)[-1]
+        where = "" if isinstance(error, CoopenvError) else f" ({Path(last.filename).name}:{last.lineno})"
+        return ObserverError(f"{whose}at {k * self.observer_init.dt:.3f} s: {error_text(error)}{where}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""

@@ -23,7 +23,7 @@ from coopenv.world.launch import start_warp
 T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
-ENOUGH = 1.0  # s of work from which on its pace can be estimated
+ENOUGH = 1.0  # s of work from which on its pace can be estimated; with less than 2 % done, LINE_PERIOD
 HINT_FROM = 20.0  # s of work left as soon as its pace is known, from which on there is a line at once
 COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; shorter compilations are not announced
 
@@ -108,7 +108,9 @@ class Progress:
             return nan
         if self._rate is not None:
             return ((self._total or nan) - self._completed) / self._rate
-        return elapsed * (1.0 - share) / share if elapsed >= ENOUGH else nan
+        if elapsed < ENOUGH or (share < 0.02 and elapsed < LINE_PERIOD):
+            return nan
+        return elapsed * (1.0 - share) / share
 
     def _write_lines(self) -> None:
         while not self._over.wait(LINE_PERIOD):

@@ -260,11 +260,11 @@ def _changed(part: Dynamics | None) -> set[str]:
 
 def _problems(s: Scenario) -> Iterator[str]:
     """Yield what of one section does not fit to another."""
-    k, q, targets = s.observer.k, s.observer.q, set(s.target_names)
+    k, q, targets = s.observer.k, s.observer.q, s.target_names
     if isinstance(k, tuple) and len(k) != len(s.vehicles):
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
-        yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
+        yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}; known: {listed(targets)}"
     names = [route.name for route in s.routes]
     for key in ("routes", "landmark_groups"):
         yield from (f"{key}: the name '{name}' is used twice" for name in _twice(getattr(s, key)))
@@ -281,7 +281,8 @@ def _problems(s: Scenario) -> Iterator[str]:
     for where, faults in parts.items():
         mark = faults.map_error.landmark
         if mark is not None and mark not in marks:
-            yield f"{where}.map_error.landmark: unknown landmark {shown(mark)}{suggest(mark, marks)}"
+            unknown = f"unknown landmark {shown(mark)}{suggest(mark, marks)}"
+            yield f"{where}.map_error.landmark: {unknown}; known: {listed(marks)}"
     yield from _problems_of_driving(s)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import sys
 from dataclasses import replace
@@ -137,7 +138,7 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
             return super().update(tick)
 
     result = run(Breaks, recording())
-    assert result.failure == "of vehicle_3 at 0.100 s: ZeroDivisionError: no gain"
+    assert re.fullmatch(r"of vehicle_3 at 0\.100 s: ZeroDivisionError: no gain \(test_runner\.py:\d+\)", result.failure)
     assert np.isfinite(result.position_error[6, :2]).all()
     assert np.isnan(result.position_error[6:, 2:]).all() and np.isnan(result.position_error[7:]).all()
 
@@ -152,7 +153,8 @@ class UnspeakableError(Exception):
     [
         (lambda e: sys.exit(3), "SystemExit: 3"),
         (lambda e: (_ for _ in ()).throw(ValueError("one\nand two")), "ValueError: one and two"),
-        (lambda e: None, "AttributeError"),
+        (lambda e: None, "update returned None, expected an Estimate"),
+        (lambda e: (e.rotation, e.position), "update returned (array("),
         (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
         (lambda e: replace(e, position=e.position * np.nan), "position is not a finite array of shape (3,)"),
         (
@@ -170,6 +172,14 @@ def test_what_is_no_estimate_is_told_in_one_line(change: Any, said: str) -> None
 
     failure = run(Odd, recording()).failure
     assert "of vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
+
+
+def test_a_message_is_a_message() -> None:
+    class Odd(Probe):
+        def message(self) -> Any:
+            return [1, 2, 3]
+
+    assert run(Odd, recording()).failure.endswith("CoopenvError: message returned [1, 2, 3], expected a Message")
 
 
 def test_a_sent_message_does_not_change_any_more() -> None:

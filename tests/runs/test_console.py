@@ -51,6 +51,9 @@ def test_time_left_is_not_told_before_there_is_enough_to_go_by(
     clock[0] = 103.5
     progress.update(1)
     assert progress.line() == "simulating: 0 % after 0 s"
+    monkeypatch.setattr(module, "LINE_PERIOD", 10.0)
+    clock[0] = 104.8  # of a slow beginning
+    assert progress.line() == "simulating: 0 % after 2 s"
     clock[0] = 105.0
     progress.update(20)
     progress.__exit__()

@@ -95,6 +95,8 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
         ({"nees": np.zeros(3)}, r"trajectory.npz: nees: float64 (3,) is not of kind f and shape ("),
         ({"position": arrays["position"].astype(np.complex64)}, "position: complex64"),
         ({"sight": arrays["sight"][:-1]}, "sight: uint8"),
+        ({"t": arrays["t"] * np.nan}, "t: expected finite times, s, in order"),
+        ({"t": arrays["t"][::-1]}, "t: expected finite times, s, in order"),
         ({"vehicles": np.array([{}] * len(arrays["vehicles"]), object)}, "vehicles: object"),
     ):
         np.savez(tmp_path / "other" / "trajectory.npz", allow_pickle=True, **{**arrays, **change})

@@ -172,3 +172,9 @@ def test_numbers_stay_with_their_units(cell: str, whole: list[str]) -> None:
     page = marked(f"<tr><td>{cell}</td></tr>")
     assert re.findall(r'<span class="quantity">(.*?)</span>', page) == whole
     assert re.sub(r"</?span[^>]*>", "", page).replace(' class="words"', "") == f"<tr><td>{cell}</td></tr>"
+
+
+def test_names_in_cells_may_be_broken() -> None:
+    """A column of long names is as wide as its longest part on a phone."""
+    page = marked("<tr><td><code>noise.odometry_scale</code> of a_b</td></tr><p><code>a_b</code></p>")
+    assert page == "<tr><td><code>noise<wbr>.odometry_<wbr>scale</code> of a_b</td></tr><p><code>a_b</code></p>"

@@ -175,7 +175,7 @@ def test_jammers_are_drawn() -> None:
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
-        ({"map_error": {"landmark": "L9"}}, r"faults.map_error.landmark: unknown landmark 'L9' .did you mean"),
+        ({"map_error": {"landmark": "L9"}}, r"faults.map_error.landmark: unknown landmark 'L9'; known: "),
         ({"map_error": {"chance": 1.5}}, "faults.map_error.chance"),
         ({"jammer": {"duty": 0.0}}, "faults.jammer.duty"),
         ({"jammer": {"range": -1.0}}, "faults.jammer.range"),

@@ -165,7 +165,9 @@ class FaultVariant:
     def applied(self, recording: Recording, seed: int) -> Recording:
         """Return the changed record; `recording` is of the variant's scenario."""
         for fault in self.faults:
-            kind = FAULTS[fault.name]
+            kind, end = FAULTS[fault.name], float(recording.t[-1])
+            if fault.start_in(end) > end:
+                raise CoopenvError(f"fault {fault.text}: it begins after the run's end at {end:g} s")
             if isinstance(kind, RecordFault):
                 recording = kind.change(recording, fault, seed)
         return recording
@@ -178,7 +180,7 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
         FaultError: one is not valid.
     """
     text = text.strip()
-    faults = tuple(parse_fault(word, FAULTS) for word in text.split("/")) if text else ()
+    faults = tuple(parse_fault(word, FAULTS) for word in text.split("/")) if text or not name else ()
     for fault in faults:
         if fault.word == "collude" and len(fault.vehicles) < 2:
             raise FaultError(f"fault {fault.text}: two vehicles collude, such as vehicle_2,vehicle_3:lie=collude:5")

@@ -235,6 +235,8 @@ def find_source(
     if not isinstance(text, str | Path):
         kind = type(text).__name__
         raise CoopenvError(f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}")
+    if isinstance(faults, str):
+        raise CoopenvError(f"faults: expected a list such as ['{faults}']")
     sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(faults))
     bag, path = is_bag(text, topics), Path(text)
     if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:

@@ -123,6 +123,8 @@ class BagFile:
             return DataError(f"{self.path}: {error}")
         repair = next((REPAIRS[part.suffix] for part in self._parts if part.suffix in REPAIRS), None)
         hint = f"; if its recording was cut off, `{repair}` mends it" if repair else ""
+        if repair == REPAIR:
+            hint += "; coopenv run reads a recording of coopenv"
         return DataError(f"{self.path}: cannot be read as a ROS bag ({error_text(error)}){hint}")
 
 

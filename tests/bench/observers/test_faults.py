@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -127,6 +128,11 @@ def test_the_recorded_world_has_the_fault() -> None:
         ("vehicle_2:jammer=5,x=1", "expected jammer, VEHICLE"),
         ("vehicle_2:jammer", "expected jammer, VEHICLE"),
         ("jammer,period=0", "period must be above 0"),
+        ("lie=jump,std=1,std=2", "'std=2' is not OPTION=VALUE, each option once"),
+        ("nosuch=1", "known: .*focal_length, clock, restart, corruption$"),
+        ("restart@101%", "restart: start: expected a number from 0 to 100, got '101'"),
+        ("", "fault '': expected"),
+        ("lie=jump/", "fault '': expected"),
         ("lie=jump,std=-1", "lie: std: expected a number from 0 to inf, got '-1'"),
     ],
 )
@@ -144,6 +150,7 @@ def test_what_is_wrong_with_a_fault_is_one_line(fault: str, message: str) -> Non
         ("mrclam_6", {"policy": "zero"}, "--policy zero: mrclam_6 is recorded"),
         ("crossing_path", {"faults": ["lie=jump"]}, "no vehicle has another one as its neighbour"),
         ("crossing_path", {"faults": ["restart@1"]}, "no vehicle has another one as its neighbour; name one"),
+        (ENV, {"faults": "lie=jump"}, "faults: expected a list such as .'lie=jump'.$"),
         (ENV, {"policy": "random"}, "no vehicle of this environment is driven"),
         ("urban_crossing", {"policy": "nobody_at_all"}, "nobody_at_all"),
     ],
@@ -151,6 +158,14 @@ def test_what_is_wrong_with_a_fault_is_one_line(fault: str, message: str) -> Non
 def test_what_a_source_cannot_have(env: str, options: dict[str, Any], message: str) -> None:
     with pytest.raises(CoopenvError, match=message):
         variants_of(find_source(env, **options), None)
+
+
+def test_a_fault_after_the_end_is_refused() -> None:
+    """Its row would be the nominal one."""
+    for fault in ("restart@2", "lie=jump@2", "landmarks_lost@2+1"):
+        records = find_source(ENV, {"horizon": 1.0}, faults=[fault])
+        with pytest.raises(CoopenvError, match=rf"^fault {re.escape(fault)}: it begins after the run's end at 1 s$"):
+            records.recording(fault, 0)
 
 
 def test_who_drives() -> None:

@@ -128,6 +128,13 @@ def test_a_folder_whose_file_is_cut_off_names_the_tool_that_mends_it(form: str, 
         BagFile(folder)
 
 
+def test_a_recording_with_its_scene_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(tmp_path / "own.mcap")
+    assert main(["record", "crossing_path", "--set", "horizon=0.2", "--out", log, "--no-replay"]) == 0
+    assert main(["import", log]) == 2
+    assert "coopenv run reads a recording of coopenv" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
 def test_bytes_that_changed_are_one_line_or_what_could_be_read(
     form: str, written: dict[str, Path], topics: Path

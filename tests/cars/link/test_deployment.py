@@ -106,6 +106,12 @@ BAD = {
 }
 
 
+def test_of_another_kind_of_file_all_keys_are_listed() -> None:
+    """The nearest key helps after a typing error alone."""
+    with pytest.raises(DeploymentError, match=r"^svea_overtaking\.toml: title: unknown key; allowed: cars, "):
+        load_deployment(Path(__file__).parents[3] / "envs" / "svea_overtaking.toml")
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, case: str) -> None:
     added, said = BAD[case]
