@@ -57,18 +57,13 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
 
     @device_function
     def no_offsets(memory: Any, world: int, i: int, time: Any):  # type: ignore[no-untyped-def]
-        count = end_block(memory, world, i, time)
+        end_block(memory, world, i, time)
         for q in range(1, 1 + SENDER_SLOTS):
             memory.source[world, i, q].ratio = wp.float64(0.0)
-        return count
 
     @device_function
     def no_drift(memory: Any, world: int, i: int, landmarks: int) -> bool:
         return False
-
-    @device_function
-    def not_several(memory: Any, world: int, i: int, count: int):  # type: ignore[no-untyped-def]
-        return wp.float64(0.0), 0
 
     @device_function
     def no_mixture(memory: Any, world: int, i: int, most: Any, total: Any):  # type: ignore[no-untyped-def]
@@ -89,7 +84,6 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
         "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
-        "several senders at once": [(fault_hypotheses, "test_several_faulty_senders", not_several)],
         "covariance of likely faults": [(fault_hypotheses, "set_fault_mixture", no_mixture)],
         "readmission": [(observer, "test_excluded", no_readmission)],
         "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],

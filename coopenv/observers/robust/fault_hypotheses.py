@@ -1,9 +1,9 @@
-"""Hypotheses of faults: one source, or all senders that deviate from landmarks and odometry.
+"""Hypotheses of faults of single sources.
 
-All sources have the same prior odds, and several senders those of as many faults. The sources of a hypothesis that is
-nearly certain are excluded: the covariance grows by what the solution without them differs by, and what it is less
-certain. Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An
-excluded source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
+All sources have the same prior odds. The source of a hypothesis that is nearly certain is excluded: unless the gate has
+rejected its bearings, the covariance grows by what the solution without it differs by, and what it is less certain.
+Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An excluded
+source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
 
 from typing import Any
@@ -27,11 +27,7 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.observers.robust.reports import includes
 from coopenv.observers.robust.source_monitor import (
-    block_between,
     end_block,
-    invert_blocks,
-    reported_covariance,
-    source_at,
 )
 from coopenv.observers.robust.sources import (
     ODOMETRY,
@@ -43,49 +39,6 @@ from coopenv.observers.robust.sources import (
     member_of,
 )
 from coopenv.world.warp_internals import device_function
-
-
-@device_function
-def test_several_faulty_senders(memory: Any, world: int, i: int, count: int):
-    """Return twice the log-likelihood ratio of faults of all senders to none, and how many of them deviate.
-
-    Their faults are those of the solution from landmarks and odometry only.
-    """
-    least = wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64)
-    for a in range(count):
-        q = source_at(memory, world, i, a)
-        for b in range(count):
-            c = source_at(memory, world, i, b)
-            memory.block_scratch[world, a, b] = block_between(memory.joint[world, i], q - 1, c - 1)
-        memory.block_scratch[world, a, a] += wp.float64(constants.ROUNDING) * memory.block_scratch[world, a, a] + least
-    invert_blocks(memory, world, count)
-    deviating = int(0)
-    for a in range(count):
-        q = source_at(memory, world, i, a)
-        f = vec3d()
-        for b in range(count):
-            c = source_at(memory, world, i, b)
-            f = f + memory.block_scratch[world, a, b] * memory.source[world, i, c].joint
-        memory.source[world, i, q].landmark_only_offset = f
-        memory.source[world, i, q].landmark_only_covariance = memory.block_scratch[world, a, a]
-    for a in range(count):
-        k = memory.block_member[world, a]
-        for b in range(count):
-            memory.block_scratch[world, a, b] += reported_covariance(memory, world, i, k, memory.block_member[world, b])
-        q = source_at(memory, world, i, a)
-        f = memory.source[world, i, q].landmark_only_offset
-        size = wp.dot(f, wp.inverse(memory.block_scratch[world, a, a]) * f)
-        memory.source[world, i, q].deviates = wp.where(size > wp.float64(constants.BEARING_GATE), 1, 0)
-        deviating += memory.source[world, i, q].deviates
-    invert_blocks(memory, world, count)
-    ratio = wp.float64(0.0)
-    for a in range(count):
-        q = source_at(memory, world, i, a)
-        for b in range(count):
-            c = source_at(memory, world, i, b)
-            f = memory.block_scratch[world, a, b] * memory.source[world, i, c].landmark_only_offset
-            ratio += wp.dot(memory.source[world, i, q].landmark_only_offset, f)
-    return ratio, deviating
 
 
 @device_function
@@ -133,12 +86,8 @@ def forget_faults(memory: Any, world: int, i: int):
         if is_active(memory, world, i, c):
             memory.source[world, i, c].sum = vec3d()
             memory.source[world, i, c].information = mat33d()
-            memory.source[world, i, c].joint = vec3d()
             if is_sender(c):
                 clear_drift(memory, world, i, c)
-    for a in range(SENDER_SLOTS):
-        for b in range(SENDER_SLOTS):
-            memory.joint[world, i, a, b] = mat33d()
 
 
 @device_function
@@ -196,16 +145,6 @@ def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
 
 
 @device_function
-def exclude_deviating_senders(memory: Any, world: int, i: int):
-    """Exclude all senders that deviate from landmarks and odometry."""
-    for q in range(1, 1 + SENDER_SLOTS):
-        if is_active(memory, world, i, q) and memory.source[world, i, q].deviates == 1:
-            memory.source[world, i, q].offset = memory.source[world, i, q].landmark_only_offset
-            memory.source[world, i, q].covariance = memory.source[world, i, q].landmark_only_covariance
-            exclude(memory, world, i, q)
-
-
-@device_function
 def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
     """Set the mixture covariance, which the hypotheses of single faults add to the covariance of the own pose.
 
@@ -223,12 +162,8 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 
 @device_function
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
-    """Weigh the hypotheses after a block of a time, s; exclude the source, or the senders, of one nearly certain.
-
-    Each hypothesis has the same prior odds, and that of several senders those of as many faults; it is tested only if
-    a single source is suspect.
-    """
-    count = end_block(memory, world, i, time)
+    """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain."""
+    end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
     if memory.belief[world, i].gate_disabled == 1:  # innovations of a wrong pose show no faults
         forget_faults(memory, world, i)
@@ -245,19 +180,11 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
             worst = q
     if worst < 0:
         return
-    several = wp.float64(0.0)
-    if count > 1:
-        ratio, deviating = test_several_faulty_senders(memory, world, i, count)
-        if deviating > 1:
-            several = ratio - gate * wp.float64(deviating - 1)
-    total = weight_of(gate, most) + weight_of(several, most)
+    total = weight_of(gate, most)
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             total += weight_of(memory.source[world, i, q].ratio, most)
-    if several > most + wp.float64(constants.ODDS):
-        exclude_deviating_senders(memory, world, i)
-        forget_faults(memory, world, i)
-    elif total < wp.float64(1.0 + constants.FAULT_RISK):
+    if total < wp.float64(1.0 + constants.FAULT_RISK):
         exclude(memory, world, i, worst)
         forget_faults(memory, world, i)
     else:

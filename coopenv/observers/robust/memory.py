@@ -103,10 +103,6 @@ class Source:
     drift_vector: vec3d  # their decaying sum, weighted by the inverse of the covariance that each has without a fault
     drift_information: mat33d  # the decaying sum of these weights
     drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
-    joint: vec3d  # a of the blocks of late
-    deviates: wp.int32  # whether a sender deviates from landmarks and odometry
-    landmark_only_offset: vec3d  # its fault if all senders have one
-    landmark_only_covariance: mat33d  # of that fault
     time: wp.float64  # s for which it has been excluded and in view
 
 
@@ -249,7 +245,6 @@ class RobustMemory:
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
-    joint: array("WNTT", mat33d)  # on the faults of senders, likewise, of the blocks of late
     fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
     effect: array("WAQ", mat23d)  # scratch: of an innovation by the fault of a source
     block_scratch: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors or faults
@@ -374,7 +369,6 @@ def robust_rules() -> dict[str, Rule]:
         **dict.fromkeys(("search.attempts", "belief.news_interval"), whole(0, 10**9)),
         "source.target": whole(-1, "agents"),
         "source.exclusions": whole(0, 10**9),
-        "source.deviates": FLAG,
         "block_member": whole(0, members - 1),
         "belief.members": whole(1, members),
         "belief.first_sender": whole(1, MOUNTING + 1),

@@ -27,7 +27,6 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.memory import (
     ERRORS,
     MOUNTING,
-    SENDER_SLOTS,
     SOURCES,
     BearingFrame,
     mat33d,
@@ -275,22 +274,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
             if is_sender(q):
                 end_drift_block(memory, world, i, q, kept)
-    add_joint_information(memory, world, i, kept)
     clear_block(memory, world, i)
-    return count
-
-
-@device_function
-def add_joint_information(memory: Any, world: int, i: int, kept: Any):
-    """Add the information of a block on the faults of all senders together to its sums."""
-    for a in range(1, 1 + SENDER_SLOTS):
-        if is_active(memory, world, i, a):
-            memory.source[world, i, a].joint = (
-                kept * memory.source[world, i, a].joint + memory.source[world, i, a].vector
-            )
-            for b in range(1, a + 1):
-                J = kept * memory.joint[world, i, a - 1, b - 1] + memory.information[world, i, a, b]
-                memory.joint[world, i, a - 1, b - 1] = J
 
 
 @device_function

@@ -47,12 +47,8 @@ def clear_source(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].rejected = wp.float64(0.0)
     memory.source[world, i, q].vector = vec3d()
     memory.source[world, i, q].sum = vec3d()
-    memory.source[world, i, q].joint = vec3d()
     if is_sender(q):
         clear_drift(memory, world, i, q)
-        for c in range(SENDER_SLOTS):
-            memory.joint[world, i, q - 1, c] = mat33d()
-            memory.joint[world, i, c, q - 1] = mat33d()
     memory.source[world, i, q].information = mat33d()
     fill(memory.sensitivity[world, i, q], mat63d())
     for c in range(SOURCES):
