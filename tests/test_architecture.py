@@ -98,7 +98,7 @@ LINES_AND_FILES = {
     "policies": (1370, 8),
     "runs": (3060, 13),
     "scenario": (3090, 12),
-    "training": (1160, 5),
+    "training": (1170, 5),
     "viz": (4450, 17),
     "world": (4312, 17),
 }

@@ -53,7 +53,7 @@ class TrainOptions:
 
         if not self.resume:
             changes = options.parse_overrides(self.overrides)
-            return TrainingPlan(self.environment, self._settings(), self.seed or 0, self.arm, changes)
+            return TrainingPlan(self.environment, self._settings(changes), self.seed or 0, self.arm, changes)
         decided = {"--set": self.overrides}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
@@ -65,11 +65,12 @@ class TrainOptions:
             raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {self.environment}")
         return plan
 
-    def _settings(self) -> Any:
+    def _settings(self, overrides: dict[str, Any]) -> Any:
+        from coopenv.backends.sources import open_simulation
         from coopenv.policies import find_agent
-        from coopenv.training.settings import SETTINGS_FILE, read_settings
+        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_start
 
-        path = self.settings
+        path, start = self.settings, {}
         if self.agent is not None:
             if path is not None:
                 raise CoopenvError("--agent and --settings: give one of them")
@@ -77,7 +78,10 @@ class TrainOptions:
             if folder is None or not (folder / SETTINGS_FILE).is_file():
                 raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
             path = folder / SETTINGS_FILE
-        return read_settings(path, self.arm, Path(self.environment).stem, steps=self.steps, minutes=self.minutes)
+        if path is None:
+            start = usual_start(open_simulation(self.environment, overrides))
+        name = Path(self.environment).stem
+        return read_settings(path, self.arm, name, steps=self.steps, minutes=self.minutes, **start)
 
 
 @options.command

@@ -281,7 +281,7 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
         torch.set_rng_state(torch.from_numpy(arrays["random"]["torch"]))
         key, position = np.split(arrays["random"]["numpy"], [-1])
         np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
-        trainer.model.num_timesteps = checkpoint.progress["steps"]
+        trainer.model.num_timesteps = int(checkpoint.progress["steps"])
         trainer.seconds, trainer.cpu_seconds = checkpoint.progress["seconds"], checkpoint.progress["cpu_seconds"]
         if "world" in arrays:
             trainer.env.go_on_from(trainer.batch.set_state(arrays["world"]))

@@ -16,7 +16,8 @@ from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
 from coopenv.base.installation import is_scene, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
-from coopenv.policies.loader import AGENT_FILE
+from coopenv.policies.loader import AGENT_FILE, load_agent
+from coopenv.scenario import Scenario
 from coopenv.scenario.base import NonNegative, Positive, Probability
 from coopenv.scenario.files import merged
 from coopenv.scenario.own_terms import SECTIONS, located
@@ -113,6 +114,22 @@ class Settings(Section):
         if self.minutes is not None:
             return None, 60.0 * self.minutes
         return self.steps or 2_000_000, None
+
+
+USUAL_START: dict[str, Any] = {
+    "clone": {"agent": "look_ahead", "episodes": 128, "epochs": 30},
+    "ppo": {"learning_rate": 5e-4, "initial_std": 0.25},
+}
+"""Settings of a training of which nothing else is said, where the planner can drive."""
+
+
+def usual_start(scenario: Scenario) -> dict[str, Any]:
+    """Return `USUAL_START`, or nothing where its agent cannot drive."""
+    try:
+        load_agent(USUAL_START["clone"]["agent"], scenario)
+    except CoopenvError:
+        return {}
+    return USUAL_START
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ import coopenv
 from coopenv.base.errors import OutputError
 from coopenv.base.installation import data_directory
 from coopenv.policies import find_agent
+from coopenv.scenario import load_scenario
 from coopenv.training.settings import (
     TrainingPlan,
     check_settings,
     environment_file,
     read_settings,
     settings_digest,
+    usual_start,
     write_settings,
 )
 
@@ -54,6 +56,15 @@ def test_defaults() -> None:
     assert settings.budget == (2_000_000, None)
     assert (settings.ppo.vehicles, settings.ppo.decisions, settings.ppo.hidden) == (512, 64, (128, 128))
     assert settings.clone is None
+
+
+def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_can_drive() -> None:
+    square, highway = (load_scenario(name) for name in ("open_square", "highway_roundabout"))
+    settings = read_settings(None, **usual_start(square))
+    assert settings.clone and settings.clone.agent == "look_ahead" and settings.ppo.initial_std == 0.25
+    blind = load_scenario("open_square", {"observation.exclude": ["map"]})
+    assert usual_start(blind) == {} and read_settings(None, **usual_start(blind)) == read_settings(None)
+    assert usual_start(highway) in ({}, usual_start(square))
 
 
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
