@@ -55,9 +55,8 @@ def act(policy: Policy, observations: Mapping[str, np.ndarray]) -> dict[str, np.
 
     A policy with an attribute `agents` (their names in order) gets a row for each of them, 0 for those that have ended.
     """
-    names = [*observations]
-    if {*names} <= {*(all_names := getattr(policy, "agents", ()))}:
-        names = [*all_names]
+    agents = list(getattr(policy, "agents", ()))
+    names = agents if {*observations} <= {*agents} else list(observations)
     ended = np.zeros_like(next(iter(observations.values())))
     actions = policy(np.stack([observations.get(name, ended) for name in names]))
     return {name: action for name, action in zip(names, actions, strict=True) if name in observations}

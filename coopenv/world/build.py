@@ -363,7 +363,7 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
 def _radio(scenario: Scenario) -> dict[str, Any]:
     v = scenario.v2x
     return {
-        "all": v.links == "all",
+        "to_all": v.links == "all",
         "slots": max(v.delay, 1) + 1 + scenario.replay_ticks,
         "range": math.inf if v.range is None else v.range,
         "staleness": math.inf if v.staleness is None else v.staleness,

@@ -243,7 +243,7 @@ def model_struct(p: Precision) -> Any:
     class Radio:
         """V2X."""
 
-        all: wp.int32  # whether messages reach all vehicles, not only those that may measure their sender
+        to_all: wp.int32  # whether messages reach all vehicles, not only those that may measure their sender
         delay: wp.int32  # ticks
         period: wp.int32  # ticks
         slots: wp.int32

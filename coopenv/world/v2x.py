@@ -305,9 +305,9 @@ def transmit(model: Any, state: Any, world: int, tick: int):
             state.arriving[world, receiver, sender] = -1
         if is_jammed(model, state, world, here, tick):
             continue
-        for n in range(wp.where(model.radio.all == 1, model.vehicles, model.target_count[receiver])):
+        for n in range(wp.where(model.radio.to_all == 1, model.vehicles, model.target_count[receiver])):
             sender = n
-            if model.radio.all == 0:
+            if model.radio.to_all == 0:
                 sender = model.targets[receiver, n] - model.landmarks
             if sender >= 0 and sender != receiver:
                 lag = model.radio.delay

@@ -94,9 +94,10 @@ def wrong_landmark(
     return replace(recording, landmarks=landmarks)
 
 
-def hidden_landmark(recording: Recording, landmark: int) -> Recording:
-    """Return a recording in which nobody sees a landmark."""
-    visible = recording.visible & (np.arange(recording.visible.shape[-1]) != landmark)
+def hidden_landmark(recording: Recording, landmark: int, start: float = 0.0) -> Recording:
+    """Return a recording in which a landmark is out of all views from a time on, s."""
+    late = (recording.t >= start)[:, None, None]
+    visible = recording.visible & ~(late & (np.arange(recording.visible.shape[-1]) == landmark))
     return replace(recording, visible=visible, bearings=np.where(visible[..., None], recording.bearings, np.nan))
 
 

@@ -65,7 +65,7 @@ def results_struct(p: Precision) -> Any:
         terms: array("WNK", wp.float32)
         reward: array("WN", wp.float32)  # 0 for vehicles that had ended before, and right after a reset
         under_way: array("WN", wp.bool)  # had not ended before this step
-        alive: array("WN", wp.bool)  # the same; with a team reward: that somebody of the team had not
+        alive: array("WN", wp.bool)  # the same; with a team reward: some vehicle of the team had not
         terminated: array("WN", wp.bool)  # ended in this step; with a team reward: all of the team had
         truncated: array("WN", wp.bool)  # the world is over and this vehicle has not just terminated
         over: array("W", wp.int32)  # 1: at the horizon, or every vehicle has ended

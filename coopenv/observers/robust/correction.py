@@ -33,7 +33,7 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
             memory.scratch[world, k].recentring = recentring(correction)
             memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
     for n in range(frame.bearings):
-        if memory.measurement[world, n].fits == 1:
+        if memory.measurement[world, n].fits != 0:
             linearise(frame, memory, world, i, n)
             for part in range(DERIVATIVES):
                 member = memory.derivative[world, n, part].member

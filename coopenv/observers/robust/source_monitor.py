@@ -143,18 +143,17 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
 @device_function
 def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     """Add the innovations of a correction to the information on all faults, and correct the sensitivities."""
+    weight = wp.min(frame.period / wp.float64(constants.MEAN_TIME), wp.float64(1.0))
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             correct_source(frame, memory, world, i, q)
             if is_sender(q):
                 correct_drift_effect(frame, memory, world, i, q)
-    weight = wp.min(frame.period / wp.float64(constants.MEAN_TIME), wp.float64(1.0))
+            memory.source[world, i, q].rejected *= wp.float64(1.0) - weight  # out of view as well
     for n in range(frame.bearings):
         q = memory.measurement[world, n].source
-        fits = memory.measurement[world, n].fits
-        if fits != 0 and q >= 0:
-            rejected = wp.where(fits == 1, wp.float64(0.0), wp.float64(1.0)) - memory.source[world, i, q].rejected
-            memory.source[world, i, q].rejected += weight * rejected
+        if q >= 0 and memory.measurement[world, n].fits == -1:
+            memory.source[world, i, q].rejected += weight
     for n in range(frame.bearings):
         if memory.measurement[world, n].fits != 0:
             W = share_of(frame, memory, world, n) * memory.measurement[world, n].weight

@@ -100,7 +100,7 @@ class Mine(DeadReckoning):
 
 
 def test_observers_travel_to_other_processes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """One fails, which stops nobody else; another tells its NIS; the last one is loaded from its file there."""
+    """One fails, and the others go on; another tells its NIS; the last one is loaded from its file there."""
     monkeypatch.setattr(registry, "_registered", {})
     registry.register("raises", Raises)
     registry.register("tells", Tells)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.evidence import CHANGES, STEP_AT
 from coopenv.observers import Recording
-from coopenv.observers.robust.constants import FAULT_GATE, MONITOR_TIME, SHORT_TIME
+from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
 from coopenv.observers.robust.sources import NO_TARGET, ODOMETRY
 from coopenv.runs.recorder import record
@@ -74,6 +74,14 @@ def test_a_sensitivity_is_the_derivative_of_the_estimate(
     for part in (slice(0, 3), slice(3, 6)):
         error = np.linalg.norm((found - expected)[:, part], axis=(1, 2))
         assert (error < 0.03 * np.linalg.norm(expected[:, part], axis=(1, 2))).all(), error
+
+
+def test_a_source_out_of_view_is_not_rejected_for_ever() -> None:
+    """The landmark is wrong for half a second, which does not suffice to exclude it, and then out of view."""
+    recording = faults.hidden_landmark(wrong_landmark(busy(14.0, 0), 1, 3.0 * METRE, 8.0), 1, 8.5)
+    rejected = watch(recording).of("rejected", 2, 1)
+    assert rejected[recording.t < 8.5][-1] > FOUND_SHARE
+    assert rejected[recording.t > 8.5 + MEAN_TIME][0] < FOUND_SHARE
 
 
 def eliminated(A: np.ndarray, a: np.ndarray, P: np.ndarray, nuisance: list[int]) -> tuple[np.ndarray, np.ndarray]:
