@@ -19,7 +19,8 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import PoseEstimate, mat33d, mat66d, vec6d
+from coopenv.observers.robust.memory import Pose, PoseEstimate, mat33d, mat66d, vec6d
+from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
 from coopenv.observers.robust.reports import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
@@ -114,18 +115,20 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
 
 
 @device_function
-def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any):
-    """Add an increment d of member n's report to the monitor of its drift."""
+def monitor_increment(
+    memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any, unknown: Any
+):
+    """Add an increment d of member n's report to the monitor of its drift; the sender's noise is `unknown` more."""
     R = memory.member[world, i, n].pose.R
     N = block3(before - after + more, 3, 3)
     if wp.trace(N) < wp.float64(0.0):
         N = mat33d()
-    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
+    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3) + unknown * wp.identity(3, wp.float64)
     add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
 @device_function
-def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool):
+def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, unknown: Any):
     """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
@@ -145,7 +148,7 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
     N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
-    monitor_increment(memory, world, i, n, d, before, after, more)
+    monitor_increment(memory, world, i, n, d, before, after, more, unknown)
     variance = algebra.position_variance(before)
     reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
@@ -190,6 +193,20 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
 
 
 @device_function
+def unknown_variance(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any):
+    """Return the variance, m^2 per axis, of an increment over dt of member n by errors of its odometry that it estimates.
+
+    The receiver knows neither what is left of them nor how suddenly the twist has changed.
+    """
+    scale = calibration_variances(model, i)[3] * wp.max(wp.float64(1.0), wp.float64(constants.MEAN_TIME) / dt)
+    variance = scale * wp.length_sq(step.p)
+    if memory.member[world, i, n].has_twist == 1:
+        change = (step.p / dt - memory.member[world, i, n].v) * model.odometry_period
+        variance = variance + wp.float64(TWELFTH) * wp.length_sq(change)
+    return variance
+
+
+@device_function
 def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
     """Propagate a member to its new report, and fuse it."""
     last = memory.member[world, i, n].report
@@ -197,6 +214,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
     dt = wp.float64(report.tick - last.tick) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
+    unknown = unknown_variance(model, memory, world, i, n, step, dt)
     propagate_member(model, memory, world, i, n, step, dt, white)
     steady = not update_clock_velocity(model, memory, world, i, n)
     memory.member[world, i, n].report = report
@@ -209,7 +227,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
         clear_source(memory, world, i, q)
         set_to_report(model, memory, world, i, n)
     else:
-        fuse_increment(model, memory, world, i, n, steady and not depends_on_own(memory, world, i, n))
+        fuse_increment(model, memory, world, i, n, steady and not depends_on_own(memory, world, i, n), unknown)
 
 
 @device_function
