@@ -148,10 +148,15 @@ def is_rejected(memory: Any, world: int, i: int, q: int) -> bool:
 
 @device_function
 def gate_locates_fault(memory: Any, world: int, i: int) -> bool:
-    """Return whether the gate rejects many bearings to some source that is used."""
+    """Return whether the gate rejects many bearings to a source whose fault is not clearly less likely than another."""
+    most = wp.float64(0.0)
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            most = wp.max(most, memory.source[world, i, q].ratio)
     for q in range(SOURCES):
         if is_active(memory, world, i, q) and is_rejected(memory, world, i, q):
-            return True
+            if memory.source[world, i, q].ratio > most - wp.float64(constants.ODDS):
+                return True
     return False
 
 
