@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.belief import remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
@@ -30,10 +30,12 @@ from coopenv.observers.robust.source_monitor import (
     end_block,
 )
 from coopenv.observers.robust.sources import (
+    GYRO,
     ODOMETRY,
     clear_drift,
     clear_source,
     is_active,
+    is_own,
     is_rejected,
     is_sender,
     member_of,
@@ -88,14 +90,19 @@ def forget_faults(memory: Any, world: int, i: int):
             memory.source[world, i, c].information = mat33d()
             if is_sender(c):
                 clear_drift(memory, world, i, c)
+            if c == GYRO:
+                clear_source(memory, world, i, c)
 
 
 @device_function
 def exclude(memory: Any, world: int, i: int, q: int):
-    """Exclude a source; the own odometry is used on, with an uncertain scale."""
-    if q == ODOMETRY:
+    """Exclude a source; the own odometry is used on, with an uncertain scale or bias."""
+    if is_own(q):
         inflate_by_fault(memory, world, i, q)
-        correct_scale(memory, world, i)
+        if q == ODOMETRY:
+            correct_scale(memory, world, i)
+        else:
+            correct_bias(memory, world, i)
         return
     if drifts(memory, world, i, q):
         inflate_by_drift(memory, world, i, q)
@@ -209,6 +216,16 @@ def correct_scale(memory: Any, world: int, i: int):
         variance = wp.dot(v, covariance * v) / (square * square)
         memory.member[world, i, ERRORS].v[0] -= scale
         memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * scale + variance
+
+
+@device_function
+def correct_bias(memory: Any, world: int, i: int):
+    """Correct the gyro's bias by the estimated fault of the angular velocity, and add the uncertainty to its variance."""
+    f = memory.source[world, i, GYRO].offset
+    memory.member[world, i, ERRORS].w -= f
+    P = memory.P[world, i, ERRORS, ERRORS]
+    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, GYRO].covariance
+    memory.P[world, i, ERRORS, ERRORS] = P
 
 
 @device_function

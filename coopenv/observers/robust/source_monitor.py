@@ -1,7 +1,7 @@
 """One monitor per source of information: landmarks, senders and the vehicle's own odometry.
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
-reported position (m, map), or the error of the odometry's velocity (m/s, body). The own error depends on it by a
+reported position (m, map), or the error of the own velocity (m/s, body) or angular velocity (rad/s, body). The own error depends on it by a
 sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
 covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
 
@@ -34,10 +34,12 @@ from coopenv.observers.robust.memory import (
     vec3d,
 )
 from coopenv.observers.robust.sources import (
-    ODOMETRY,
+    GYRO,
     clear_drift,
+    clear_source,
     gate_locates_fault,
     is_active,
+    is_own,
     is_rejected,
     is_sender,
 )
@@ -251,7 +253,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
         if is_active(memory, world, i, q):
             V = mat33d()
             v = vec3d()
-            if is_rejected(memory, world, i, q) or not located:
+            if is_rejected(memory, world, i, q) or is_own(q) or not located:
                 V = memory.information[world, i, q, q]
                 v = memory.source[world, i, q].vector
                 for b in range(count):
@@ -264,8 +266,8 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].information = V
             memory.source[world, i, q].sum = v
             least = wp.float64(constants.ROUNDING) * wp.trace(V) + wp.float64(constants.MIN_VARIANCE)
-            if q == ODOMETRY:
-                variance = odometry_fault_variance(memory, world, i)
+            if is_own(q):
+                variance = odometry_fault_variance(memory, world, i, q)
                 least = wp.float64(1.0) / wp.max(variance, wp.float64(constants.MIN_VARIANCE))
             covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
             memory.source[world, i, q].covariance = covariance
@@ -273,14 +275,16 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
             if is_sender(q):
                 end_drift_block(memory, world, i, q, kept)
+            if q == GYRO and memory.source[world, i, q].ratio < wp.float64(3.0):
+                clear_source(memory, world, i, q)  # the bias state follows a fault from further back
     clear_block(memory, world, i)
 
 
 @device_function
-def odometry_fault_variance(memory: Any, world: int, i: int):
-    """Return the variance, (m/s)^2, of the fault of the odometry's velocity: a share of the speed."""
-    share = wp.float64(constants.ODOMETRY_FAULT * constants.ODOMETRY_FAULT)
-    return share * wp.length_sq(memory.belief[world, i].mean_v)
+def odometry_fault_variance(memory: Any, world: int, i: int, q: int):
+    """Return the variance of the fault of the own velocity, (m/s)^2, or angular velocity, (rad/s)^2."""
+    variance = wp.float64(constants.ODOMETRY_FAULT * constants.ODOMETRY_FAULT)
+    return wp.where(q == GYRO, variance, variance * wp.length_sq(memory.belief[world, i].mean_v))
 
 
 @device_function

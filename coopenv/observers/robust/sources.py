@@ -21,7 +21,8 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.world.warp_internals import device_function
 
-ODOMETRY = 0  # the slot of the own odometry; then those of senders, then those of landmarks
+ODOMETRY, GYRO = 0, SOURCES - 1
+"""The slots of the own velocity and angular velocity; between them are those of senders, then those of landmarks."""
 NO_TARGET = -1
 
 
@@ -29,6 +30,12 @@ NO_TARGET = -1
 def is_sender(q: int) -> bool:
     """Return whether a slot is one of senders."""
     return q > 0 and q <= SENDER_SLOTS
+
+
+@wp.func
+def is_own(q: int) -> bool:
+    """Return whether a slot is one of the own odometry."""
+    return q == ODOMETRY or q == GYRO
 
 
 @device_function
@@ -113,7 +120,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
     q = slot_of(memory, world, i, target)
     if q < 0:
         first = wp.where(landmark, 1 + SENDER_SLOTS, 1)
-        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, SOURCES, 1 + SENDER_SLOTS))
+        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, GYRO, 1 + SENDER_SLOTS))
         if landmark and q >= 0 and memory.source[world, i, q].target != NO_TARGET:
             unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
             q = wp.where(unseen > wp.float64(constants.MEAN_TIME), q, -1)
@@ -128,7 +135,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
 @device_function
 def is_active(memory: Any, world: int, i: int, q: int) -> bool:
     """Return whether a slot is of a source that is used."""
-    active = q == ODOMETRY or memory.source[world, i, q].target != NO_TARGET
+    active = is_own(q) or memory.source[world, i, q].target != NO_TARGET
     return active and memory.source[world, i, q].excluded == 0
 
 
@@ -170,6 +177,9 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
                 E = dt * wp.transpose(step.R)
                 for k in range(3):
                     Phi[k + 3] = Phi[k + 3] + E[k]
+            if q == GYRO:
+                for k in range(6):
+                    Phi[k] = Phi[k] - vec3d(G[k, 0], G[k, 1], G[k, 2])
             memory.sensitivity[world, i, q, 0] = Phi
             if is_sender(q):
                 e = forward_error(step, memory.drift_effect[world, i, q - 1, 0])
