@@ -26,9 +26,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
 )
 from coopenv.observers.robust.reports import includes
-from coopenv.observers.robust.source_monitor import (
-    end_block,
-)
+from coopenv.observers.robust.source_monitor import end_block, restart_gyro
 from coopenv.observers.robust.sources import (
     GYRO,
     ODOMETRY,
@@ -91,7 +89,7 @@ def forget_faults(memory: Any, world: int, i: int):
             if is_sender(c):
                 clear_drift(memory, world, i, c)
             if c == GYRO:
-                clear_source(memory, world, i, c)
+                restart_gyro(memory, world, i)
 
 
 @device_function

@@ -241,6 +241,15 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
 
 
 @device_function
+def restart_gyro(memory: Any, world: int, i: int):
+    """Let a fault of the gyro begin now; the bias state follows one from further back."""
+    clear_source(memory, world, i, GYRO)
+    variance = odometry_fault_variance(memory, world, i, GYRO)
+    memory.source[world, i, GYRO].covariance = variance * wp.identity(3, wp.float64)
+    memory.source[world, i, GYRO].offset = vec3d()
+
+
+@device_function
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 
@@ -276,7 +285,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             if is_sender(q):
                 end_drift_block(memory, world, i, q, kept)
             if q == GYRO and memory.source[world, i, q].ratio < wp.float64(3.0):
-                clear_source(memory, world, i, q)  # the bias state follows a fault from further back
+                restart_gyro(memory, world, i)
     clear_block(memory, world, i)
 
 
