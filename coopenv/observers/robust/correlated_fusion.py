@@ -194,9 +194,9 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
 
 @device_function
 def unknown_variance(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any):
-    """Return the variance, m^2 per axis, of an increment over dt of member n by errors of its odometry that it estimates.
+    """Return the variance, m^2 per axis, of an increment of member n over dt by what only the sender knows.
 
-    The receiver knows neither what is left of them nor how suddenly the twist has changed.
+    That is how much it has still to learn of its odometry's scale, and how suddenly its twist has changed.
     """
     scale = calibration_variances(model, i)[3] * wp.max(wp.float64(1.0), wp.float64(constants.MEAN_TIME) / dt)
     variance = scale * wp.length_sq(step.p)

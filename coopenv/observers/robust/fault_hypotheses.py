@@ -95,6 +95,7 @@ def forget_faults(memory: Any, world: int, i: int):
 @device_function
 def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; the own odometry is used on, with an uncertain scale or bias."""
+    memory.source[world, i, q].exclusions += 1
     if is_own(q):
         inflate_by_fault(memory, world, i, q)
         if q == ODOMETRY:
@@ -111,7 +112,6 @@ def exclude(memory: Any, world: int, i: int, q: int):
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
     memory.source[world, i, q].excluded = 1
-    memory.source[world, i, q].exclusions += 1
     memory.source[world, i, q].time = wp.float64(0.0)
     k = member_of(memory, world, i, q)
     if k > 0:
@@ -167,13 +167,14 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 
 @device_function
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
-    """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain."""
+    """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain.
+
+    Innovations of a wrong pose, while the gate is disabled, show no faults but those of the own odometry.
+    """
     end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
-    if memory.belief[world, i].gate_disabled == 1:  # innovations of a wrong pose show no faults
-        forget_faults(memory, world, i)
-        return
-    if exclude_drifting(memory, world, i, landmarks):
+    lost = memory.belief[world, i].gate_disabled == 1
+    if not lost and exclude_drifting(memory, world, i, landmarks):
         forget_faults(memory, world, i)
         return
     gate = wp.float64(constants.FAULT_GATE)
@@ -183,16 +184,16 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
         if is_active(memory, world, i, q) and memory.source[world, i, q].ratio > most:
             most = memory.source[world, i, q].ratio
             worst = q
-    if worst < 0:
-        return
     total = weight_of(gate, most)
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             total += weight_of(memory.source[world, i, q].ratio, most)
-    if total < wp.float64(1.0 + constants.FAULT_RISK):
+    certain = worst >= 0 and total < wp.float64(1.0 + constants.FAULT_RISK)
+    if certain and (is_own(worst) or not lost):
         exclude(memory, world, i, worst)
+    if certain or lost:
         forget_faults(memory, world, i)
-    else:
+    elif worst >= 0:
         set_fault_mixture(memory, world, i, most, total)
 
 
@@ -218,7 +219,7 @@ def correct_scale(memory: Any, world: int, i: int):
 
 @device_function
 def correct_bias(memory: Any, world: int, i: int):
-    """Correct the gyro's bias by the estimated fault of the angular velocity, and add the uncertainty to its variance."""
+    """Correct the gyro's bias by the estimated fault of the angular velocity, and add to its variance likewise."""
     f = memory.source[world, i, GYRO].offset
     memory.member[world, i, ERRORS].w -= f
     P = memory.P[world, i, ERRORS, ERRORS]

@@ -1,9 +1,10 @@
 """One monitor per source of information: landmarks, senders and the vehicle's own odometry.
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
-reported position (m, map), or the error of the own velocity (m/s, body) or angular velocity (rad/s, body). The own error depends on it by a
-sensitivity Phi, which passes through propagation and correction like the error itself, and an innovation r of
-covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all faults.
+reported position (m, map), or the error of the own velocity (m/s, body) or angular velocity (rad/s, body). The own
+error depends on it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an
+innovation r of covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all
+faults.
 
 Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
 Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
@@ -253,7 +254,7 @@ def restart_gyro(memory: Any, world: int, i: int):
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 
-    While the gate rejects bearings to some sources, it has located the fault: the block tells of those sources alone.
+    While the gate locates a fault, the block tells of the sources that it rejects, and of the own odometry.
     """
     located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)

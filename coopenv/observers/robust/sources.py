@@ -35,7 +35,7 @@ def is_sender(q: int) -> bool:
 @wp.func
 def is_own(q: int) -> bool:
     """Return whether a slot is one of the own odometry."""
-    return q == ODOMETRY or q == GYRO
+    return q <= ODOMETRY or q >= GYRO
 
 
 @device_function
