@@ -38,9 +38,10 @@ MIN_VELOCITY_STD, MIN_ANGULAR_VELOCITY_STD = 2e-3, 2e-4
 """m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
 JUMP_GATE = 2.0 * float(chdtri(3, RISK))  # of the squared change of a twist between samples, in sample variances
 SHARE_OF_CHANGE = 0.2  # of a velocity, by which it must change before the effect of clock offsets is updated. Chosen
-MOUNTING_WALK = 0.02
-"""Share of its declared deviation by which the mounting walks in a second. Without turns, heading and mounting
-are not separately observable, and linearisation makes both covariances slightly too small. Tuned."""
+CALIBRATION_CHANGE = 0.02
+"""Change of a calibration that is no fault: of the scale of a sender's odometry, as by tyres, and of the mounting in a
+second, as a share of its declared deviation. Without turns, heading and mounting are not separately observable, and
+linearisation makes both covariances slightly too small. Tuned."""
 GYRO_BIAS = 1e-3
 """rad/s per axis, and rad/s in the root of a second: least deviation of a gyro's bias, and of its walk, where no larger
 ones are declared. Chosen."""

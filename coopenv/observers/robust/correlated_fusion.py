@@ -123,7 +123,7 @@ def monitor_increment(
     N = block3(before - after + more, 3, 3)
     if wp.trace(N) < wp.float64(0.0):
         N = mat33d()
-    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3) + unknown * wp.identity(3, wp.float64)
+    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3) + unknown
     add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
@@ -193,17 +193,18 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
 
 
 @device_function
-def unknown_variance(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any):
-    """Return the variance, m^2 per axis, of an increment of member n over dt by what only the sender knows.
+def unknown_covariance(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any):
+    """Return the covariance (3, 3), m^2 and body, of an increment of member n over dt by what the receiver cannot know.
 
-    That is how much it has still to learn of its odometry's scale, and how suddenly its twist has changed.
+    That is how wrong the scale of the sender's odometry is, and how suddenly its twist has changed.
     """
-    scale = calibration_variances(model, i)[3] * wp.max(wp.float64(1.0), wp.float64(constants.MEAN_TIME) / dt)
-    variance = scale * wp.length_sq(step.p)
+    p = wp.transpose(step.R) * step.p
+    scale = calibration_variances(model, i)[3] + wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE)
+    C = (scale * wp.max(wp.float64(1.0), wp.float64(constants.MEAN_TIME) / dt)) * wp.outer(p, p)
     if memory.member[world, i, n].has_twist == 1:
         change = (step.p / dt - memory.member[world, i, n].v) * model.odometry_period
-        variance = variance + wp.float64(TWELFTH) * wp.length_sq(change)
-    return variance
+        C = C + (wp.float64(TWELFTH) * wp.length_sq(change)) * wp.identity(3, wp.float64)
+    return C
 
 
 @device_function
@@ -214,7 +215,7 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
     dt = wp.float64(report.tick - last.tick) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
-    unknown = unknown_variance(model, memory, world, i, n, step, dt)
+    unknown = unknown_covariance(model, memory, world, i, n, step, dt)
     propagate_member(model, memory, world, i, n, step, dt, white)
     steady = not update_clock_velocity(model, memory, world, i, n)
     memory.member[world, i, n].report = report

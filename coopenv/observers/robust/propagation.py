@@ -46,11 +46,11 @@ def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
 
 @device_function
 def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Inflate the covariance of the mounting by its walk over dt, see `MOUNTING_WALK`."""
+    """Inflate the covariance of the mounting by its walk over dt, see `CALIBRATION_CHANGE`."""
     if mounting_of(memory, world, i) > 0:
-        declared = (wp.float64(constants.MOUNTING_WALK * constants.MOUNTING_WALK) * dt) * mounting_variances(model, i)
+        share = wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE) * dt
         P = memory.P[world, i, MOUNTING, MOUNTING]
-        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, declared)
+        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, share * mounting_variances(model, i))
 
 
 @device_function
