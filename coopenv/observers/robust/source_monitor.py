@@ -254,7 +254,7 @@ def restart_gyro(memory: Any, world: int, i: int):
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 
-    While the gate locates a fault, the block tells of the sources that it rejects, and of the own odometry.
+    While the gate locates a fault, the block tells of the sources that it rejects, and of the gyro.
     """
     located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
@@ -263,7 +263,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
         if is_active(memory, world, i, q):
             V = mat33d()
             v = vec3d()
-            if is_rejected(memory, world, i, q) or is_own(q) or not located:
+            if is_rejected(memory, world, i, q) or q == GYRO or not located:
                 V = memory.information[world, i, q, q]
                 v = memory.source[world, i, q].vector
                 for b in range(count):
