@@ -15,8 +15,7 @@ from coopenv.cars.gate.core import Gate, GateMode, Reason
 from coopenv.cars.gate.process import CLOCK, GateConnection, run
 from coopenv.cars.profile import NEUTRAL, SVEA, Role
 from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench
-from tests.cars.link.gate.hostile import messages_of_strangers
+from tests.cars.link.gate.bench import CAR, LIMITS, OTHER, STATION, Bench, messages_of_strangers
 from tests.cars.link.gate.station import Station
 from tests.helpers.hub import Hub
 
