@@ -69,6 +69,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["page", "raises.py"], "unknown environment 'raises.py'"),
         (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
+        (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
         (["bench", "observers", "overtaking", "--fault", ""], "fault '': expected [VEHICLE:]NAME"),
     ],
 )

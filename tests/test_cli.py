@@ -313,27 +313,6 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
     assert Path("out/mine/metrics.json").is_file()
 
 
-def test_an_interrupted_run_leaves_the_earlier_result(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from coopenv.evaluation.episodes import Views
-
-    take = Views.take
-
-    def interrupted(self: Views) -> None:
-        if self.taken == 31:
-            raise KeyboardInterrupt
-        take(self)
-
-    assert main(["run", "overtaking", "--steps", "3", "--no-figures", "--out", "cut"]) == 0
-    before = {path.name: path.read_bytes() for path in Path("cut").iterdir()}
-    capsys.readouterr()
-    monkeypatch.setattr(Views, "take", interrupted)
-    assert main(["run", "overtaking", "--seed", "1", "--no-figures", "--out", "cut"]) == 130
-    assert capsys.readouterr().out == ""
-    assert {path.name: path.read_bytes() for path in Path("cut").iterdir()} == before
-
-
 @pytest.mark.parametrize(
     ("text", "value"),
     [

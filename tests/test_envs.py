@@ -53,25 +53,21 @@ def test_registries(name: str) -> None:
     check_env(single.unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def restored(env: Env) -> Env:
+    """Return another environment, which was elsewhere, with the state of this one."""
+    other = coopenv.parallel_env(env.scenario)
+    other.reset(seed=99)
+    other.set_state(env.get_state())
+    return other
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), restored])
 def test_copies_go_on_where_the_original_is(name: str, copy_of: Callable[[Env], Env]) -> None:
+    """With the noise, too."""
     env = coopenv.parallel_env(name)
     rollout(env, 4, 12)
     twin = copy_of(env)
-    for actions in actions_of(env):
-        assert_equal(env.step(actions), twin.step(actions))
-
-
-def test_saved_state_restores_noise_too(name: str) -> None:
-    env = coopenv.parallel_env(name)
-    rollout(env, 4, 12)
-    saved, actions = env.get_state(), actions_of(env)
-    first = [env.step(action) for action in actions]
-    env.reset(seed=99)
-    env.set_state(saved)
-    assert_equal([env.step(action) for action in actions], first)
-
-
-def actions_of(env: Env) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(1)
-    return [random_actions(env, rng) for _ in range(10)]
+    for _ in range(10):
+        actions = random_actions(env, rng)
+        assert_equal(env.step(actions), twin.step(actions))

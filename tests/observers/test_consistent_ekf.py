@@ -15,6 +15,7 @@ from coopenv.observers.centralised import Centralised
 from coopenv.observers.consistent_ekf import FirstEstimatesEkf, ObservabilityConstrainedEkf
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.oracles.continuous import skew
 
 
 def without_landmarks(ticks: int = 20) -> Recording:
@@ -67,10 +68,6 @@ def test_bearings_between_vehicles_leave_six_directions_unobservable() -> None:
     assert unobservable_dimension(FirstEstimatesEkf, made) == 6
     assert unobservable_dimension(ObservabilityConstrainedEkf, made) == 6
     assert unobservable_dimension(Centralised, made) < 6
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 def transform(p: np.ndarray) -> np.ndarray:

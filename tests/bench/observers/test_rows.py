@@ -22,7 +22,7 @@ from coopenv.bench.observers.rows import EDGES, UNKNOWN, WindowRow, checked_edge
 from coopenv.bench.observers.tables import level_figures
 from coopenv.cli import main
 from coopenv.observers import run
-from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.runner import Run
 from coopenv.runs.recorder import record
 
@@ -53,6 +53,21 @@ def test_rows_are_what_the_runs_say(found: coopenv.Comparison) -> None:
             got = (row.position_rmse_m, row.position_rmse_se_m, row.bound_ancestors_m, row.ratio_to_bound_ancestors)
             assert_allclose((*got, row.ratio_to_bound_ancestors_se), expected, rtol=1e-9)
             assert_allclose((row.anees, row.anees_se), (nees.mean(), nees.std(ddof=1) / np.sqrt(3)), rtol=1e-9)
+
+
+def test_rows_have_the_bounds_of_the_runs(found: coopenv.Comparison) -> None:
+    scenario = coopenv.load_scenario("lane:4", SHORT)
+    records = [record(scenario, seed) for seed in (0, 1, 2)]
+    late = records[0].t > 2.5
+    errors = np.array([run("mekf_covariance", made).position_error[late] for made in records])
+    squares = [np.mean(cramer_rao(made).position[late] ** 2, axis=0) for made in records]
+    assert_allclose([row.bound_m for row in found.rows], np.sqrt(np.mean(squares, axis=0)), rtol=1e-12)
+    median = np.median(np.sqrt(np.mean(errors**2, axis=1)), axis=0)
+    assert_allclose([row.position_rmse_median_m for row in found.rows], median, rtol=1e-12)
+    for row in found.rows:
+        assert row.ratio_to_bound == pytest.approx(row.position_rmse_m / row.bound_m)
+        assert max(row.bound_m, row.bound_single_m) <= row.bound_ancestors_m * (1 + 1e-9)
+        assert row.degradation == pytest.approx(1.0) and row.gramian_min_eigenvalue >= 0.0
 
 
 def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -128,23 +127,3 @@ def test_what_others_have_not_signed_is_dropped_and_counted(tmp_path: Path) -> N
     assert not station.drain() and station.dropped == {"signature": 6}
     network.publish(topic, payload, genuine)
     assert len(station.drain()) == 1
-
-
-def test_replayed_messages_of_others_count_once() -> None:
-    bound = binding("svea1")
-    intake, assembler, now = Intake(bound, Sensors()), Assembler(bound), 10**12
-    assembler.begin(now)
-    topic = SVEA.topic_of("svea7", Role.ESTIMATE)
-
-    def say(stamp: int, received: int) -> Any:
-        pose = {"pose": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
-        message = make(SVEA.topics[Role.ESTIMATE].type, header=header(stamp), pose=pose)
-        for sample in intake.samples(Arrival(topic, encode(message), received)):
-            assembler.put(sample)
-
-    say(now, now + 10**6)
-    assert assembler.tick(1, now + 2 * 10**6).messages
-    say(now, now + 3 * 10**6)  # again
-    say(now - 5, now + 3 * 10**6)  # older
-    assert not assembler.tick(2, now + 4 * 10**6).messages
-    assert assembler.refused["message out of order"] == 2
