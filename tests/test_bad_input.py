@@ -41,6 +41,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "acts.py").write_text(AGENTS)
     (tmp_path / "raises.py").write_text("raise RuntimeError('at import')")
     (tmp_path / "file").touch()
+    (tmp_path / "broken.toml").write_text("title = ")
+    (tmp_path / "picture.toml").write_bytes(bytes([137, 80, 200, 0]))
+    (tmp_path / "rosbag").mkdir()
+    (tmp_path / "rosbag" / "metadata.yaml").touch()
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -71,13 +75,49 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
         (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
         (["bench", "observers", "overtaking", "--fault", ""], "fault '': expected [VEHICLE:]NAME"),
+        ("run busy_intersecton", "did you mean 'busy_intersection'"),
+        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
+        ("run broken.toml", "not valid TOML"),
+        ("run busy_intersection --steps 0", "--steps"),
+        ("run busy_intersection --seed x", "--seed"),
+        ("run busy_intersection --seed -1", "--seed"),
+        ("run busy_intersection --set foo", "expected KEY=VALUE"),
+        ("run busy_intersection --set =3", "expected KEY=VALUE"),
+        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
+        ("run busy_intersection --set horizon=nan", "horizon"),
+        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
+        ("run busy_intersection --dtype float16", "float16"),
+        ("run busy_intersection --device tpu", "tpu"),
+        ("run urban_crossing --policy rando", "did you mean 'random'"),
+        ("run busy_intersection --steady-from 50", "steady_from"),
+        ("run busy_intersection --out file", "it is not a folder"),
+        ("run busy_intersection --out file/below", "cannot write to"),
+        ("schema --out missing/schema.json", "cannot write to"),
+        ("describe", "ENV"),
+        ("list things", "things"),
+        ("run ./rosbag", "rosbag: a ROS bag"),
+        ("describe picture.toml", "picture.toml: not a text file"),
+        ("run busy_intersection --figures gif", "--figures"),
+        ("run nowhere.mcap", "nowhere.mcap"),
+        ("run nowhere.mcap --seed 1", "--seed: is for a simulation, nowhere.mcap is recorded"),
+        ("run busy_intersection --variant blind", "is for recorded data"),
+        ("run busy_intersection --bogus", "--bogus"),
+        ("frobnicate", "frobnicate"),
+        ("record mrclam_6 --seed 2 --out drive.mcap", "--seed: is for a simulation, mrclam_6 is recorded"),
+        ("record mrclam_12 --data . --out drive.mcap", "unknown data set 'mrclam_12' (did you mean"),
+        ("record mrclam_6 --variant blnd --data . --out drive.mcap", "did you mean 'blind'"),
+        ("record busy_intersection --variant blind --out drive.mcap", "--variant blind: is for recorded data"),
+        ("record busy_intersection --data . --out drive.mcap", "--data .: is for recorded data"),
+        ("record busy_intersectoin --out drive.mcap", "did you mean 'busy_intersection'"),
+        ("record busy_intersection --out drive.bag", "the name must end in .mcap"),
+        ("record busy_intersection --out none/drive.mcap", "folder none does not exist"),
     ],
 )
 def test_one_line_and_nothing_is_left(
-    arguments: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str] | str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = sorted(folder.rglob("*"))
-    assert main(arguments) == 2
+    assert main(arguments.split() if isinstance(arguments, str) else arguments) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1 and words in errors[0], errors
     assert [path for path in sorted(folder.rglob("*")) if "__pycache__" not in path.parts] == there

@@ -24,7 +24,6 @@ from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
 from coopenv.runs import console
 from coopenv.runs.recorder import record
-from tests.helpers.commands import refused
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {
@@ -41,17 +40,6 @@ FIGURES = {
 def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> Path:
-    """A folder with a plain file and a scenario that is no TOML."""
-    (tmp_path / "occupied").write_text("")
-    (tmp_path / "broken.toml").write_text("title = ")
-    (tmp_path / "picture.toml").write_bytes(bytes([137, 80, 200, 0]))
-    (tmp_path / "rosbag").mkdir()
-    (tmp_path / "rosbag" / "metadata.yaml").write_text("")
-    return tmp_path
 
 
 def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,44 +116,6 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--steady-from" in capsys.readouterr().out
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"coopenv {coopenv.__version__}\n"
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("run busy_intersecton", "did you mean 'busy_intersection'"),
-        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
-        ("run broken.toml", "not valid TOML"),
-        ("run busy_intersection --steps 0", "--steps"),
-        ("run busy_intersection --seed x", "--seed"),
-        ("run busy_intersection --seed -1", "--seed"),
-        ("run busy_intersection --set foo", "expected KEY=VALUE"),
-        ("run busy_intersection --set =3", "expected KEY=VALUE"),
-        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
-        ("run busy_intersection --set horizon=nan", "horizon"),
-        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
-        ("run busy_intersection --dtype float16", "float16"),
-        ("run busy_intersection --device tpu", "tpu"),
-        ("run urban_crossing --policy rando", "did you mean 'random'"),
-        ("run busy_intersection --steady-from 50", "steady_from"),
-        ("run busy_intersection --out occupied", "it is not a folder"),
-        ("run busy_intersection --out occupied/below", "cannot write to"),
-        ("schema --out missing/schema.json", "cannot write to"),
-        ("describe", "ENV"),
-        ("list things", "things"),
-        ("run ./rosbag", "rosbag: a ROS bag"),
-        ("describe picture.toml", "picture.toml: not a text file"),
-        ("run busy_intersection --figures gif", "--figures"),
-        ("run nowhere.mcap", "nowhere.mcap"),
-        ("run nowhere.mcap --seed 1", "--seed: is for a simulation, nowhere.mcap is recorded"),
-        ("run busy_intersection --variant blind", "is for recorded data"),
-        ("run busy_intersection --bogus", "--bogus"),
-        ("frobnicate", "frobnicate"),
-    ],
-)
-def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, files: Path) -> None:
-    assert message in refused(*line.split())
-    assert {path.name for path in files.iterdir()} <= {"occupied", "broken.toml", "picture.toml", "rosbag", "out"}
 
 
 def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

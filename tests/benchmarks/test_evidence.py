@@ -21,7 +21,7 @@ from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
-from tests.helpers.barrier_robots import barrier_robots
+from tests.helpers.mrclam_files import barrier_robots
 
 
 @pytest.fixture(scope="module")

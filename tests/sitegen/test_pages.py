@@ -102,13 +102,6 @@ def test_the_page_of_the_command_line_has_every_command(made: dict[str, str]) ->
     assert len(lists) > 20 and not [line for line in lists if line.endswith("...")]
 
 
-def test_examples_are_told_in_whole_sentences(made: dict[str, str]) -> None:
-    rows = re.findall(r"^- \[.+\]\(.+\): (.+)$", made["files/examples.md"], re.MULTILINE)
-    assert len(rows) == len(mirror.listed("examples"))
-    assert not [row for row in rows if not re.search(r"\w[.?!]$|\)\.$", row)]
-    assert any(row.endswith("?") for row in rows)
-
-
 def test_no_two_pages_have_the_same_title(made: dict[str, str]) -> None:
     """A search lists them by their titles."""
     texts = [text for page, text in made.items() if not page.startswith("files/")]

@@ -22,7 +22,7 @@ from coopenv.world.route import place_on_route, point_on_route
 from coopenv.world.state import allocate, state_struct
 from tests.helpers.builders import command, constant, reset, run, scenario, start, vehicle
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.warp_calls import DTYPES, EPSILON
+from tests.helpers.warp_calls import DTYPES
 
 start_warp()
 
@@ -123,17 +123,6 @@ def test_the_place_is_the_nearest_one_of_a_crooked_line() -> None:
     assert_allclose(np.abs(lateral[inside]), distance[inside], atol=2e-3)
     there = points("float64", line, s)[inside, :2]
     assert_allclose(np.linalg.norm(there - xy[inside], axis=1), distance[inside], atol=2e-3)
-
-
-def test_points_and_places_are_inverse() -> None:
-    angles = np.linspace(0.0, 2.0, 40)
-    line = 5.0 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
-    s = np.linspace(-2.0, 12.0, 57)
-    on = points("float64", line, s)
-    again = places("float64", line, on[:, :2])
-    assert_allclose(again[:, 0], s, atol=1e3 * EPSILON["float64"])
-    assert_allclose(again[:, 1], 0.0, atol=1e2 * EPSILON["float64"] ** 0.5)
-    assert_allclose(again[:, 2], on[:, 2], atol=1e3 * EPSILON["float64"])
 
 
 def test_no_route() -> None:

@@ -96,14 +96,6 @@ def through_its_gate(transport: Transport, ears: Ears) -> None:
     gates.end()
 
 
-def test_in_a_thread_behind_its_gate(fleet: Path) -> None:
-    with fakes(fleet) as (hub, _):
-        station = hub.connect()
-        ears = Ears(station, "svea7")
-        through_its_gate(station, ears)
-    assert not ears.there
-
-
 def test_as_a_process_over_zenoh(fleet: Path, tmp_path: Path) -> None:
     endpoint = fleet.read_text().split('"')[-2]
     with ExitStack() as stack:

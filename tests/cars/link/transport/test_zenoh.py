@@ -18,7 +18,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
 from coopenv.cars.transport.base import Address, Arrival, Certificates, LinkError, address_of, trouble_at
 from coopenv.cars.transport.zenoh import Zenoh, open_transport, open_zenoh
-from tests.helpers.authority import Authority
+from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import ECHO, PING, PONG, free_endpoint, free_port, heard_by, listening, running, seen_by
 
