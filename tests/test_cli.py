@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -242,13 +240,6 @@ def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pyte
     assert "NaN" not in Path("lost/metrics.json").read_text()
 
 
-def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
-    assert main(["run", "urban_crossing", "--steps", "3", "--video", "--no-figures", "--out", "film"]) == 0
-    assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
-    assert "pip install '.[video]'" in capsys.readouterr().err
-
-
 def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine.toml").write_text(
         'title = "Mine"\nhorizon = 2.0\n[[landmarks]]\nname = "A"\nposition = [1.0, 0.0, 2.0]\n'
@@ -279,12 +270,3 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 )
 def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
     assert parse_value(text) == value
-
-
-def test_the_installed_module_runs_in_a_process_of_its_own() -> None:
-    run = [sys.executable, "-m", "coopenv", "run", "overtaking", "--steps", "5", "--no-figures"]
-    done = subprocess.run(run, capture_output=True, text=True)
-    assert done.returncode == 0
-    progress = r"[a-z ]+: \d+ (s|%.*)|compiling kernels .*"  # where the machine is slow, or new
-    assert all(re.fullmatch(progress, line) for line in done.stderr.splitlines())
-    assert "Overtaking: seed 0" in done.stdout

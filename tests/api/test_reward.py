@@ -20,8 +20,8 @@ from coopenv.policies import load_agent
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
+from tests.helpers.env_suite import largest_slow
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.marks import largest_slow
 
 SHORT = {"horizon": 0.5, "observation.include": ["estimate", "quality"]}
 

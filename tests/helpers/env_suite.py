@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -193,3 +193,12 @@ def first_episodes(
         length += under_way
         under_way &= ~(terminated | truncated)
     return returned, length, infos["ended"]
+
+
+LARGEST = ("large_crossing", "urban_crossing")
+"""Environments whose figures take longest; the quick tests do without them where others ask the same."""
+
+
+def largest_slow(environments: Iterable[str]) -> list[Any]:
+    """Return environments as parameters, the largest ones marked slow."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in LARGEST else name for name in environments]

@@ -26,7 +26,7 @@ from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.state import array
 from tests.helpers.recordings import simulated
-from tests.helpers.robust_scenes import small_errors
+from tests.helpers.robust_worlds import small_errors
 
 
 def merged(recording: Recording, first: int, last: int, vehicle: int) -> Tick:

@@ -24,9 +24,8 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import replayed
-from tests.helpers.robust_observers import OpenRobust
-from tests.helpers.robust_scenes import crowd, small_errors
-from tests.helpers.robust_worlds import estimates, nees_of
+from tests.helpers.robust_ticks import OpenRobust
+from tests.helpers.robust_worlds import crowd, estimates, nees_of, small_errors
 
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029, "horizon": 4.0}

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import reset, simulate
-from tests.helpers.robust_observers import OpenRobust
 from tests.helpers.robust_ticks import (
     LANDMARKS,
     NOISE,
+    OpenRobust,
     Pose,
     direction,
     displaced,

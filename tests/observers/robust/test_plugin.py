@@ -18,8 +18,8 @@ from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import find
 from coopenv.observers.robust.constants import RISK
 from coopenv.observers.robust.protection import QUANTILE, fault_variances, levels, own_variances
-from tests.helpers.robust_observers import OpenRobust
-from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, small_errors
+from tests.helpers.robust_ticks import OpenRobust
+from tests.helpers.robust_worlds import everybody_sees_everybody, noise_free, small_errors
 from tests.helpers.warp_calls import Calls
 
 
