@@ -178,7 +178,7 @@ def test_a_router_of_another_authority_is_refused(tmp_path: Path, fleet: Authori
     other = Authority(tmp_path, "other")
     fleet.certify("station")
     wanted = deployment(tmp_path, guarded, root_ca=other.file.name, certificate="station.pem", key="station.key")
-    with pytest.raises(LinkError, match=rf"^{endpoint}: no Zenoh there \(its certificate is refused: .*issuer.*\)$"):
+    with pytest.raises(LinkError, match=rf"^{guarded}: no Zenoh there \(its certificate is refused: .*issuer.*\)$"):
         open_transport(wanted, timeout=1.0)
 
 
@@ -196,7 +196,7 @@ def test_a_router_with_another_address_in_its_certificate_is_refused(tmp_path: P
 def test_who_shows_no_certificate_or_a_foreign_one_is_refused(tmp_path: Path, guarded: str) -> None:
     Authority(tmp_path, "other").certify("stranger")
     for shown in ({}, {"certificate": "stranger.pem", "key": "stranger.key"}):
-        with pytest.raises(LinkError, match=rf"^{endpoint}: no Zenoh there \([^\n]+\)$"):
+        with pytest.raises(LinkError, match=rf"^{guarded}: no Zenoh there \([^\n]+\)$"):
             open_transport(deployment(tmp_path, guarded, **shown), timeout=1.0)
 
 
