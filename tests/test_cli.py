@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,6 @@ from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
 from coopenv.runs import console
 from coopenv.runs.recorder import record
-from tests.helpers.commands import refused
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {
@@ -41,17 +38,6 @@ FIGURES = {
 def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> Path:
-    """A folder with a plain file and a scenario that is no TOML."""
-    (tmp_path / "occupied").write_text("")
-    (tmp_path / "broken.toml").write_text("title = ")
-    (tmp_path / "picture.toml").write_bytes(bytes([137, 80, 200, 0]))
-    (tmp_path / "rosbag").mkdir()
-    (tmp_path / "rosbag" / "metadata.yaml").write_text("")
-    return tmp_path
 
 
 def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,44 +114,6 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--steady-from" in capsys.readouterr().out
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"coopenv {coopenv.__version__}\n"
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("run busy_intersecton", "did you mean 'busy_intersection'"),
-        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
-        ("run broken.toml", "not valid TOML"),
-        ("run busy_intersection --steps 0", "--steps"),
-        ("run busy_intersection --seed x", "--seed"),
-        ("run busy_intersection --seed -1", "--seed"),
-        ("run busy_intersection --set foo", "expected KEY=VALUE"),
-        ("run busy_intersection --set =3", "expected KEY=VALUE"),
-        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
-        ("run busy_intersection --set horizon=nan", "horizon"),
-        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
-        ("run busy_intersection --dtype float16", "float16"),
-        ("run busy_intersection --device tpu", "tpu"),
-        ("run urban_crossing --policy rando", "did you mean 'random'"),
-        ("run busy_intersection --steady-from 50", "steady_from"),
-        ("run busy_intersection --out occupied", "it is not a folder"),
-        ("run busy_intersection --out occupied/below", "cannot write to"),
-        ("schema --out missing/schema.json", "cannot write to"),
-        ("describe", "ENV"),
-        ("list things", "things"),
-        ("run ./rosbag", "rosbag: a ROS bag"),
-        ("describe picture.toml", "picture.toml: not a text file"),
-        ("run busy_intersection --figures gif", "--figures"),
-        ("run nowhere.mcap", "nowhere.mcap"),
-        ("run nowhere.mcap --seed 1", "--seed: is for a simulation, nowhere.mcap is recorded"),
-        ("run busy_intersection --variant blind", "is for recorded data"),
-        ("run busy_intersection --bogus", "--bogus"),
-        ("frobnicate", "frobnicate"),
-    ],
-)
-def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, files: Path) -> None:
-    assert message in refused(*line.split())
-    assert {path.name for path in files.iterdir()} <= {"occupied", "broken.toml", "picture.toml", "rosbag", "out"}
 
 
 def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -292,13 +240,6 @@ def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pyte
     assert "NaN" not in Path("lost/metrics.json").read_text()
 
 
-def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
-    assert main(["run", "urban_crossing", "--steps", "3", "--video", "--no-figures", "--out", "film"]) == 0
-    assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
-    assert "pip install '.[video]'" in capsys.readouterr().err
-
-
 def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine.toml").write_text(
         'title = "Mine"\nhorizon = 2.0\n[[landmarks]]\nname = "A"\nposition = [1.0, 0.0, 2.0]\n'
@@ -311,27 +252,6 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
     assert second.startswith("note: all motion here is prescribed")
     assert "Mine: seed 0" in captured.out
     assert Path("out/mine/metrics.json").is_file()
-
-
-def test_an_interrupted_run_leaves_the_earlier_result(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from coopenv.evaluation.episodes import Views
-
-    take = Views.take
-
-    def interrupted(self: Views) -> None:
-        if self.taken == 31:
-            raise KeyboardInterrupt
-        take(self)
-
-    assert main(["run", "overtaking", "--steps", "3", "--no-figures", "--out", "cut"]) == 0
-    before = {path.name: path.read_bytes() for path in Path("cut").iterdir()}
-    capsys.readouterr()
-    monkeypatch.setattr(Views, "take", interrupted)
-    assert main(["run", "overtaking", "--seed", "1", "--no-figures", "--out", "cut"]) == 130
-    assert capsys.readouterr().out == ""
-    assert {path.name: path.read_bytes() for path in Path("cut").iterdir()} == before
 
 
 @pytest.mark.parametrize(
@@ -350,12 +270,3 @@ def test_an_interrupted_run_leaves_the_earlier_result(
 )
 def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
     assert parse_value(text) == value
-
-
-def test_the_installed_module_runs_in_a_process_of_its_own() -> None:
-    run = [sys.executable, "-m", "coopenv", "run", "overtaking", "--steps", "5", "--no-figures"]
-    done = subprocess.run(run, capture_output=True, text=True)
-    assert done.returncode == 0
-    progress = r"[a-z ]+: \d+ (s|%.*)|compiling kernels .*"  # where the machine is slow, or new
-    assert all(re.fullmatch(progress, line) for line in done.stderr.splitlines())
-    assert "Overtaking: seed 0" in done.stdout

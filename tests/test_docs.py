@@ -1,6 +1,6 @@
 """Programs and tables of single pages run as they stand, and commands are understood, though not run.
 
-Programs of tutorials are in tests/sitegen/test_sessions.py.
+Programs of tutorials are in tests/sitegen/test_pages.py.
 """
 
 from __future__ import annotations

@@ -1,13 +1,165 @@
-"""Output that nobody reads or no disk takes: one line and a status, never a traceback."""
+"""Input that cannot be, output that no reader or disk takes, missing extras: one line and a status, nothing is left."""
 
 from __future__ import annotations
 
+import importlib
+import json
+import os
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from tests.helpers.processes import COOPENV, DEADLOCK, start
+import coopenv
+from coopenv.cli import main
+from coopenv.runs.rollouts import rollout
+from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start
+
+AGENTS = """
+import numpy as np
+
+def shape(observations): return np.zeros((len(observations), 5))
+def nan(observations): return np.full((len(observations), 2), np.nan)
+def text(observations): return "left"
+def none(observations): return None
+def boom(observations): raise KeyError("inside")
+
+class Init:
+    def __init__(self, scenario): raise ZeroDivisionError("no")
+
+class Leaves:
+    def __init__(self, scenario): raise SystemExit(3)
+
+class Reset:
+    def __init__(self, scenario): pass
+    def reset(self, mask): raise ValueError("bad reset")
+    def __call__(self, observations): return np.zeros((len(observations), 2))
+"""
+SHORT = ["--set", "horizon=0.5"]
+EVALUATE = ["evaluate", "facade", *SHORT, "--worlds", "2", "--out", "out", "--agents"]
+WATCH = ["watch", "--env", "facade", *SHORT, "--out", "film"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "acts.py").write_text(AGENTS)
+    (tmp_path / "raises.py").write_text("raise RuntimeError('at import')")
+    (tmp_path / "file").touch()
+    (tmp_path / "broken.toml").write_text("title = ")
+    (tmp_path / "picture.toml").write_bytes(bytes([137, 80, 200, 0]))
+    (tmp_path / "rosbag").mkdir()
+    (tmp_path / "rosbag" / "metadata.yaml").touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([*EVALUATE, "acts.py:shape"], "the policy returned actions of shape (2, 5), expected (2, 2)"),
+        ([*EVALUATE, "acts.py:nan"], "not finite for row 0"),
+        ([*EVALUATE, "acts.py:text"], "the policy returned no array of numbers, but 'left'"),
+        ([*EVALUATE, "acts.py:none"], "the policy returned actions of shape (), expected (2, 2)"),
+        ([*EVALUATE, "acts.py:boom"], "the policy failed at acts.py:8: KeyError: 'inside'"),
+        ([*EVALUATE, "acts.py:Reset"], "the policy's reset failed at acts.py:18: ValueError: bad reset"),
+        ([*EVALUATE, "acts.py:Init"], "agent 'Init' cannot be built: ZeroDivisionError: no"),
+        ([*EVALUATE, "acts.py:Leaves"], "agent 'Leaves' cannot be built: SystemExit: 3"),
+        ([*EVALUATE, ","], "--agents ,: names none"),
+        ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
+        ([*EVALUATE, "peek", "--out", "file"], "cannot write to file: it is not a folder"),
+        ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),
+        ([*WATCH, "acts.py:boom"], "the policy failed at acts.py:8"),
+        ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
+        (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
+        (["play", "facade", "--others", "nobody"], "unknown policy 'nobody'"),
+        (["page", "facade", "--out", "file"], "cannot write to file"),
+        (["page", "facade", "busy_intersection", "--measure"], "there is nothing to drive"),
+        (["page", "raises.py"], "unknown environment 'raises.py'"),
+        (["run", "facade", "--set", "seed=3"], "seed: unknown key; allowed: action, backend,"),
+        (["bench", "observers", "overtaking", "--observers", ""], "unknown observer ''; known: "),
+        (["bench", "observers", "overtaking", "--seeds", "1000", "--out", "file"], "cannot write to file"),
+        (["bench", "observers", "overtaking", "--fault", ""], "fault '': expected [VEHICLE:]NAME"),
+        ("run busy_intersecton", "did you mean 'busy_intersection'"),
+        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
+        ("run broken.toml", "not valid TOML"),
+        ("run busy_intersection --steps 0", "--steps"),
+        ("run busy_intersection --seed x", "--seed"),
+        ("run busy_intersection --seed -1", "--seed"),
+        ("run busy_intersection --set foo", "expected KEY=VALUE"),
+        ("run busy_intersection --set =3", "expected KEY=VALUE"),
+        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
+        ("run busy_intersection --set horizon=nan", "horizon"),
+        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
+        ("run busy_intersection --dtype float16", "float16"),
+        ("run busy_intersection --device tpu", "tpu"),
+        ("run urban_crossing --policy rando", "did you mean 'random'"),
+        ("run busy_intersection --steady-from 50", "steady_from"),
+        ("run busy_intersection --out file", "it is not a folder"),
+        ("run busy_intersection --out file/below", "cannot write to"),
+        ("schema --out missing/schema.json", "cannot write to"),
+        ("describe", "ENV"),
+        ("list things", "things"),
+        ("run ./rosbag", "rosbag: a ROS bag"),
+        ("describe picture.toml", "picture.toml: not a text file"),
+        ("run busy_intersection --figures gif", "--figures"),
+        ("run nowhere.mcap", "nowhere.mcap"),
+        ("run nowhere.mcap --seed 1", "--seed: is for a simulation, nowhere.mcap is recorded"),
+        ("run busy_intersection --variant blind", "is for recorded data"),
+        ("run busy_intersection --bogus", "--bogus"),
+        ("frobnicate", "frobnicate"),
+        ("record mrclam_6 --seed 2 --out drive.mcap", "--seed: is for a simulation, mrclam_6 is recorded"),
+        ("record mrclam_12 --data . --out drive.mcap", "unknown data set 'mrclam_12' (did you mean"),
+        ("record mrclam_6 --variant blnd --data . --out drive.mcap", "did you mean 'blind'"),
+        ("record busy_intersection --variant blind --out drive.mcap", "--variant blind: is for recorded data"),
+        ("record busy_intersection --data . --out drive.mcap", "--data .: is for recorded data"),
+        ("record busy_intersectoin --out drive.mcap", "did you mean 'busy_intersection'"),
+        ("record busy_intersection --out drive.bag", "the name must end in .mcap"),
+        ("record busy_intersection --out none/drive.mcap", "folder none does not exist"),
+    ],
+)
+def test_one_line_and_nothing_is_left(
+    arguments: list[str] | str, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = sorted(folder.rglob("*"))
+    assert main(arguments.split() if isinstance(arguments, str) else arguments) == 2
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and words in errors[0], errors
+    assert [path for path in sorted(folder.rglob("*")) if "__pycache__" not in path.parts] == there
+
+
+@pytest.mark.skipif(not os.path.ismount("/proc"), reason="needs a folder that nobody can write to")
+@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*WATCH, "peek"], ["page", "facade"]])
+def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*arguments, "--out", "/proc/nobody"]) == 2
+    assert "error: cannot write to /proc/nobody" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["run {}", "bench observers {}", "view {}", "film {} --out film.gif", "record {} --out a.mcap", "import {}"],
+)
+@pytest.mark.parametrize("name", ["nosuch.bag", "nosuch.db3"])
+def test_a_bag_that_does_not_exist_is_told_so(command: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.format(name).split()) == 2
+    told = capsys.readouterr().err
+    assert f"no such bag: {name}" in told and "map" not in told and told.count("\n") == 1
+
+
+def test_a_scenario_goes_where_a_name_goes() -> None:
+    scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
+    env = coopenv.parallel_env(scenario, overrides={"noise.enabled": False}, observer="dead_reckoning")
+    made = env.engine.backend.scenario
+    assert made.observer.name == "dead_reckoning" and not made.noise.enabled
+    assert env.metadata["name"] == f"{scenario.title}_v0"
+    assert len(rollout(scenario, steps=2).t) == len(rollout("overtaking", steps=2).t)
+    batch = coopenv.make_vec(scenario, num_worlds=2, overrides={"horizon": 0.5})
+    assert batch.num_envs == 2 * len(scenario.vehicles)
+    assert coopenv.load_scenario(scenario) is scenario
+    with pytest.raises(coopenv.CoopenvError, match=r"^overrides \(--set\): noise\.enabeld: unknown key .*did you mean"):
+        coopenv.parallel_env(scenario, overrides={"noise.enabeld": False})
+    with pytest.raises(coopenv.CoopenvError, match=r"^environment: expected a name or a path, got a Scenario"):
+        coopenv.compare(["riccati"], scenario, seeds=1)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--help"]])
@@ -60,3 +212,111 @@ def test_a_terminal_without_width_still_shows_tables(tmp_path: Path) -> None:
     process = start(("env", "COLUMNS=0", *COOPENV, "list"), tmp_path)
     out, _ = process.communicate(timeout=DEADLOCK)
     assert "busy_intersection" in out
+
+
+WITHOUT = """
+import json, os, subprocess, sys
+
+LIBRARIES = {
+    "cryptography", "foxglove", "gtsam", "h5py", "highway_env", "imageio_ffmpeg", "lz4", "mcap", "minari", "moviepy",
+    "nats", "onnx", "ray", "rosbags", "stable_baselines3", "tensorboard", "tomlkit", "torch", "torchrl", "viser",
+    "zenoh", "zstandard",
+}
+
+class Filtered:
+    def __init__(self, finder):
+        self.finder = finder
+
+    def find_spec(self, name, path=None, target=None):
+        return None if name.partition(".")[0] in LIBRARIES else self.finder.find_spec(name, path, target)
+
+sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder for finder in sys.meta_path]
+import coopenv.api.engine
+import coopenv.policies
+import coopenv.runs.demo
+import coopenv.runs.dataset
+import coopenv.runs.live
+from coopenv.cli import main
+
+for command, folder in json.load(sys.stdin):
+    if os.fork() == 0:
+        os.chdir(folder)
+        os.dup2(os.open("/dev/null", os.O_WRONLY), 1)
+        os.dup2(os.open(folder + ".errors", os.O_WRONLY | os.O_CREAT), 2)
+        sys.argv = ["coopenv", *command.split()]
+        os._exit(main())  # what ends at an exit is not asked for, and takes longer than the command
+    status = os.waitstatus_to_exitcode(os.wait()[1])
+    print(json.dumps([command, status, open(folder + ".errors").read(), sorted(os.listdir(folder))]))
+"""
+FLEET = ROOT / "examples" / "fleet" / "overtaking.toml"
+COMMANDS = {
+    "view crossing_path": "view",
+    "film crossing_path --out film.mp4": "video",
+    "run recorded.mcap": "log",
+    "describe recorded.mcap": "log",
+    "film recorded.mcap --out film.gif": "log",
+    "run drive.bag --map topics.toml": "log",
+    "import drive.bag": "log",
+    "record crossing_path --out new.mcap": "log",
+    "bench observers recorded.mcap": "log",
+    "train facade --out agent": "train",
+    "dataset facade": "minari",
+    "describe highway_intersection": "highway",
+    "bench observers overtaking --observers factor_graph": "bench",
+    "bench observers overtaking --engine ray": "ray",
+    "svea demo": "svea",
+    "svea router": "svea",
+    f"svea fake {FLEET} --car svea7": "svea",
+    f"svea run {FLEET}": "svea",
+    f"svea keys {FLEET} --out keys": "svea",
+    f"svea health {FLEET} --car svea7": "svea",
+}
+"""Command to the extra that it needs."""
+
+
+def metadata(name: str) -> bytes:
+    """Return a record of metadata without entries."""
+    content = len(name).to_bytes(4, "little") + name.encode() + bytes(4)
+    return b"\x0c" + len(content).to_bytes(8, "little") + content
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, str, list[str]]]:
+    """Return the exit status, errors and folder of every command, each run in a fork of one interpreter."""
+    orders = []
+    for number, command in enumerate(COMMANDS):
+        folder = tmp_path_factory.getbasetemp() / f"extras_{number}"
+        folder.mkdir()
+        (folder / "drive.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(64))
+        (folder / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+        (folder / "topics.toml").write_text('environment = "crossing_path"\ncars = [{ name = "svea7" }]\n')
+        (folder / "recorded.mcap").write_bytes(b"\x89MCAP0\r\n" + metadata("coopenv-drive"))
+        orders.append((command, str(folder)))
+    program = [sys.executable, "-c", WITHOUT]
+    variables = os.environ | {"PYTHONPATH": str(ROOT)}
+    result = subprocess.run(program, input=json.dumps(orders), stdout=subprocess.PIPE, text=True, env=variables)
+    return {command: rest for command, *rest in map(json.loads, result.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_one_line_names_the_extra(command: str, done: dict[str, tuple[int, str, list[str]]]) -> None:
+    status, errors, names = done[command]
+    assert (status, errors.count("\n")) == (2, 1), errors
+    assert f"pip install '.[{COMMANDS[command]}]'" in errors
+    assert names == ["drive.bag", "drive.mcap", "recorded.mcap", "topics.toml"]
+
+
+@pytest.mark.parametrize(
+    ("module", "needed", "extra"),
+    [
+        ("coopenv.api.trainers.sb3", "stable_baselines3.common.vec_env", "train"),
+        ("coopenv.api.trainers.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
+        ("coopenv.api.trainers.torchrl", "torchrl.envs", "torchrl"),
+        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.pettingzoo.common", "benchmarl"),
+    ],
+)
+def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, needed, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install '\.\[{extra}\]'$"):
+        importlib.import_module(module)

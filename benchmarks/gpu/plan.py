@@ -59,4 +59,4 @@ def _training(device: str, quick: bool) -> dict[str, Any]:
 
 def _tests(device: str, quick: bool) -> Stage:
     chosen = "cpu and busy" if quick else device.split(":")[0]
-    return Stage("tests", "tests", 90.0, {"files": ["tests/world/test_devices.py"], "chosen": chosen})
+    return Stage("tests", "tests", 90.0, {"files": ["tests/world/test_launch.py"], "chosen": chosen})

@@ -18,7 +18,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers.planar.plugin import LEAST_LOST_STD, PlanarEkf, PlanarRobust
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
-from tests.helpers.barrier_robots import barrier_robots, carried_off
+from tests.helpers.mrclam_files import barrier_robots, carried_off
 
 CHANGES: dict[str, Callable[[Dataset, int], Dataset]] = {
     "8.3 Hz, turns .7, hidden": lambda d, s: changed(d, s, odometry(1 / 0.7, rate=8.3), hidden((5, 40), (5, 23))),

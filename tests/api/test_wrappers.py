@@ -1,4 +1,4 @@
-"""The wrappers and checks that users bring along work unchanged on every face."""
+"""The wrappers and checks that users bring along work unchanged on every face; infos that are numbers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrappers
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from pettingzoo.test import parallel_api_test
 from pettingzoo.utils.wrappers import RecordVideoParallel
 
 import coopenv
+from coopenv.api.parallel_env import NUMBERS, PlainInfos
 from coopenv.api.vector_env import RecordVehicleEpisodes, TrueEnds
-from tests.helpers.episodes import first_episodes
+from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 CROSSING = "coopenv/UrbanCrossing-v0"
@@ -28,8 +30,8 @@ def batch(**options: Any) -> coopenv.CooperativeVectorEnv:
 
 
 def wide_turns(env: gymnasium.vector.VectorEnv) -> np.ndarray:
-    """Return actions under which vehicles hit walls, each at a time of its own."""
-    return np.column_stack([np.ones(env.num_envs), np.linspace(0.2, 0.5, env.num_envs)]).astype(np.float32)
+    """Return actions under which vehicles hit walls, each at a time of its own, or come to the horizon."""
+    return np.column_stack([np.ones(env.num_envs), np.linspace(0.0, 0.5, env.num_envs)]).astype(np.float32)
 
 
 # Gymnasium, one vehicle
@@ -78,21 +80,6 @@ def test_a_generator_for_wrappers_follows_the_seed() -> None:
     assert env.np_random.random() != first
     env.reset(seed=3)
     assert env.np_random.random() == first
-
-
-@pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
-def test_record_video_of_all_vehicles(tmp_path: Path) -> None:
-    pytest.importorskip("moviepy", reason="RecordVideoParallel needs the extra 'video'")
-    env = RecordVideoParallel(
-        coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array", overrides={"horizon": 0.5}), str(tmp_path)
-    )
-    env.reset(seed=0)
-    while env.agents:
-        env.step({agent: np.zeros(2, dtype=np.float32) for agent in env.agents})
-    env.close()
-    (video,) = tmp_path.iterdir()
-    assert video.name == "rl-video-episode-0.mp4"
-    assert video.stat().st_size > 1000
 
 
 def test_aec_goes_through_the_same_states_as_the_parallel_face() -> None:
@@ -159,20 +146,27 @@ def test_partial_reset_under_statistics() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
-@pytest.mark.parametrize("vehicles", ["one", "a batch"])
+@pytest.mark.parametrize("vehicles", ["one", "all", "a batch"])
 def test_record_video(vehicles: str, tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="RecordVideo needs the extra 'video'")
     if vehicles == "one":
         env: Any = RecordVideo(gymnasium.make(CROSSING, render_mode="rgb_array"), str(tmp_path), video_length=3)
+    elif vehicles == "all":
+        short = coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array", overrides={"horizon": 0.3})
+        env = RecordVideoParallel(short, str(tmp_path))
     elif hasattr(wrappers, "RecordVideo"):
         env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)
     else:
         pytest.skip("this Gymnasium records no batches")
     env.reset(seed=0)
     for _ in range(4):
-        env.step(env.action_space.sample())
+        if vehicles != "all":
+            env.step(env.action_space.sample())
+        elif env.agents:
+            env.step({agent: env.action_space(agent).sample() for agent in env.agents})
     env.close()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+    (video,) = tmp_path.iterdir()
+    assert video.suffix == ".mp4" and video.stat().st_size > 1000
 
 
 # Statistics of vehicles' episodes
@@ -182,22 +176,17 @@ DECISIONS = 60
 OPTIONS = {"num_worlds": 6, "overrides": {"horizon": DECISIONS / 10}}
 
 
-def actions_of(env: coopenv.CooperativeVectorEnv) -> np.ndarray:
-    """Return wide turns, which end against a wall or at the horizon."""
-    return np.column_stack([np.ones(env.num_envs), np.linspace(0.0, 0.5, env.num_envs)]).astype(np.float32)
-
-
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
 def test_true_episodes_only(autoreset: str) -> None:
     plain = coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS)
-    returned, length, _ = first_episodes(plain, 5, DECISIONS, lambda observation: actions_of(plain))
+    returned, length, _ = first_episodes(plain, 5, DECISIONS, lambda observation: wide_turns(plain))
     assert length.min() < DECISIONS and length.max() == DECISIONS
     env = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset=autoreset, **OPTIONS), buffer_length=1000)
     env.reset(seed=5)
     weights = env.unwrapped.scenario.reward.by_name
     first_return, first_length = np.full(env.num_envs, np.nan), np.zeros(env.num_envs)
     for _ in range(2 * DECISIONS + 2):
-        _, _, terminated, truncated, infos = env.step(actions_of(env.unwrapped))
+        _, _, terminated, truncated, infos = env.step(wide_turns(env.unwrapped))
         if "episode" in infos:
             of, told = infos["_episode"], infos["episode"]
             fresh = of & np.isnan(first_return)
@@ -222,7 +211,7 @@ def test_statistics_of_gymnasium_are_true_over_true_ends(autoreset: str) -> None
     env = RecordEpisodeStatistics(TrueEnds(own), buffer_length=1000, stats_key="gymnasium")
     env.reset(seed=5)
     for _ in range(2 * DECISIONS + 2):
-        _, _, terminated, truncated, infos = env.step(actions_of(env.unwrapped))
+        _, _, terminated, truncated, infos = env.step(wide_turns(env.unwrapped))
         if "final_obs" in infos:
             assert np.array_equal(infos["_final_obs"], terminated | truncated)
     assert env.episode_count == own.episode_count >= 2 * env.num_envs
@@ -244,3 +233,65 @@ def test_tensors_are_refused() -> None:
     pytest.importorskip("torch", reason="needs the extra 'train'")
     with pytest.raises(coopenv.CoopenvError, match=r"needs NumPy arrays: make_vec\(arrays='numpy'\)"):
         RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, arrays="torch", **OPTIONS))
+
+
+def test_infos_are_numbers_and_hold_no_truth() -> None:
+    env, full = PlainInfos(coopenv.parallel_env(FOUR_WAY)), coopenv.parallel_env(FOUR_WAY)
+    observations, infos = env.reset(seed=3)
+    expected, complete = full.reset(seed=3)
+    for _ in range(20):
+        assert set(infos) == set(env.agents)
+        for agent, info in infos.items():
+            assert tuple(info) == NUMBERS
+            assert all(type(value) is float for value in info.values())
+            assert info["nees"] == complete[agent]["nees"]
+            assert np.array_equal(observations[agent], expected[agent])
+        actions = {agent: np.full(2, 0.1, dtype=np.float32) for agent in env.agents}
+        observations, _, _, _, infos = env.step(actions)
+        expected, _, _, _, complete = full.step(actions)
+
+
+def test_events_show_once_and_actions_of_the_dead_are_dropped() -> None:
+    env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
+    env.reset(seed=0)
+    turns = {agent: np.array([1.0, 0.2 + 0.1 * i], dtype=np.float32) for i, agent in enumerate(env.possible_agents)}
+    collided = dict.fromkeys(env.possible_agents, 0.0)
+    while env.agents:
+        _, _, terminated, _, infos = env.step(turns)  # for all, the dead included
+        for agent, info in infos.items():
+            assert (info["arrived"] + info["collided"] == 1.0) == terminated[agent]
+            collided[agent] += info["collided"]
+    assert set(collided.values()) == {1.0}
+
+
+def absent_at(env: PlainInfos) -> int:
+    """Return a seed at which the first vehicle is absent."""
+    for seed in range(100):
+        env.reset(seed=seed)
+        if "vehicle_1" not in env.agents:
+            return seed
+    raise AssertionError("the first vehicle is never absent")
+
+
+@pytest.mark.parametrize("observation", ["flat", "dict"])
+def test_a_reset_has_absent_vehicles_on_request(observation: str) -> None:
+    plain, full = (
+        PlainInfos(coopenv.parallel_env("urban_crossing", observation=observation), with_absent=with_absent)
+        for with_absent in (False, True)
+    )
+    seed = absent_at(plain)
+    expected, (observations, infos) = plain.reset(seed=seed), full.reset(seed=seed)
+    assert set(observations) == set(infos) == set(full.possible_agents)
+    assert full.agents == plain.agents and set(expected[0]) == set(plain.agents)
+    np.testing.assert_equal({agent: observations[agent] for agent in plain.agents}, expected[0])
+    assert full.observation_space("vehicle_1").contains(observations["vehicle_1"])
+    assert tuple(infos["vehicle_1"]) == NUMBERS and not any(infos["vehicle_1"].values())
+
+
+def test_conforms() -> None:
+    env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
+    parallel_api_test(env, num_cycles=100)
+    env.reset(seed=0)
+    assert env.state_space.contains(env.state())
+    with pytest.raises(coopenv.ActionError, match="no action for 'vehicle_1'"):
+        env.step({})

@@ -218,27 +218,3 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "MRCLAM_Dataset6" / "Robot5_Measurement.dat").write_text("")
     assert main(["record", "mrclam_6", *data, "--force", "--out", str(path)]) == 0
     assert capsys.readouterr().err == "warning: mrclam_6: no detections of robot 5\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (["mrclam_6", "--seed", "2"], "--seed: is for a simulation, mrclam_6 is recorded"),
-        (["mrclam_12", "--data", "."], "unknown data set 'mrclam_12' (did you mean"),
-        (["mrclam_6", "--variant", "blnd", "--data", "."], "did you mean 'blind'"),
-        (["busy_intersection", "--variant", "blind"], "--variant blind: is for recorded data"),
-        (["busy_intersection", "--data", "."], "--data .: is for recorded data"),
-        (["busy_intersectoin"], "did you mean 'busy_intersection'"),
-        (["busy_intersection", "--out", "drive.bag"], "the name must end in .mcap"),
-        (["busy_intersection", "--out", "none/drive.mcap"], "folder none does not exist"),
-    ],
-)
-def test_command_mistakes(
-    arguments: list[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    out = [] if "--out" in arguments else ["--out", "drive.mcap"]
-    assert main(["record", *arguments, *out]) == 2
-    error = capsys.readouterr().err
-    assert why in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())

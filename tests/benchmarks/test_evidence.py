@@ -1,16 +1,27 @@
-"""Changed recordings, as `python -m benchmarks.evidence` makes them."""
+"""Programs behind the evidence: changed recordings, trained adversaries, lying senders, receipt and theory."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
-from benchmarks import evidence
+from benchmarks import adversary, evidence, linear_case, linearisation, receipt
+from benchmarks.planar.__main__ import main
+from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
+from benchmarks.planar.lies import Drifting, Replaying
+from coopenv.backends.mrclam import recording_of
+from coopenv.bench.observers.faults import variant_of
+from coopenv.observers import run
+from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
+from tests.helpers.mrclam_files import barrier_robots
 
 
 @pytest.fixture(scope="module")
@@ -18,12 +29,12 @@ def recording() -> Recording:
     return record(load_scenario(evidence.BASE, {"horizon": 14.0}), 0)
 
 
-def changed(recording: Recording, change: evidence.Change) -> Recording:
+def changed_by(recording: Recording, change: evidence.Change) -> Recording:
     return change(recording, np.random.default_rng(0))
 
 
 def test_a_landmark_is_moved_in_the_map_alone(recording: Recording) -> None:
-    moved = changed(recording, evidence.landmark_moved(0.3))
+    moved = changed_by(recording, evidence.landmark_moved(0.3))
     assert moved.interference is not None
     for vehicle, k in ((0, 0), (4, recording.ticks - 1)):
         error = moved.interference.map_error_of(vehicle, k)
@@ -33,19 +44,19 @@ def test_a_landmark_is_moved_in_the_map_alone(recording: Recording) -> None:
 
 def test_odometry_has_a_bias_from_its_step_on(recording: Recording) -> None:
     late = recording.t > evidence.STEP_AT
-    difference = changed(recording, evidence.bias_step(0.01)).angular_velocity - recording.angular_velocity
+    difference = changed_by(recording, evidence.bias_step(0.01)).angular_velocity - recording.angular_velocity
     np.testing.assert_allclose(difference[late, :, 2], 0.01)
     assert not difference[~late].any()
 
 
 def test_the_scale_error_grows(recording: Recording) -> None:
-    velocity = changed(recording, evidence.scale_drift(0.1)).velocity
+    velocity = changed_by(recording, evidence.scale_drift(0.1)).velocity
     np.testing.assert_allclose(velocity[-1], 1.1 * recording.velocity[-1])
     np.testing.assert_allclose(velocity[0], recording.velocity[0])
 
 
 def test_a_share_of_the_bearings_is_random(recording: Recording) -> None:
-    bearings = changed(recording, evidence.random_bearings(0.1)).bearings
+    bearings = changed_by(recording, evidence.random_bearings(0.1)).bearings
     wrong = (bearings != recording.bearings).any(axis=-1)[recording.visible]
     assert wrong.mean() == pytest.approx(0.1, abs=0.02)
     np.testing.assert_allclose(np.linalg.norm(bearings[recording.visible], axis=-1), 1.0)
@@ -66,3 +77,202 @@ def test_a_page_without_marks_is_left_as_it_is(
     page.write_text("A <!-- scenes: begin --> old <!-- scenes: end --> page.\n")
     assert evidence.main(["scenes", "--page", str(page)]) == 0
     assert "| a |" in page.read_text() and "old" not in page.read_text()
+
+
+HORIZON = 8.0
+
+
+def test_the_cross_entropy_method_finds_a_maximum() -> None:
+    best = np.array([1.0, -2.0, 0.5])
+    found = adversary.cross_entropy(
+        lambda candidates, generation: -np.square(candidates - best).sum(axis=1), np.zeros(3), np.ones(3), 30, 24
+    )
+    assert_allclose(found, best, atol=0.05)
+
+
+def test_a_steering_begins_in_time_and_keeps_the_limit() -> None:
+    parameters = adversary.constant(np.array([2.0, 2.0]), np.array([0.1, 0.9]), np.array([0.0, np.pi / 2]))
+    steering, features = adversary.linear(parameters, 0.3), np.ones((2, 10))
+    assert not steering(1.0, features).any()
+    assert_allclose(steering(2.0, features), [[0.1, 0.0], [0.0, 0.3]], atol=1e-12)
+
+
+@pytest.mark.parametrize("odometry", adversary.ODOMETRY)
+def test_an_attack_of_the_worlds_is_replayed_on_a_recording(odometry: str) -> None:
+    """Steps of the velocity in the kernels are sums of drifts on the host."""
+    seeds, drawn = [3, 4], np.random.default_rng(5).normal(scale=0.3, size=(3, 2, 2))
+    worlds = adversary.Worlds(2, "riccati", odometry, {"horizon": HORIZON})
+    rollouts = worlds.play(seeds, lambda time, features: drawn[int(time)])
+    assert_allclose(rollouts.velocity, drawn.swapaxes(0, 1))
+    assert np.isnan(rollouts.error[:, adversary.LIAR]).all()
+    for world, seed in enumerate(seeds):
+        recording = record(load_scenario(adversary.SCENE, {"horizon": HORIZON}), seed)
+        fault = adversary.fault_of(rollouts.velocity[world], odometry)
+        changed = variant_of(fault).applied(recording, 0)
+        assert changed.interference is not None
+        assert_allclose(changed.interference.shift[-1, adversary.LIAR, :2], drawn[:, world].sum(axis=0), atol=1e-3)
+        found = run("riccati", changed)
+        decisions = found.position_error[306::6]  # 10 Hz at 60 ticks per second, after `START`
+        assert_allclose(np.delete(decisions.mean(axis=0), 1), np.delete(rollouts.error[world], 1), rtol=1e-3)
+
+
+def test_the_table_and_the_worst_case(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(adversary, "OBSERVERS", ("riccati",))
+    sizes = ["--generations", "1", "--population", "2", "--seeds", "1", "--held-out", "2"]
+    assert adversary.main(["--horizon", "7", *sizes]) == 0
+    printed = capsys.readouterr().out
+    rows = [line for line in printed.splitlines() if line.startswith("|")]
+    assert len(rows) == 2 + 1 + 2 * 4 and rows[2].startswith("| none |")
+    fault = printed.rpartition("--fault ")[2].split()[0]
+    assert all(part.vehicles == ("vehicle_2",) for part in variant_of(fault).faults)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return barrier_robots(3, 30.0, 0.8)
+
+
+def test_a_part_drives_as_the_whole(data):
+    whole, cut = recording_of(data, "landmarks"), recording_of(part(data, 10.0, 15.0), "landmarks")
+    k = round(10.0 / whole.dt)
+    n = len(cut.t) - 2
+    np.testing.assert_allclose(cut.truth.position[1:n], whole.truth.position[k + 1 : k + n], atol=1e-3)
+    np.testing.assert_allclose(cut.translation[2:n], whole.translation[k + 2 : k + n], atol=1e-6)
+    assert cut.visible[: n - 1].sum() == pytest.approx(whole.visible[k : k + n - 1].sum(), abs=10)
+
+
+def test_odometry_is_told_otherwise(data):
+    robot = data.robots[0]
+    told = changed(data, 0, odometry(turns=1.5, speed=1.1)).robots[0].odometry
+    np.testing.assert_allclose(told, robot.odometry * (1.0, 1.1, 1.5))
+    assert len(changed(data, 0, odometry(rate=4.0)).robots[0].odometry) == pytest.approx(120, abs=3)
+    assert (changed(data, 0, drifting(0.01)).robots[0].odometry[:, 2] > robot.odometry[:, 2]).all()
+
+
+def test_sightings_are_hidden_misread_and_late(data):
+    gap = [changed(data, 0, hidden((1, 2), (5, 6))).robots[n].detections for n in range(5)]
+    for before, after in zip(data.robots, gap, strict=True):
+        landmarks = after[after[:, 1] > 5]
+        assert (after[:, 1] <= 5).sum() == (before.detections[:, 1] <= 5).sum()
+        assert np.diff(np.r_[0.0, np.unique(landmarks[:, 0]), 30.0]).max() > 4.9
+    wrong = changed(data, 0, misread(0.3)).robots[0].detections
+    assert 0.15 < (wrong[:, 1] != data.robots[0].detections[:, 1]).mean() < 0.4
+    np.testing.assert_allclose(
+        changed(data, 0, clocks(0.1)).robots[0].detections[:, 0], data.robots[0].detections[:, 0] + 0.1
+    )
+    blind = blindfolded(data, 2)
+    assert (blind.robots[1].detections[:, 1] <= 5).all() and blind.robots[0] is data.robots[0]
+
+
+class Speaker:
+    def tampered(self, made, honest):
+        return made
+
+
+def test_messages_of_lying_senders():
+    honest = Message(position=np.zeros(3), covariance=np.eye(3))
+    liar = Drifting([1], jump=1.0, drift=0.5, since=10.0)
+    assert not liar.applies(0, 20.0) and not liar.applies(1, 9.0) and liar.applies(1, 12.0)
+    assert np.linalg.norm(liar.broadcast(Speaker(), honest).position) == pytest.approx(2.0)
+    assert liar.broadcast(Speaker(), Message()).position is None
+    echo = Replaying([1], 3)
+    sent = [
+        echo.broadcast(Speaker(), replace(honest, position=np.full(3, k))).position[0]
+        for k in range(6)
+        if echo.applies(1, 20)
+    ]
+    assert sent == [0, 0, 0, 0, 1, 2]
+
+
+def test_the_command_prints_a_row_per_lie_and_one_line_about_a_mistake(capsys, tmp_path):
+    assert main(["lies", "--seeds", "1", "--seconds", "20", "--only", "all see"]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert len(rows) == 4 and all(row.startswith("seed 1, all see landmarks, 1 lies, ") for row in rows)
+    assert main(["changed", "--data", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_what_is_left_out_is_part_of_the_observer() -> None:
+    found = receipt.parts()
+    assert not found["nothing"] and len(found) > 10
+    assert all(hasattr(module, name) for changes in found.values() for module, name, _ in changes)
+    assert {name for changes in found.values() for _, name, _ in changes if name.isupper()} <= {*receipt.numbers()}
+
+
+class Source(dict[str, np.ndarray]):
+    """Records of two sources."""
+
+    def __len__(self) -> int:
+        return 2
+
+
+def test_exclusions_are_noted_with_their_time_and_target() -> None:
+    source = Source(exclusions=np.zeros(2, int), target=np.array([-1, 7]))
+
+    def update(tick: SimpleNamespace) -> float:
+        source["exclusions"][1] = tick.time >= 2.0
+        return float(tick.time)
+
+    setup = SimpleNamespace(targets=np.array([3, 7]))
+    watched = receipt.Watched(SimpleNamespace(memory=SimpleNamespace(source=source), setup=setup, update=update))
+    assert [watched.update(SimpleNamespace(time=t)) for t in (1.0, 2.0, 3.0)] == [1.0, 2.0, 3.0]
+    assert watched.times == [(2.0, 7)] and watched.sees(7) and not watched.sees(4)
+
+
+def test_unknown_constants_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert receipt.main(["--constants", "FAULT_GAT"]) == 2
+    error = capsys.readouterr().err
+    assert "FAULT_GAT" in error and "FAULT_GATE" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "ratio"),
+    [
+        ("one sender, every report fused", 1.0),
+        ("one sender, every twelfth, exact odometry", 1.0),
+        ("common ancestor, correlation known", 1.0),
+        ("common ancestor, correlation missing", (0.65 + 0.5) / 0.65),
+        ("two common ancestors, product of one", 0.6 / (0.35 + 0.125)),
+        ("four newcomers, common ancestor", (4.0 + 0.3) / 1.3),
+        ("sixteen newcomers, common ancestor", (16.0 + 0.3) / 1.3),
+    ],
+)
+def test_ratios_are_those_of_closed_forms(name: str, ratio: float) -> None:
+    own, largest = linear_case.EXAMPLES[name]().ratios()
+    assert own == pytest.approx(ratio, rel=1e-5) and largest >= own * (1.0 - 1e-9)
+
+
+def test_the_statistic_is_a_chi_square_without_senders_errors_and_smaller_with_them() -> None:
+    assert_allclose(linear_case.monitor(30, 1e-12), 1.0, atol=1e-6)
+    assert linear_case.monitor(1, 1.0)[1] == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_derivative_of_a_bearing_is_that_of_its_prediction() -> None:
+    random = np.random.default_rng(0)
+    own, leader = random.normal(size=(2, 5, 3))
+    leader[:, 1] += 6.0
+    _, H, _ = linearisation.bearing(own, leader)
+    for k in range(6):
+        error = np.zeros((5, 6))
+        error[:, k] = 1e-6
+        ends = [
+            linearisation.bearing(
+                linearisation.moved(own, s * error[:, :3]), linearisation.moved(leader, s * error[:, 3:])
+            )
+            for s in (1.0, -1.0)
+        ]
+        assert_allclose(linearisation.wrapped(ends[0][0] - ends[1][0]) / 2e-6, H[:, k], atol=1e-8)
+
+
+def test_the_constrained_point_has_the_least_bias_in_a_lane_and_the_variance_reduces_it() -> None:
+    bias = {
+        (point, variance): linearisation.simulate("lane", point, 40, 5.0, variance)[-1].bias
+        for point, variance in (("prediction", False), ("prediction", True), ("constrained", False))
+    }
+    assert abs(bias["constrained", False]) < 0.01 < bias["prediction", True] < 0.5 * bias["prediction", False]
+
+
+def test_an_odd_number_of_seeds_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert linearisation.main(["--seeds", "3"]) == 2 and "even number of seeds" in capsys.readouterr().err
+    assert linear_case.main([]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80

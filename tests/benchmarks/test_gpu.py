@@ -1,21 +1,27 @@
-"""`make gpu` keeps what it has, leaves out what does not fit, and runs whole on a CPU."""
+"""`make gpu` and `python -m benchmarks.stages`: what they keep, leave out and compare."""
 
 from __future__ import annotations
 
 import copy
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from benchmarks import view
 from benchmarks.gpu import work
 from benchmarks.gpu.__main__ import PAGE, main
 from benchmarks.gpu.plan import ENVIRONMENT, LEARNING, OBSERVERS, SIZES, Stage, plan
 from benchmarks.gpu.prepare import requirements
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import BEGIN, END, put, section
+from benchmarks.stages.__main__ import main as stages_main
+from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_settings
+from benchmarks.stages.against import HERE
+from benchmarks.stages.rounds import alternate
 from coopenv.base.errors import CoopenvError
 
 HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
@@ -97,16 +103,12 @@ def test_the_table_stands_between_the_marks(tmp_path: Path) -> None:
     assert page.read_text() == text
     with pytest.raises(CoopenvError, match="of a CPU"):
         put({**document, "device": "cpu"}, page)
+    page.write_text(PAGE.read_text(encoding="utf-8"))  # has a place for it
+    put(document, page)
+    assert section(document) in page.read_text()
     page.write_text("no marks")
     with pytest.raises(CoopenvError, match="needs one line"):
         put(document, page)
-
-
-def test_the_page_has_a_place_for_the_table(tmp_path: Path) -> None:
-    page = tmp_path / "benchmarks.md"
-    page.write_text(PAGE.read_text(encoding="utf-8"))
-    put(document_of_a_gpu(), page)
-    assert section(document_of_a_gpu()) in page.read_text()
 
 
 def test_bad_worlds_and_failed_tests_are_failures() -> None:
@@ -147,3 +149,76 @@ def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert results["throughput, riccati, 64"]["env_steps_per_s"] > 0.0
     assert results["tests"]["failed"] == 0 < results["tests"]["passed"]
     assert "| riccati | 64 |" in capsys.readouterr().out
+
+
+def test_rounds_alternate() -> None:
+    told: list[str] = []
+
+    def step(name: str) -> float:
+        told.append(name)
+        return float(len(told))
+
+    times = alternate([partial(step, "a"), partial(step, "b")], 3)
+    assert told == ["a", "b"] * 3 and times.tolist() == [[1, 2], [3, 4], [5, 6]]
+
+
+def test_each_stage_is_switched_off_on_top_of_those_before() -> None:
+    settings = list(ablated_settings())
+    assert [name for name, _ in settings] == [name for name, _ in STAGES]
+    last = settings[-1][1]
+    assert not (last.visibility or last.sending or last.gramian) and last.overrides == {"noise.enabled": False}
+
+
+def test_what_is_switched_off_does_not_happen() -> None:
+    sensed = {"topology.mode": "sensed", "horizon": 1.0}
+    whole = Setting().world("overtaking", sensed, 2, "float32")
+    silent = Setting(visibility=False, sending=False, gramian=False).world("overtaking", sensed, 2, "float32")
+    for world in (whole, silent):
+        world.advance(6)
+    assert silent.model.radio.period == NEVER
+    assert (whole.view("inbox_tick") >= 0).any() and not (silent.view("inbox_tick") > 0).any()
+    targets = whole.view("sight")[0] != 0
+    assert (silent.view("sight")[0][targets] == silent.view("sight")[0][targets][0]).all()
+    assert (whole.view("sight") != silent.view("sight")).any()
+    assert whole.view("gramian_time").any() and not silent.view("gramian_time").any()
+
+
+def test_a_folder_without_coopenv(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert stages_main(["--against", str(tmp_path), "--worlds", "1"]) == 2
+    assert "no checkout of coopenv" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_whole_command(capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--worlds", "2", "--rounds", "2", "--decisions", "1"]
+    assert stages_main(few) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name, _ in STAGES) and "urban_crossing, robust" in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert stages_main([*few, "--against", str(HERE), "--compiles", "0"]) == 0
+    assert "this / other" in capsys.readouterr().out
+
+
+# The live view
+
+
+def test_simulating_is_a_part_of_what_is_measured(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    monkeypatch.setattr(view, "WARM_UP", 0.3)
+    assert view.main(["busy_intersection", "--seconds", "1.5"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("busy_intersection")]
+    assert [row[1] for row in rows] == ["no", "yes"]
+    for row in rows:
+        frames, cpu, scaled, without = (float(entry.rstrip("%")) for entry in row[2:])
+        assert frames > 0.0
+        assert cpu > 0.0
+        assert 0.0 < without < scaled
+
+
+def test_an_unknown_environment_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert view.main(["nosuch"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: unknown environment 'nosuch'; known: ")
+    assert error.count("\n") == 1

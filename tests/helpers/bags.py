@@ -17,6 +17,7 @@ from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA
+from tests.oracles.continuous import left_jacobian
 
 BEGIN = 1_700_000_000_000_000_000  # ns
 DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
@@ -129,14 +130,8 @@ def blocks(
 def twist(r: Recording, k: int, i: int) -> dict[str, Any]:
     """Return the twist that leads to a tick when it is held since the last one; its rotation is small or none."""
     turn = log_so3(r.rotation[k, i])
-    linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, i])
+    linear = np.linalg.solve(left_jacobian(turn), r.translation[k, i])
     return {"twist": (linear / r.dt, turn / r.dt), "covariance": np.diag([0.1] * 6)}
-
-
-def _left_jacobian(turn: np.ndarray) -> np.ndarray:
-    x, y, z = turn
-    W = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + W / 2 + W @ W / 6 + W @ W @ W / 24
 
 
 def later(given: Iterable[Message], *, stamps: float = 0.0, received: float = 0.0, topics: str = "") -> list[Message]:

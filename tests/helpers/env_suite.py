@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -179,3 +179,26 @@ def reset_without_seed_draws_anew(make: Make) -> None:
         steps = [env.step({agent: np.zeros(2) for agent in env.agents}) for _ in range(3)]
         runs.append([info["estimate"]["position"] for info in steps[-1][-1].values()])
     assert not np.allclose(runs[0], runs[1], atol=1e-12)
+
+
+def first_episodes(
+    env: coopenv.CooperativeVectorEnv, seed: int, decisions: int, policy: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return return, decisions and outcome of every vehicle's first episode; `env` is not reset automatically."""
+    observation, _ = env.reset(seed=seed)
+    returned, length, under_way = np.zeros(env.num_envs), np.zeros(env.num_envs), np.ones(env.num_envs, bool)
+    for _ in range(decisions):
+        observation, reward, terminated, truncated, infos = env.step(policy(observation))
+        returned += np.where(under_way, reward, 0.0)
+        length += under_way
+        under_way &= ~(terminated | truncated)
+    return returned, length, infos["ended"]
+
+
+LARGEST = ("large_crossing", "urban_crossing")
+"""Environments whose figures take longest; the quick tests do without them where others ask the same."""
+
+
+def largest_slow(environments: Iterable[str]) -> list[Any]:
+    """Return environments as parameters, the largest ones marked slow."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in LARGEST else name for name in environments]

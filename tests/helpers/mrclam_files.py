@@ -1,11 +1,17 @@
-"""Small recordings in MR.CLAM's format, whose truth is known: five robots on circles, in sight of landmarks."""
+"""Synthetic recordings of the shape of MR.CLAM's: files, and drives with barriers that hide landmarks."""
 
 from __future__ import annotations
 
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
+from coopenv.backends.mrclam import Dataset, recording_of
+from coopenv.backends.mrclam.dataset import MotionCapture, Robot
+from coopenv.observers.recording import PER_TICK, Recording
 
 ORIGIN = 1248444187.0
 LANDMARKS = {6: (0.0, 4.0), 7: (4.0, 0.0), 8: (-4.0, 0.0), 9: (0.0, -4.0), 10: (3.0, 3.0)}
@@ -76,3 +82,120 @@ def real_folder() -> Path | None:
     candidates = [Path(named)] if named else []
     candidates += [above / "shared" / "data" for above in Path(__file__).resolve().parents]
     return next((c for c in candidates if (c / "MRCLAM_Dataset6" / "Barcodes.dat").is_file()), None)
+
+
+DT = 0.025
+LOW, HIGH = np.array([-1.0, -5.5]), np.array([5.0, 5.5])
+HALL_LANDMARKS = (
+    *((0.0, -5.0), (2.0, -4.6), (4.2, -5.0), (4.6, -3.0), (2.6, -2.2), (-0.6, -2.4), (0.9, -0.9), (3.4, -0.4)),
+    *((4.7, 1.0), (-0.7, 1.1), (1.8, 1.6), (4.0, 3.2), (0.1, 3.4), (2.2, 4.6), (4.5, 5.0)),
+)
+REACH_M, HALF_VIEW = 5.0, 0.55  # m, rad
+MISREAD = 0.004  # share of barcodes
+
+
+def barrier_robots(seed: int, seconds: float = 150.0, turn_scale: float = 0.6, barriers: int = 3) -> Dataset:
+    """Return a sub-dataset in which robots turn `turn_scale` times what they were told."""
+    rng = np.random.default_rng([9, seed])
+    centre, angle = rng.uniform(LOW + 1, HIGH - 1, (barriers, 2)), rng.uniform(0, np.pi, barriers)
+    half = rng.uniform(0.8, 1.6, barriers)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    walls = list(zip(centre - half, centre + half, strict=True))
+    driven = [_drive(rng, seconds, turn_scale) for _ in range(5)]
+    poses = np.array([pose for pose, _ in driven])
+    robots = tuple(_robot(rng, n, poses, driven[n][1], walls) for n in range(5))
+    return Dataset("mrclam_9", seconds - 0.5, {6 + n: np.array(p) for n, p in enumerate(HALL_LANDMARKS)}, robots)
+
+
+def _drive(rng: np.random.Generator, seconds: float, turn_scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses (K, 3) every DT and the log (n, 3) of commands at 8 Hz."""
+    steps = int(seconds / DT)
+    pose, told = np.zeros((steps, 3)), np.zeros((steps, 2))
+    x = np.array([*rng.uniform(LOW + 1, HIGH - 1), rng.uniform(-3, 3)])
+    scale, done, until, command, waiting = turn_scale * rng.normal(1, 0.05), np.zeros(2), 0.0, np.zeros(2), []
+    wanted = np.zeros(2)
+    for k in range(steps):
+        t = k * DT
+        if t >= until:
+            command, until = _command(rng, x, t, scale)
+            came = command * (0.95 * rng.normal(1, 0.03), scale * rng.normal(1, 0.06))
+            waiting.append((t + max(0.2 + 0.08 * rng.standard_normal(), DT), came))
+        while waiting and t >= waiting[0][0]:
+            wanted = waiting.pop(0)[1]
+        done = done + (wanted - done) * (DT / 0.12)
+        pose[k], told[k] = x, command
+        x = x + DT * np.array([done[0] * math.cos(x[2]), done[0] * math.sin(x[2]), done[1]])
+    logged = np.unique(np.clip(((np.arange(0, seconds, 1 / 8) + rng.uniform(-0.02, 0.02)) / DT).astype(int), 0, None))
+    return pose, np.column_stack([logged * DT, told[logged]])
+
+
+def _command(rng: np.random.Generator, x: np.ndarray, t: float, scale: float) -> tuple[np.ndarray, float]:
+    """Return what a robot is told next, m/s and rad/s, and until when."""
+    inside = (LOW + HIGH) / 2 - x[:2]
+    off = (math.atan2(inside[1], inside[0]) - x[2] + math.pi) % (2 * math.pi) - math.pi
+    outside = bool((x[:2] < LOW + 0.7).any() or (x[:2] > HIGH - 0.7).any())
+    kind = rng.random()
+    if outside and abs(off) > 0.6:
+        w = math.copysign(rng.uniform(0.3, 0.9), off)
+        return np.array([0.0, w]), t + min(abs(off / w) / scale, 8.0)
+    if outside or kind < 0.45:
+        return np.array([rng.uniform(0.08, 0.25), 0.0]), t + rng.uniform(2, 8)
+    w = rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.9)
+    if kind < 0.75:
+        return np.array([rng.uniform(0.08, 0.25), w]), t + rng.uniform(1, 5)
+    return np.array([0.0, w * (kind < 0.9)]), t + rng.uniform(0.5, 3)
+
+
+def _robot(
+    rng: np.random.Generator,
+    n: int,
+    poses: np.ndarray,
+    odometry: np.ndarray,
+    walls: list[tuple[np.ndarray, np.ndarray]],
+) -> Robot:
+    """Return what robot n logged; poses are (5, K, 3)."""
+    bias, seen = 0.008 * rng.standard_normal(), []
+    frames = np.cumsum(rng.uniform(0.25, 0.6, 4 * poses.shape[1]))
+    for k in (frames[frames < DT * (poses.shape[1] - 1)] / DT).astype(int):
+        x, y, heading = poses[n, k]
+        points = [*poses[:, k, :2], *np.array(HALL_LANDMARKS)]
+        for subject, point in enumerate(points, 1):
+            dx, dy = point - (x, y)
+            bearing = (math.atan2(dy, dx) - heading + math.pi) % (2 * math.pi) - math.pi
+            near = 0.3 < math.hypot(dx, dy) < REACH_M and abs(bearing) < HALF_VIEW and subject != n + 1
+            if near and rng.random() < 0.6 and not any(_crosses(poses[n, k, :2], point, *wall) for wall in walls):
+                who = subject if rng.random() > MISREAD else int(rng.integers(6, 21))
+                seen.append((k * DT, who, math.hypot(dx, dy), bearing + bias + 0.013 * rng.standard_normal()))
+    t = np.asarray(DT * np.arange(poses.shape[1]), dtype=np.float64)
+    truth = MotionCapture(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
+    return Robot(n + 1, odometry, np.array(seen).reshape(-1, 4), truth, 0)
+
+
+def _crosses(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether the line from p to q meets the one from a to b."""
+    u, v = q - p, b - a
+    det = u[0] * v[1] - u[1] * v[0]
+    if abs(det) < 1e-9:
+        return False
+    s = ((a - p)[0] * v[1] - (a - p)[1] * v[0]) / det
+    r = ((a - p)[0] * u[1] - (a - p)[1] * u[0]) / det
+    return bool(0 < s < 1 and 0 < r < 1)
+
+
+def carried_off(seed: int, robot: int, at: float, seconds: float = 150.0) -> Recording:
+    """Return a record without sightings of robots in which one is carried, unfelt, to another place at a time in s.
+
+    From then on it is the robot of another record, whose odometry and bearings it has.
+    """
+    before, after = (recording_of(barrier_robots(s, seconds), "landmarks") for s in (seed, seed + 1000))
+    k = round(at / before.dt)
+    changed = {name: getattr(before, name).copy() for name in (*PER_TICK,)}
+    for name in ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible"):
+        changed[name][k:, robot] = getattr(after, name)[k:, robot]
+    truth = replace(before.truth, rotation=before.truth.rotation.copy(), position=before.truth.position.copy())
+    truth.rotation[k:, robot], truth.position[k:, robot] = (
+        after.truth.rotation[k:, robot],
+        after.truth.position[k:, robot],
+    )
+    for array in changed.values():
+        array.setflags(write=False)
+    return replace(before, **changed, truth=truth)

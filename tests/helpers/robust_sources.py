@@ -19,8 +19,7 @@ from coopenv.observers.robust.messages import from_six
 from coopenv.observers.robust.sources import NO_TARGET, ODOMETRY
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from tests.helpers.robust_observers import OpenRobust
-from tests.helpers.robust_ticks import Pose
+from tests.helpers.robust_ticks import OpenRobust, Pose
 
 SEEN = (
     ("SL1", "SL2", "SL3"),

@@ -21,21 +21,13 @@ Array = NDArray[np.float64]
 
 def skew(x: ArrayLike) -> Array:
     """Return S(x) of vectors (..., 3), with S(x) y = x cross y."""
-    x = np.asarray(x, float)
-    S = np.zeros((*x.shape, 3))
-    S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = x[..., 0], x[..., 1], x[..., 2]
-    S[..., 1, 2], S[..., 2, 0], S[..., 0, 1] = -x[..., 0], -x[..., 1], -x[..., 2]
-    return S
+    return np.cross(np.eye(3), np.asarray(x, float)[..., None, :])
 
 
 def exponential(theta: ArrayLike) -> Array:
     """Return the rotation matrices of rotation vectors (..., 3)."""
     theta = np.asarray(theta, float)
-    angle = np.linalg.norm(theta, axis=-1)[..., None, None]
-    S = skew(theta)
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.eye(3) + first * S + second * (S @ S)
+    return Rotation.from_rotvec(theta.reshape(-1, 3)).as_matrix().reshape(*theta.shape, 3)
 
 
 def left_jacobian(theta: ArrayLike) -> Array:
@@ -139,10 +131,6 @@ class Result:
     P: Array  # (T, N, 6, 6)
     position_error: Array  # (T, N, 3) m, inertial: true position - R_hat p_hat
     angle_error_deg: Array  # (T, N)
-
-    def settle_times(self, position: float = 0.1, angle_deg: float = 1.0) -> Array:
-        """Return per vehicle the first sample from which both errors stay below the bounds; NaN if none."""
-        return settle_times(self.t, self.position_error, self.angle_error_deg, position, angle_deg)
 
 
 def settle_times(

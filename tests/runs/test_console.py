@@ -1,18 +1,34 @@
-"""Progress: a bar on a terminal, lines elsewhere."""
+"""Progress, and what `describe`, the words and the JSON schema say about scenarios."""
 
 from __future__ import annotations
 
+import copy
 import io
+import json
+import tomllib
 from pathlib import Path
 from time import sleep
+from typing import Any
 
+import jsonschema
 import pytest
 from rich.console import Console
 
+import coopenv
+from coopenv.api.terms.layout import observation_layout
+from coopenv.base.installation import data_directory
+from coopenv.cli import main
 from coopenv.estimation import compiled
 from coopenv.runs import console as module
+from coopenv.runs import scenario_text as words
 from coopenv.runs.console import Progress, compile_notice
+from coopenv.runs.scenario_text import IMAGE_FIELDS, settings
+from coopenv.runs.summary import describe_scenario
+from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
+from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario, schema_text
 from coopenv.world import launch
+from tests.helpers.commands import printed
+from tests.helpers.four_way import FOUR_WAY
 
 
 @pytest.fixture
@@ -143,3 +159,215 @@ def test_functions_of_observers_on_the_host_are_compiled_as_well(
         assert text.getvalue() == ""
         fresh.append("new")
         wait_for(text, "compiling kernels (once per machine) ...\n")
+
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"
+
+
+def described(name: str, width: int, **overrides: Any) -> str:
+    return printed(*describe_scenario(coopenv.load_scenario(name, overrides)), width=width)
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_everything_fits_and_nothing_is_cut_off(name: str, width: int) -> None:
+    text = described(name, width)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert "…" not in text
+    tokens = set(text.split())
+    scenario = coopenv.load_scenario(name)
+    for section in (scenario.camera, scenario.noise, scenario.v2x, scenario.observer, scenario.observation):
+        for key, _, meaning, _ in settings(section):
+            assert key in tokens
+            assert set(meaning.split()) <= tokens, key
+    for field, layout in observation_layout(scenario).items():
+        assert field in tokens
+        assert f"{layout.start}:{layout.stop}" in tokens
+        assert set(layout.meaning.split()) <= tokens | {token.rstrip(";") for token in tokens}  # a center follows
+    assert set(scenario.target_names) <= {token.strip(",") for token in tokens}
+
+
+def test_the_sections_of_the_busy_intersection() -> None:
+    lines = [line.split() for line in described("busy_intersection", 100).splitlines()]
+    assert ["landmark", "position", "motion", "body"] in lines
+    assert ["SL1", "(-4,", "5,", "3)", "stands", "still", "none"] in lines
+    assert next(line for line in lines if line[:1] == ["bearing.scale"])[:3] == ["bearing.scale", "*", "0.005"]
+    assert next(line for line in lines if line[:1] == ["loss"])[:2] == ["loss", "0"]
+    text = described("busy_intersection", 140)
+    assert "keeps 0.6 m/s to the left" in text
+    assert "off by 90 deg about z" in text
+    assert "Horizon: 50 s, 500 decisions of 6 camera ticks each." in text
+    assert "wheelbase" not in text
+    assert "wheelbase" in described(FOUR_WAY, 100)
+
+
+def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
+    keys = {name: [key for key, *_ in settings(coopenv.load_scenario(name).camera)] for name in coopenv.list_envs()}
+    assert coopenv.load_scenario("busy_intersection").camera.model == "omnidirectional"
+    assert not set(IMAGE_FIELDS) & set(keys["busy_intersection"])
+    assert {"model", "position", "orientation", "miss_probability"} <= set(keys["busy_intersection"])
+    assert set(IMAGE_FIELDS) <= set(keys["crossing_path"])
+    assert "principal_point" not in described("busy_intersection", 100)
+
+
+def test_stages_of_prescribed_motions_are_shown() -> None:
+    lines = [line.split() for line in described("crossing_path", 80).splitlines()]
+    first = lines.index(["vehicle_1", "0-20", "rests"])
+    assert lines[first + 1 : first + 5] == [
+        ["20-22.1", "0.26", "m/s", "forward"],
+        ["22.1-28.5", "rests"],
+        ["28.5-30", "0.26", "m/s", "forward"],
+        ["30-", "rests"],
+    ]
+    assert ["ML", "0-15.6", "rests"] in lines
+    assert "Stages of motion" not in described("busy_intersection", 80)
+    turning = {"duration": 2.5, "linear": (0.26, 0, 0), "angular": (0, 0, -0.5)}
+    segments = SegmentMotion.model_validate({"kind": "segments", "segments": [turning]})
+    assert list(words.stages(segments)) == [
+        ("0-2.5", "0.26 m/s forward, turning at (0, 0, -0.5) rad/s"),
+        ("2.5-", "rests"),
+    ]
+    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 1.5)}]
+    spline = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
+    assert list(words.stages(spline)) == [("0", "at (0, 0, 0)"), ("8", "at (4, 0, 1.5)")]
+
+
+def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["describe", "busy_intersection", "--all", "--set", "v2x.loss=0.25"]) == 0
+    assert any(line.split()[:3] == ["loss", "*", "0.25"] for line in capsys.readouterr().out.splitlines())
+
+
+def test_scenario_texts_are_not_read_as_markup() -> None:
+    assert "[bold]loud[/bold]" in described("busy_intersection", 80, title="[bold]loud[/bold]")
+
+
+def test_starts_and_estimates_in_words() -> None:
+    half = 0.7071067811865476
+    belief = InitialEstimate(position_radius=0.3, orientation_angle="uniform")
+    assert words.estimate(belief).splitlines() == [
+        "true position",
+        "within 0.3 m",
+        "true orientation",
+        "turned at random, over SO(3)",
+    ]
+    belief = InitialEstimate(position=(1.0, 2.0, -0.0), orientation_offset_wxyz=(half, 0.0, -half, 0.0))
+    assert words.estimate(belief).splitlines() == ["(1, 2, 0)", "true orientation", "off by -90 deg about y"]
+    assert words.turn((half, 0.5, 0.5, 0.0)) == "90 deg about (0.707, 0.707, 0)"
+    assert words.turn((1.0, 0.0, 0.0, 0.0)) == "0 deg"
+    assert words.orientation(None, (half, half, 0.0, 0.0)) == "turned 90 deg about x"
+
+
+def test_motions_in_words() -> None:
+    assert words.motion(ConstantMotion(linear=(-1.0, 0.0, 0.0))) == "keeps 1 m/s backward"
+    turning = ConstantMotion(linear=(1.0, 2.0, 0.0), angular=(0.0, 0.0, 0.5))
+    assert words.motion(turning) == "keeps (1, 2, 0) m/s, turning at (0, 0, 0.5) rad/s"
+    assert words.motion(ConstantMotion(linear=(0.0, 0.0, 0.0))) == "keeps 0 m/s"
+    assert TwistSegment(duration=1.0).linear == (0.0, 0.0, 0.0)
+    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 0)}]
+    motion = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
+    assert words.motion(motion) == "spline through 2 waypoints over 8 s"
+
+
+def test_the_published_schema_is_up_to_date() -> None:
+    published, current = (plain_schema(json.loads(text)) for text in (DOCUMENT.read_text(), schema_text()))
+    assert published == current, "run: coopenv schema --out docs/scenario.schema.json"
+
+
+def plain_schema(part: Any) -> Any:
+    """Return a schema without what some versions of pydantic say twice: lists of one, and an enum beside its const."""
+    if isinstance(part, list):
+        return [plain_schema(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    if len(part.get("allOf", ())) == 1:
+        part = {**part.pop("allOf")[0], **part}
+    return {key: plain_schema(value) for key, value in part.items() if not (key == "enum" and "const" in part)}
+
+
+def test_schema_to_standard_output_and_to_a_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["schema"]) == 0
+    assert capsys.readouterr().out == schema_text()
+    assert main(["schema", "--out", str(tmp_path / "schema.json")]) == 0
+    assert (tmp_path / "schema.json").read_text() == schema_text()
+
+
+@pytest.fixture(scope="module")
+def validator() -> Any:
+    schema = json.loads(schema_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def raw(path: Path | str) -> dict[str, Any]:
+    return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_every_environment_satisfies_the_schema(name: str, validator: Any) -> None:
+    assert [error.message for error in validator.iter_errors(raw(data_directory("envs") / f"{name}.toml"))] == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        (),
+        ("camera",),
+        ("noise", "bearing"),
+        ("vehicle_defaults",),
+        ("vehicle_defaults", "body"),
+        ("vehicle_defaults", "initial_pose"),
+        ("vehicles", 0),
+        ("vehicles", 0, "initial_pose"),
+        ("vehicles", 0, "goal"),
+        ("landmarks", 0),
+        ("obstacles", 0),
+        ("reward", "weights"),
+        ("termination",),
+    ],
+)
+def test_the_schema_refuses_unknown_keys_as_the_loader_does(path: tuple[Any, ...], validator: Any) -> None:
+    document = raw(FOUR_WAY)
+    node: Any = document
+    for part in path:
+        node = node.setdefault(part, {}) if isinstance(part, str) else node[part]
+    node["misspelt"] = 1
+    assert not validator.is_valid(document)
+    with pytest.raises(coopenv.ScenarioError, match="misspelt"):
+        parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "four_way")
+
+
+def test_vehicles_may_leave_out_what_the_defaults_say(validator: Any) -> None:
+    document = raw(FOUR_WAY)
+    document["vehicle_defaults"]["goal"] = {"position": [5.0, 5.0, 0.0]}
+    for vehicle in document["vehicles"]:
+        vehicle["goal"] = {"radius": 1.0}
+    parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "four_way")
+    assert validator.is_valid(document)
+    del document["horizon"]
+    assert not validator.is_valid(document)
+
+
+def test_what_is_drawn_is_described() -> None:
+    raw = {
+        "title": "Drawn",
+        "horizon": 5.0,
+        "landmarks": [{"name": "sign", "position": [1, 2, 3], "position_spread": [0.5, 0.5, 0], "presence": 0.8}],
+        "landmark_groups": [
+            {"name": "posts", "count": 3, "boxes": [{"center": [5, 5], "half": [2, 1]}], "height": [0.4, 1.2]},
+            {"name": "kerb", "count": 1, "lines": [{"start": [0, 3], "end": [9, 3]}], "height": [1, 1]},
+        ],
+        "routes": [
+            {"name": "left", "waypoints": [[-8, 0], [0, 0], [0, 8]], "corner_radius": 1.5, "lateral_spread": 0.1},
+            {"name": "ahead", "waypoints": [[-8, 0], [8, 0]], "wander": 0.2, "start_spread": 1.0},
+        ],
+        "vehicles": [{"routes": ["left", "ahead"], "motion": {"kind": "driven"}}],
+        "randomisation": {"camera_range": [0.8, 1.2]},
+    }
+    text = printed(*describe_scenario(parse_scenario(raw, "test")), width=160)
+    for said in (
+        *("end of its route: left or ahead", "(-8, 0), (0, 0), (0, 8)", "radius 1.5", "shifted by +- 0.1"),
+        *("wanders by 0.2", "begun along the first 1", "there with 80 %", "+- (0.5, 0.5, 0)", "drawn by group posts"),
+        *("(5, 5) +- (2, 1)", "(0, 3) to (9, 3)", "0.4 to 1.2", "camera_range *"),
+    ):
+        assert said in text, said
+    assert "[difficulty]" not in text

@@ -1,8 +1,10 @@
-"""An episode in a window or as a film, and driving by keys, without a display."""
+"""Episodes in a window or as a film, and driving by keys, without a display."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,18 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import coopenv
+from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.cli import main
 from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
 from coopenv.runs.live import Keyboard, Keys, drive_by_hand, watch
-from coopenv.viz.topview import PictureWindow
+from coopenv.runs.scenes import frame_stride, frames_at, scene_of, write_film, write_pictures
+from coopenv.viz.scene import Origin, SceneRecord
+from coopenv.viz.topview import PictureWindow, TopView
 from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.processes import small_disk
 
 AT_ONCE = np.inf
 SHORT = {"horizon": 3.0}
@@ -162,3 +169,101 @@ def test_mistakes_are_one_line(options: list[str], message: str, capsys: pytest.
     assert main(options) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def record() -> SceneRecord:
+    scenario = coopenv.load_scenario("overtaking", {"horizon": 3.0})
+    return scene_of(Engine(scenario), Origin.of("overtaking", scenario, seed=0))
+
+
+def test_a_film_shows_the_frame_that_is_there() -> None:
+    time = np.array([0.0, 0.1, 0.2, 0.5])
+    np.testing.assert_array_equal(frames_at(time, 10.0, 1.0), [0, 1, 2, 2, 2, 3])
+    np.testing.assert_array_equal(frames_at(time, 10.0, 2.5), [0, 2, 3])
+    np.testing.assert_array_equal(frames_at(time, 20.0, 1.0)[:4], [0, 0, 1, 1])
+    np.testing.assert_array_equal(frames_at(np.array([1.0]), 10.0, 1.0), [0])
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_path: Path) -> None:
+    path = tmp_path / f"film{suffix}"
+    assert write_film(record, path, fps=5.0, width=448, panel=False) == 16
+    with Image.open(path) as film:
+        assert film.n_frames == 16 and film.size[0] == 448
+        film.seek(15)
+        film.load()
+        assert film.info["duration"] == 200
+        shown = np.asarray(film.convert("RGB"), float)
+    last = TopView(record.scenario, panel=False).paint(record.frame(len(record) - 1))
+    wanted = np.asarray(Image.fromarray(last).resize(shown.shape[1::-1]), float)
+    assert np.abs(shown - wanted).mean() < 8.0
+
+
+def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    assert write_film(record, tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16
+    assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 16
+
+
+def test_other_formats_and_missing_extras_are_told(
+    record: SceneRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
+        write_film(record, tmp_path / "film.avi", fps=10.0)
+    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
+    with pytest.raises(CoopenvError, match=r"pip install '\.\[video\]'"):
+        write_film(record, tmp_path / "film.mp4", fps=10.0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_films_play_in_real_time(tmp_path: Path) -> None:
+    assert frame_stride(coopenv.load_scenario("busy_intersection")) == 6
+    assert frame_stride(coopenv.load_scenario("busy_intersection", {"rates.decision": 60.0})) == 3
+    path = tmp_path / "video.gif"
+    write_pictures(path, 15.0, (np.full((300, 960, 3), 10 * shade, dtype=np.uint8) for shade in range(15)))
+    with Image.open(path) as image:
+        assert image.size == (480, 150)
+        duration = 0
+        for frame in range(image.n_frames):
+            image.seek(frame)
+            duration += image.info["duration"]
+    assert duration == 1000
+
+
+def pictures(count: int) -> Iterator[np.ndarray]:
+    return iter(np.random.default_rng(1).integers(0, 256, (count, 241, 321, 3), dtype=np.uint8))
+
+
+def test_a_film_that_does_not_fit_on_the_disk_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    with (
+        small_disk(tmp_path / "disk", "200k") as disk,
+        pytest.raises(OutputError, match=r"video.mp4: ffmpeg could not finish it") as error,
+    ):
+        write_pictures(disk / "video.mp4", 10.0, pictures(12))
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nobody_writes_to_a_film_that_was_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    writers: list[Any] = []
+    begin = ffmpeg.write_frames
+    monkeypatch.setattr(ffmpeg, "write_frames", lambda *a, **k: (writers.append(begin(*a, **k)), writers[0])[1])
+
+    def broken() -> Iterator[np.ndarray]:
+        yield from pictures(1)
+        raise KeyError
+
+    with suppress(KeyError):
+        write_pictures(tmp_path / "video.mp4", 10.0, broken())
+    assert getgeneratorstate(writers[0]) == GEN_CLOSED
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_film_without_pictures_is_no_file(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
+    write_pictures(tmp_path / f"video{suffix}", 10.0, [])
+    assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coopenv.base.errors import ScenarioError
-from coopenv.scenario import Scenario, load_scenario, parse_scenario
+from coopenv.scenario import Scenario, parse_scenario
 from tests.fuzz.scenarios import at, places
 from tests.helpers import builders
 
@@ -208,24 +208,3 @@ def test_derived_counts_and_names() -> None:
     assert made.horizon_ticks == 150
     assert made.target_names == ["L1", "L2", "L3", "L4", "vehicle_1", "vehicle_2", "vehicle_3"]
     assert made.driven
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("noise-enabled", False, "noise-enabled: unknown key"),
-        ("", 1, "unknown key"),
-        ("noise.foo-bar", 1, "noise.foo-bar: unknown key"),
-        ("vehicles.0.motion", {"kind": None, "knd": "constant"}, r"motion.kind"),
-        ("rates.decision", 1e-9, "rates.decision"),
-        ("horizon", "5", "horizon: Input should be a valid number"),
-        ("observer.k", True, "observer.k"),
-        ("v2x.period", 2**32, "v2x.period"),
-        ("horizon", 1e308, "horizon"),
-        ("rates.camera", 1e300, "rates.camera"),
-    ],
-)
-def test_one_line_for_what_a_stranger_tried(key: str, value: object, message: str) -> None:
-    with pytest.raises(ScenarioError, match=message) as caught:
-        load_scenario("busy_intersection", {key: value})
-    assert "\n" not in str(caught.value)

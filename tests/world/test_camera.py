@@ -131,12 +131,12 @@ class Scene:
 
 @pytest.mark.parametrize("pinhole", [False, True])
 def test_sight_on_random_scenes(pinhole: bool) -> None:
-    """Up to 60 scenes of 34 lines of sight each, in either precision."""
+    """Up to 40 scenes of 34 lines of sight each, in either precision."""
     lever, reach = np.array([0.3, 0.1, 0.2]), 9.0
     camera = {"position": lever.tolist(), "range": reach, "orientation": "forward"}
     camera["model"] = "pinhole" if pinhole else "omnidirectional"
     seen: list[np.ndarray] = []
-    for seed in range(60):
+    for seed in range(40):
         parts = random_scene(seed, camera)
         try:
             made = scenario(**parts)
@@ -152,7 +152,7 @@ def test_sight_on_random_scenes(pinhole: bool) -> None:
             seen.append(expected[~unclear])
     counts = np.bincount(np.concatenate(seen), minlength=6)
     assert (counts[[1, 2, 3, 4]] > 10).all(), counts
-    assert counts.sum() > 40 * 18
+    assert counts.sum() > 25 * 18
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

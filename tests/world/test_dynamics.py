@@ -145,12 +145,8 @@ def test_action_minus_one_is_the_lowest_speed(reverse: bool, lowest: float) -> N
     rows = path(drive(driven({"reverse": reverse}, speed=0.8), [(-1.0, 0.0)] * 60))
     assert_allclose(rows[-1, 3], lowest, atol=1e-6)
     assert rows[:, 3].min() >= lowest - 1e-12
-
-
-def test_reversing_moves_backwards() -> None:
-    rows = path(drive(driven({"reverse": True}), [(-1.0, 0.0)] * 20))
-    back = (rows[-1, :2] - rows[0, :2]) @ [np.cos(0.7), np.sin(0.7)]
-    assert -3.06 < back < -2.0
+    back = (rows[20, :2] - rows[0, :2]) @ [np.cos(0.7), np.sin(0.7)]
+    assert -2.5 < back < -0.8 if reverse else back > 0.0
 
 
 def test_acceleration_mode() -> None:
@@ -297,12 +293,6 @@ def test_the_first_entry_spans_the_speeds() -> None:
     assert_allclose(rows[:, 2], 2.0)
     both_ways = asked([(-1.0, 0.0), (0.0, 0.0), (0.5, 0.0)], dynamics={"reverse": True, "max_speed": 2.0})
     assert_allclose(both_ways[:, 0], [-2.0, 0.0, 1.0])
-
-
-def test_or_the_acceleration_towards_a_limit() -> None:
-    rows = asked([(0.25, 0.0), (-0.5, 0.0), (0.0, 0.0)], action={"longitudinal": "acceleration"})
-    assert_allclose(rows[:, 0], [1.53, 0.0, 1.53])
-    assert_allclose(rows[:, 2], [0.5, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -163,15 +163,6 @@ def test_a_jammer_blocks_the_receivers_in_its_range(dtype: str, delay: int) -> N
     assert len(seen) > 2
 
 
-def test_jammers_are_drawn() -> None:
-    jammer = {"chance": 0.25, "start": 1.0, "start_spread": 2.0}
-    state = start(fleet({}, faults={"jammer": jammer}), range(WORLDS)).get_state()
-    begun = state["jammer_tick"][state["jammer_tick"] >= 0]
-    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 3 * WORLDS, 0.25)
-    assert low <= len(begun) <= high
-    assert stats.kstest((begun / 60 - 1.0) / 2.0, "uniform").pvalue > 1e-4
-
-
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
@@ -261,14 +252,17 @@ def test_a_restart_loses_all_at_the_next_decision() -> None:
     assert after["inbox_tick"][0, 1].tolist() == [28, -1, -1]  # again, as the radio delivers at this tick
 
 
-def test_restarts_are_drawn() -> None:
-    restart = {"chance": 0.25, "time": 5.0, "time_spread": 20.0}
-    state = start(fleet({}, faults={"restart": restart}), range(WORLDS)).get_state()
-    begun = state["restart_tick"][state["restart_tick"] >= 0]
+@pytest.mark.parametrize(
+    ("fault", "options", "decision"),
+    [("jammer", {"start": 5.0, "start_spread": 20.0}, 1), ("restart", {"time": 5.0, "time_spread": 20.0}, 6)],
+)
+def test_jammers_and_restarts_are_drawn(fault: str, options: dict[str, float], decision: int) -> None:
+    """A restart waits for the tick after a decision."""
+    state = start(fleet({}, faults={fault: {"chance": 0.25, **options}}), range(WORLDS)).get_state()
+    begun = state[f"{fault}_tick"][state[f"{fault}_tick"] >= 0] - (fault == "restart")
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 3 * WORLDS, 0.25)
-    assert low <= len(begun) <= high
-    assert ((begun - 1) % 6 == 0).all()
-    assert stats.kstest(((begun - 1) / 60 - 5.0) / 20.0, "uniform").pvalue > 1e-4
+    assert low <= len(begun) <= high and (begun % decision == 0).all()
+    assert stats.kstest((begun / 60 - 5.0) / 20.0, "uniform").pvalue > 1e-4
 
 
 def test_others_go_on_as_if_there_were_no_fault() -> None:

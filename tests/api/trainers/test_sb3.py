@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 import coopenv
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, make_sb3_vec_env
 from coopenv.scenario.terms import REWARD_TERMS
-from tests.helpers.episodes import first_episodes
+from tests.helpers.env_suite import first_episodes
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train

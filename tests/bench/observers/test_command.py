@@ -251,11 +251,6 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(
     assert "'broken' (no_such_module:Thing) cannot be loaded" in told_now
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    assert "file" in refused("bench", "observers", "overtaking", "--seeds", "1000", "--out", str(tmp_path / "file"))
-
-
 def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures of another format go."""
     monkeypatch.setattr(registry, "_registered", {})

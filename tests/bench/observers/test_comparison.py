@@ -28,7 +28,6 @@ from coopenv.bench.observers.sources import variants_of
 from coopenv.bench.observers.tables import failures
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
-from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Estimate, Tick
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs.recorder import record
@@ -38,27 +37,6 @@ from tests.helpers import mrclam_files
 from tests.helpers.commands import printed
 
 SHORT = {"horizon": 1.5}
-
-
-def test_rows_are_root_means_over_seeds() -> None:
-    scenario = coopenv.load_scenario("overtaking", SHORT)
-    rows = compare(["riccati", "dead_reckoning"], "overtaking", 2, overrides=SHORT, steady_from=0.5).rows
-    assert [(row.observer, row.vehicle) for row in rows] == [
-        (name, f"vehicle_{i}") for name in ("riccati", "dead_reckoning") for i in (1, 2)
-    ]
-    records = [record(scenario, seed) for seed in (0, 1)]
-    late = records[0].t > 0.5
-    errors = np.array([run("riccati", made).position_error[late] for made in records])
-    each = np.sqrt(np.mean(errors**2, axis=1))
-    assert [row.position_rmse_m for row in rows[:2]] == pytest.approx(np.sqrt(np.mean(each**2, axis=0)), rel=1e-12)
-    assert [row.position_rmse_median_m for row in rows[:2]] == pytest.approx(each.mean(axis=0), rel=1e-12)
-    for column, bound in (("bound_m", cramer_rao), ("bound_ancestors_m", cramer_rao_ancestors)):
-        squares = [np.mean(bound(made).position[late] ** 2, axis=0) for made in records]
-        assert [getattr(row, column) for row in rows[:2]] == pytest.approx(np.sqrt(np.mean(squares, axis=0)), rel=1e-12)
-    for row in rows:
-        assert row.ratio_to_bound == pytest.approx(row.position_rmse_m / row.bound_m)
-        assert max(row.bound_m, row.bound_single_m) <= row.bound_ancestors_m * (1 + 1e-9)
-        assert row.degradation == pytest.approx(1.0) and row.gramian_min_eigenvalue >= 0.0
 
 
 def test_every_fault_has_its_rows() -> None:

@@ -297,52 +297,38 @@ def test_landmarks_are_lost_for_a_while() -> None:
     assert differing(after, made()) == {"bearings", "visible"}
 
 
-@pytest.mark.parametrize(
-    ("word", "keys"),
-    [
-        ("jump:3", {"kind": "jump", "offset": 3.0}),
-        ("drift:0.5", {"kind": "drift", "speed": 0.5}),
-        ("replay:0.3", {"kind": "replay", "age": 0.3}),
-    ],
-)
-def test_lies_on_a_recording_are_those_of_a_scenario(word: str, keys: dict[str, float | str]) -> None:
-    lie = {**keys, "start": 0.33, "std": 0.1, "direction": list(DIRECTION)}
-    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"lie": lie}}
-    expected = record(coopenv.load_scenario("busy_intersection", overrides), 0).interference
-    found = variant_of(f"vehicle_3:lie={word}@33%,std=0.1").applied(made(horizon=1.0), 0).interference
-    for field in fields(Interference):
-        assert_allclose(getattr(found, field.name), getattr(expected, field.name), atol=1e-6, err_msg=field.name)
+LIE = {"start": 0.33, "std": 0.1, "direction": list(DIRECTION)}
+MAP = {"landmark": "SL2", "offset": 0.3, "direction": [0.0, 1.0, 0.0], "start": 0.33}
 
 
 @pytest.mark.parametrize(
-    ("text", "keys"),
+    ("text", "faults", "delay"),
     [
-        ("jammer@33%+0.4", {"start": 0.33, "duration": 0.4}),
-        ("vehicle_3:jammer=20,period=0.2,duty=0.5", {"range": 20.0, "period": 0.2, "duty": 0.5}),
-        ("jammer=17,x=-2,y=-2,z=2", {"range": 17.0, "position": [-2.0, -2.0, 2.0]}),
+        ("vehicle_3:lie=jump:3@33%,std=0.1", {"lie": {"kind": "jump", "offset": 3.0, **LIE}}, 0),
+        ("vehicle_3:lie=drift:0.5@33%,std=0.1", {"lie": {"kind": "drift", "speed": 0.5, **LIE}}, 0),
+        ("vehicle_3:lie=replay:0.3@33%,std=0.1", {"lie": {"kind": "replay", "age": 0.3, **LIE}}, 0),
+        ("jammer@33%+0.4", {"jammer": {"start": 0.33, "duration": 0.4}}, 2),
+        ("vehicle_3:jammer=20,period=0.2,duty=0.5", {"jammer": {"range": 20.0, "period": 0.2, "duty": 0.5}}, 2),
+        ("jammer=17,x=-2,y=-2,z=2", {"jammer": {"range": 17.0, "position": [-2.0, -2.0, 2.0]}}, 2),
+        (f"vehicle_3:map_error=SL2:0.3@33%,angle={np.pi / 2}", {"map_error": MAP}, 0),
     ],
 )
-def test_jammers_of_a_recording_are_those_of_a_scenario(text: str, keys: dict[str, Any]) -> None:
-    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"jammer": {"chance": 1.0, **keys}}, "v2x.delay": 2}
+def test_faults_of_a_recording_are_those_of_a_scenario(text: str, faults: dict[str, Any], delay: int) -> None:
+    (name,) = faults
+    drawn = {} if name == "lie" else {"chance": 1.0}
+    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {name: {**drawn, **faults[name]}}, "v2x.delay": delay}
     expected = record(coopenv.load_scenario("busy_intersection", overrides), 0)
-    plain = made(horizon=1.0, v2x__delay=2)
+    plain = made(horizon=1.0, v2x__delay=delay)
     after = variant_of(text).applied(plain, 0)
-    assert_array_equal(after.inbox_tick, expected.inbox_tick)
-    assert differing(plain, after) == {"inbox_tick"}
-
-
-def test_wrong_maps_of_a_recording_are_those_of_a_scenario() -> None:
-    error = {"chance": 1.0, "landmark": "SL2", "offset": 0.3, "direction": [0.0, 1.0, 0.0], "start": 0.33}
-    overrides = {"horizon": 1.0, "vehicles.vehicle_3.faults": {"map_error": error}}
-    expected = record(coopenv.load_scenario("busy_intersection", overrides), 0)
-    after = variant_of(f"vehicle_3:map_error=SL2:0.3@33%,angle={np.pi / 2}").applied(made(horizon=1.0), 0)
-    assert expected.interference is not None and after.interference is not None
-    for field in fields(Interference):
-        found, wanted = (getattr(r.interference, field.name) for r in (after, expected))
-        assert_allclose(found, wanted, atol=1e-12, err_msg=field.name)
     assert not differing(after, expected)
-    assert_allclose(after.interference.map_error_of(2, 20), [[0, 0, 0], [0, 0.3, 0], [0, 0, 0]], atol=1e-12)
-    assert not after.interference.map_error_of(2, 19).any() and not after.interference.map_error_of(1, 20).any()
+    assert differing(plain, after) == ({"inbox_tick"} if name == "jammer" else set())
+    for field in fields(Interference) if name != "jammer" else ():
+        found, wanted = (getattr(r.interference, field.name) for r in (after, expected))
+        assert_allclose(found, wanted, atol=1e-6, err_msg=field.name)
+    if name == "map_error":
+        assert after.interference is not None
+        assert_allclose(after.interference.map_error_of(2, 20), [[0, 0, 0], [0, 0.3, 0], [0, 0, 0]], atol=1e-12)
+        assert not after.interference.map_error_of(2, 19).any() and not after.interference.map_error_of(1, 20).any()
 
 
 def test_drawn_errors_of_a_map() -> None:

@@ -235,8 +235,11 @@ def test_the_observers_own_message_counts_before_the_pose_and_a_stale_one_not_at
     report = Message(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
     assembler.put(sample(Role.REPORT, START + MS, report, "car0"))
     assert set(assembler.tick(1, START + 5 * MS).messages[1, 0].message.extra) == {"odometry"}
+    for older in (MS, 0):  # replayed, and from before
+        assembler.put(sample(Role.ESTIMATE, START + older, ORIGIN, "car0", delay=6 * MS))
+    assert not heard(assembler.tick(2, START + 8 * MS)) and assembler.refused["message out of order"] == 2
     assembler.put(sample(Role.ESTIMATE, START + 10 * MS, ORIGIN, "car0"))
-    assert not heard(assembler.tick(2, START + 11 * MS + STALE))
+    assert not heard(assembler.tick(3, START + 11 * MS + STALE))
     assert assembler.refused["stale message"] == 1
 
 

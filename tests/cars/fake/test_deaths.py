@@ -153,15 +153,3 @@ def test_a_router_that_dies_stops_all_and_arming_again_goes_on(fleet: Fleet) -> 
         wait_until(lambda: fleet.moves("svea7"))
     finally:
         env.close()
-
-
-def test_old_commands_of_a_stalled_station_move_nothing(fleet: Fleet) -> None:
-    """The station freezes for 2 s and goes on: the cars stand, and drive again only by what is sent then."""
-    driver = fleet.launch_driver()
-    driver.send_signal(signal.SIGSTOP)
-    time.sleep(1.0)
-    assert not any(fleet.moves(car) for car in fleet.cars)
-    time.sleep(1.0)
-    driver.send_signal(signal.SIGCONT)
-    time.sleep(0.1)
-    assert driver.poll() is None or not any(fleet.moves(car) for car in fleet.cars)

@@ -1,30 +1,39 @@
-"""Fake cars in real time: in a thread behind their gate, and as a process that is reached over Zenoh."""
+"""Fake cars and their router as threads and processes: they are there when asked for, and gone whatever happens."""
 
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import time
-from collections.abc import Callable
+import tracemalloc
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.backend import scenario_of
+from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.station import Gates
-from coopenv.cars.codec import decode, encode, make
+from coopenv.cars.codec import MOST_BYTES, decode, encode, make
+from coopenv.cars.deployment import DeploymentError, load_deployment
+from coopenv.cars.fake.fleet import FakesError, free_port
+from coopenv.cars.fake.fleet import fakes as fake_processes
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import RESET_TOPIC, SVEA, Limits, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
+from coopenv.cli.svea import next_status
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
 from tests.helpers.hub import Hub
-from tests.helpers.processes import COOPENV, start, wait_until
-from tests.helpers.wire import free_endpoint
+from tests.helpers.processes import COOPENV, ROOT, mentioning, start, wait_until
+from tests.helpers.wire import free_endpoint, seen_by
 
 LIMITS = Limits(speed=0.5, steering=0.5, acceleration=1.0, steering_rate=2.0)
 
@@ -87,14 +96,6 @@ def through_its_gate(transport: Transport, ears: Ears) -> None:
     gates.end()
 
 
-def test_in_a_thread_behind_its_gate(fleet: Path) -> None:
-    with fakes(fleet) as (hub, _):
-        station = hub.connect()
-        ears = Ears(station, "svea7")
-        through_its_gate(station, ears)
-    assert not ears.there
-
-
 def test_as_a_process_over_zenoh(fleet: Path, tmp_path: Path) -> None:
     endpoint = fleet.read_text().split('"')[-2]
     with ExitStack() as stack:
@@ -152,3 +153,125 @@ def test_keys_of_the_gate_are_needed_where_the_deployment_has_some(fleet: Path) 
     fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
     with pytest.raises(CoopenvError, match="keys"):
         open_fake(fleet, "svea7", Hub().connect())
+
+
+FLEETS = sorted((ROOT / "examples" / "fleet").glob("*.toml"))
+SHIPPED = ROOT / "examples" / "fleet" / "overtaking.toml"
+
+
+@pytest.mark.parametrize("path", FLEETS, ids=lambda path: path.stem)
+def test_the_shipped_fleets_are_those_of_their_environments(path: Path) -> None:
+    fleet = load_deployment(path)
+    scenario = scenario_of(fleet, None, {})
+    binding = bind(scenario, fleet.cars, fleet.markers, path.name, None)
+    landmarks = len(scenario.landmarks)
+    marked = {landmarks + binding.cars[car.name] for car in fleet.cars if car.marker and car.name in binding.cars}
+    assert set(binding.targets.values()) == marked | set(range(landmarks))
+    assert len(fleet.cars) == len(scenario.vehicles) + len(binding.leaders)
+    assert fleet.fakes and fleet.network.connect == ("tcp/127.0.0.1:7447",)
+    commands = [line.removeprefix("#").split() for line in path.read_text().splitlines() if "coopenv svea" in line]
+    assert any("demo" in command for command in commands)
+    for command in commands:
+        for name in command:
+            assert not name.endswith(".toml") or name == str(path.relative_to(ROOT))
+
+
+def test_an_endpoint_takes_the_place_of_the_files() -> None:
+    assert load_deployment(SHIPPED, "tcp/10.0.0.1:1").network.connect == ("tcp/10.0.0.1:1",)
+    with pytest.raises(DeploymentError, match=r"network\.connect.*is no endpoint"):
+        load_deployment(SHIPPED, "nonsense")
+
+
+def health(file: Path, endpoint: str = "", *options: str) -> Result:
+    connect = ("--connect", endpoint) if endpoint else ()
+    return CliRunner().invoke(app, ["svea", "health", str(file), "--car", "svea7", *connect, *options])
+
+
+def test_cars_come_and_go() -> None:
+    with pytest.raises(ZeroDivisionError), fake_processes(SHIPPED) as endpoint:
+        with closing(open_zenoh("client", [endpoint])) as here:
+            seen = seen_by(here)
+            wait_until(lambda: set(seen) == {(presence_of("svea7"), True), (presence_of("svea1"), True)})
+            assert len(mentioning(endpoint)) == 3
+            assert health(SHIPPED, endpoint).output == (
+                "svea7: gate disarmed, 0 commands accepted, 0 messages refused\n"
+            )
+        raise ZeroDivisionError
+    assert not mentioning(endpoint)
+
+
+def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Path) -> None:
+    endpoint, file = free_endpoint(), tmp_path / "fleet.toml"
+    text = SHIPPED.read_text().replace("tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447")
+    file.write_text(f'{text}\n[gate]\nconnect = ["{endpoint}"]\n')
+    with closing(open_zenoh("router", listen=[endpoint])):
+        absent = "svea7: no message of its gate for 0.2 s on fleet/svea7/coopenv/gate"
+        assert str(health(file, "", "--patience", "0.2").exception) == absent  # so it has got there
+        assert str(health(SHIPPED, endpoint, "--patience", "0.2").exception) == absent
+    for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):
+        assert str(health(file, there).exception).startswith(f"{there}: is not on this computer")
+    tried = health(file, "tcp/nowhere.invalid:7447", "--off-board")
+    assert str(tried.exception).startswith("tcp/nowhere.invalid:7447: no Zenoh there")
+
+
+def test_who_cannot_start_says_why() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FakesError, match=rf"router has ended with status 2: tcp/127.0.0.1:{port}: no Zenoh there"):
+            fake_processes(SHIPPED, port).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_who_is_slow_is_not_waited_for() -> None:
+    port = free_port()
+    with pytest.raises(FakesError, match="router is not ready in time: it has printed nothing"):
+        fake_processes(SHIPPED, port, patience=0.05).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_real_cars_have_no_fakes(tmp_path: Path) -> None:
+    file = tmp_path / "cars.toml"
+    file.write_text(SHIPPED.read_text().replace("fakes = true", "fakes = false"))
+    with pytest.raises(CoopenvError, match=r"cars\.toml: fakes = true is missing"):
+        fake_processes(file).__enter__()
+
+
+# Listening to a gate: what is no message of a gate fills no memory and hides none
+
+
+TOPIC = SVEA.topic_of("svea7", Role.GATE)
+
+
+class Crowded:
+    """A network on which all comes at once as soon as somebody listens."""
+
+    def __init__(self, payloads: Iterator[bytes]) -> None:
+        self._payloads = payloads
+
+    def subscribe(self, pattern: str, callback: Any) -> None:
+        for payload in self._payloads:
+            callback(Arrival(pattern, payload, 0))
+
+
+def status_message() -> bytes:
+    return encode(make(SVEA.topics[Role.GATE].type))
+
+
+def first_status(payloads: Iterator[bytes]) -> Any:
+    return next_status(Crowded(payloads), TOPIC, 0.2)  # type: ignore[arg-type]
+
+
+def test_the_first_word_of_a_gate_is_found_among_others() -> None:
+    good = status_message()
+    assert first_status(iter([b"", b"nonsense", good + bytes(MOST_BYTES), good, b"nonsense"])).state == ""
+
+
+@pytest.mark.parametrize("size", [60_000, MOST_BYTES + 1, 1_000_000])
+def test_a_flood_fills_no_memory(size: int) -> None:
+    first_status(iter([status_message()]))  # what is loaded at the first time does not count
+    tracemalloc.start()
+    try:
+        assert first_status(b"\xff" * size for _ in repeat(None, 300)) is None
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()

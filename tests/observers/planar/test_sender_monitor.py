@@ -12,7 +12,7 @@ from coopenv.observers.planar.fusion import ENOUGH, LEAST_STD, MOST_SEEN, RobotM
 from coopenv.observers.planar.model import PlanarPose, misfit
 from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.runner import run
-from tests.helpers.barrier_robots import barrier_robots
+from tests.helpers.mrclam_files import barrier_robots
 
 EXTRA = {
     "seen": np.array([15, 17], np.uint8),

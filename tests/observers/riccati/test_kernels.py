@@ -1,4 +1,4 @@
-"""The observer inside the world against the splitting oracle tick by tick, and against the continuous solution."""
+"""The kernels of the paper's observer against the oracles, and that they stay healthy."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import (
+    LANDMARKS,
     constant,
     errors,
     estimated_position,
     from_oracle,
+    landmark,
     run,
     same_bits,
     scenario,
@@ -123,6 +125,9 @@ def test_error_against_the_continuous_observer_falls_with_the_step(k: float, q: 
         assert ((smooth < 0.6 * rough) | (smooth < 1e-7)).all()
 
 
+PAPER_SETTLES = (2.95, 7.90, 10.55, 11.65, 29.9)  # s, f1 .. f5
+
+
 def test_busy_intersection_settles_like_the_continuous_observer() -> None:
     rate = 30.0
     overrides = {"noise.enabled": False, "rates.camera": rate}
@@ -131,7 +136,9 @@ def test_busy_intersection_settles_like_the_continuous_observer() -> None:
     states = run(world, ticks)
     position, angle = (np.array(x)[:, 0] for x in zip(*(errors(world, s) for s in states), strict=True))
     settled = continuous.settle_times(np.arange(ticks + 1) / rate, np.eye(3)[0] * position[..., None], angle)
-    expected = continuous.solve(continuous.busy_intersection(), 50.0).settle_times()
+    solved = continuous.solve(continuous.busy_intersection(), 50.0)
+    expected = continuous.settle_times(solved.t, solved.position_error, solved.angle_error_deg)
+    assert_allclose(expected, PAPER_SETTLES, atol=0.051)
     assert (np.abs(settled - expected) <= np.maximum(0.1 * expected, 0.5)).all(), (settled, expected)
     assert position[-1].max() < 1e-6
     assert angle[-1].max() < 1e-5
@@ -274,3 +281,113 @@ def test_hamel_samson_is_the_riccati_observer_without_neighbours() -> None:
     assert_allclose(alone.position[:, 0], together.position[:, 0], rtol=0, atol=1e-12)
     assert np.abs(alone.position[-1, 1:] - together.position[-1, 1:]).max(axis=1).min() > 0.01
     assert (alone.bytes_per_second == 0).all()
+
+
+NOISE = {
+    "velocity": 0.05,
+    "angular_velocity": 0.02,
+    "bearing": {"model": "isotropic", "scale": 0.01},
+}
+MIXED_ERRORS = (
+    {"position_radius": 0.5, "orientation_angle": 0.2},
+    {"position_radius": 10.0, "orientation_angle": "uniform"},
+    {"position_offset": [30.0, -20.0, 10.0], "orientation_offset_wxyz": [0.0, 0.0, 0.0, 1.0]},
+)
+
+
+def circling(miss: float = 0.5, **observer: object) -> Scenario:
+    """Return three vehicles on circles that lose detections and messages at random."""
+    vehicles = [
+        vehicle(
+            (1.5 * i, -1.0 * i, 0.5),
+            yaw=0.7 * i,
+            motion=constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.2 + 0.1 * i]),
+            initial_estimate=error,
+        )
+        for i, error in enumerate(MIXED_ERRORS)
+    ]
+    return scenario(
+        vehicles,
+        noise=NOISE,
+        camera={"orientation": "body", "miss_probability": miss, "position": [0.3, 0.0, 0.2]},
+        v2x={"delay": 1, "loss": 0.3},
+        observer={"q": 25.0, **observer},
+    )
+
+
+def assert_healthy(world: World) -> None:
+    state = world.get_state()
+    P, R, p = state["covariance"], state["estimate_rotation"], state["estimate_position"]
+    assert np.isfinite(P).all()
+    assert (np.swapaxes(P, -1, -2) == P).all()
+    P = P.astype(float)
+    diagonal = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    assert np.isfinite(diagonal).all()
+    assert (diagonal > 0.0).all()
+    correlation = P / (diagonal[..., :, None] * diagonal[..., None, :])
+    assert np.linalg.eigvalsh(correlation).min() > 0.0
+    assert np.isfinite(p).all()
+    R = R.astype(float)
+    slack = 1e-12 if world.precision.name == "float64" else 3e-6
+    assert np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max() < slack
+    assert np.linalg.det(R).min() > 0.5
+
+
+def watch(world: World, ticks: int, every: int) -> None:
+    for _ in range(ticks // every):
+        world.advance(every)
+        assert_healthy(world)
+    assert (world.get_state()["tick"] == ticks // every * every).all()
+
+
+def alone(origin: np.ndarray, landmarks: int, k: float) -> Scenario:
+    """Return one vehicle near an origin with some landmarks."""
+    motion = constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.3])
+    return scenario(
+        [vehicle(origin, motion=motion, initial_estimate=MIXED_ERRORS[0])],
+        landmarks=[landmark(f"L{i}", (origin + p).tolist()) for i, p in enumerate(LANDMARKS[:landmarks])],
+        noise=NOISE,
+        observer={"k": k, "q": 25.0},
+    )
+
+
+FAR = np.array([1000.0, -500.0, 0.0])
+RUNS: dict[str, tuple[Scenario, int, int]] = {
+    "stiff": (circling(k=80.0), 6000, 60),
+    **{f"almost never a target in view, k={k}": (circling(miss=0.999, k=k), 6000, 30) for k in (1.0, 80.0)},
+    **{f"one landmark, k={k}": (alone(np.zeros(3), 1, k), 3000, 20) for k in (1.0, 80.0)},
+    **{f"P0={P0}": (circling(k=80.0, P0=P0), 300, 1) for P0 in ([1e-6, 1e-6], [1e3, 1e5], [1e-6, 1e4])},
+    "1 km from the origin, condition number of M above 1e12": (alone(FAR, len(LANDMARKS), 80.0), 1800, 10),
+}
+
+
+@pytest.mark.parametrize(("name", "dtype"), [*((name, "float32") for name in RUNS), ("stiff", "float64")])
+def test_it_stays_healthy(name: str, dtype: str) -> None:
+    made, ticks, every = RUNS[name]
+    watch(start(made, range(4), dtype), ticks, every)
+
+
+@pytest.mark.parametrize("k", [0.6, 1.0, 80.0, 1000.0])
+def test_any_gain_over_a_minute_tick_by_tick(k: float) -> None:
+    world = start(circling(k=k), range(4), "float32")
+    watch(world, 600, 1)
+    for _ in range(25):
+        world.advance(60)
+        assert_healthy(world)
+
+
+@pytest.mark.parametrize("k", [1.0, 80.0])
+def test_nothing_in_view_then_everything(k: float) -> None:
+    """Five minutes blind, then every target at once."""
+    world = start(circling(miss=1.0, k=k), range(4), "float32")
+    watch(world, 18000, 6000)
+    growth = 300.0 * np.array([0.1] * 3 + [1.0] * 3)
+    P = world.get_state()["covariance"]
+    np.testing.assert_allclose(
+        np.diagonal(P, axis1=-2, axis2=-1), np.broadcast_to([1.0] * 3 + [100.0] * 3 + growth, (4, 3, 6)), rtol=2e-3
+    )
+    seeing = start(circling(miss=0.0, k=k), range(4), "float32")
+    seeing.set_state(world.get_state())
+    for _ in range(300):
+        seeing.advance(1)
+        assert_healthy(seeing)

@@ -1,18 +1,85 @@
-"""`robust` learns the scale error of its odometry and its gyro's bias, and knows how well."""
+"""Errors of sensors and of mounting that last, and cars that drive hard."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from coopenv.observers.robust.constants import GYRO_BIAS
-from coopenv.scenario.files import load_scenario
+from coopenv.observers.robust.memory import MOUNTING
+from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
-from tests.helpers.robust_worlds import nees_of, steps_of
-from tests.observers.robust.test_driving import driven, square, weaving
+from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.robust_worlds import estimates, nees_of, steps_of, watched
+from tests.helpers.warp_calls import DTYPES
+
+Driver = Callable[[World, int, np.ndarray], np.ndarray | float]
+
+CORNERS = [(x, y) for x in (-3.8, 3.8) for y in (-3.8, 3.8)]
+SIDES = [
+    (sx * a, sy * b) for sx in (-1, 1) for sy in (-1, 1) for a, b in ((5.5, 3.9), (3.9, 5.5), (7.5, 4.0), (4.0, 7.5))
+]
+HEIGHTS = (0.3, 0.6, 0.9, 0.5, 0.7)
+
+
+def square(**overrides: object) -> Scenario:
+    """Return four cars on an open square whose landmarks are seen by those only that look aside."""
+    landmarks = [{"name": f"L{n}", "position": [x, y, HEIGHTS[n % 5]]} for n, (x, y) in enumerate(CORNERS + SIDES)]
+    start = {"vehicle_defaults.initial_estimate": {"position_radius": 0.3, "orientation_angle": 0.15}}
+    open_space = {"obstacles": [], "landmarks": landmarks, "camera.range": 6.0, "horizon": 20.0}
+    return load_scenario(FOUR_WAY, {**open_space, **start, "observer.name": "robust", **overrides})
+
+
+def weaving(world: World, k: int, phase: np.ndarray) -> np.ndarray:
+    """Return actions (W, N, 2) of drivers that weave along their lanes."""
+    R, p = estimates(world)
+    goal = world.view("goal").astype(float)
+    start = world.view("start_position")[:, world.model.landmarks :].astype(float)
+    along = (goal - start) / np.linalg.norm(goal - start, axis=-1, keepdims=True)
+    ahead = start + along * (np.einsum("wni,wni->wn", p - start, along) + 1.5)[..., None] - p
+    heading = np.arctan2(ahead[..., 1], ahead[..., 0]) + 0.6 * np.sin(0.16 * k + phase)
+    turn = heading - np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.stack([np.ones_like(turn), 3.0 * np.arctan2(np.sin(turn), np.cos(turn))], -1)
+
+
+def turning_hard(world: World, k: int, phase: np.ndarray) -> np.ndarray:
+    """Return actions (W, N, 2) of drivers that steer as far as they can, to either side in turn."""
+    return np.stack([np.full(phase.shape, 0.5), np.sign(np.sin(0.09 * k + phase))], -1)
+
+
+def driven(
+    scenario: Scenario, driver: Driver, worlds: int, dtype: str, seconds: int
+) -> tuple[np.ndarray, np.ndarray, World]:
+    """Return NEES / 6 (K, W, N) and position errors in m of vehicles under way, and the world in the end."""
+    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (worlds, len(scenario.vehicles)))
+    return watched(
+        scenario,
+        range(1000, 1000 + worlds),
+        10 * seconds,
+        6,
+        dtype=dtype,
+        act=lambda world, k: np.asarray(driver(world, k, phase)),
+    )
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_hard_turns_are_in_the_covariance(dtype: str) -> None:
+    """Samples of odometry that are held lag behind: with a lag of half a period ANEES/6 would be 1.86."""
+    nees, errors, _ = driven(square(), turning_hard, 48, dtype, 14)
+    assert 0.8 < np.nanmean(nees[30:]) < 1.2
+    assert np.nanpercentile(errors[80:], 95) < 0.03
+
+
+def test_cars_that_see_little_but_each_other_are_consistent() -> None:
+    """With covariances left about poses before their correction ANEES/6 would be 1.6, at worst 80."""
+    nees, _, _ = driven(square(), weaving, 96, "float32", 12)
+    assert 0.8 < np.nanmean(nees[30:]) < 1.35
+    assert np.nanmean(nees[30:] > 5.0) < 3e-3
+
 
 LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.0087}
 YAW_ONLY = LASTING | {"noise.gyro_bias": [0.0, 0.0, 0.0087]}
@@ -95,3 +162,50 @@ def test_drivers_know_their_errors(environment: str, agent: str, lasting: dict[s
     told = ", ".join(f"{mean:.2f} +- {error:.2f}" for mean, error in zip(means, std, strict=True))
     tell(f"{environment}, {agent}, by vehicle {told}", lasting, nees, errors)
     assert ((means + 2.0 * std > 0.5) & (means - 2.0 * std < 1.5)).all()
+
+
+TURNED = {"camera.extrinsics_error": 0.01745}  # rad per axis: 1 deg
+
+
+def judged(name: str, seeds: range, start: int, end: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, World]:
+    """Return (W, N) the mean NEES/6 and error in m of each vehicle from one second to another; and the world."""
+    made = load_scenario(name, {"observer.name": "robust", **TURNED, **overrides})
+    nees, errors, world = watched(made, seeds, end, round(made.rates.camera), skipped=start)
+    return nees.mean(axis=0), errors.mean(axis=0), world
+
+
+def test_it_is_as_sure_as_it_may_be_and_finds_out_how_the_camera_is_turned() -> None:
+    """A car that goes straight on tells its heading from the camera's by where its odometry leads."""
+    nees, _, world = judged("busy_intersection_tracking", range(16), 10, 40)
+    assert (nees.mean(axis=0) < 2.5).all()
+    R = world.memory.member.numpy()["pose"]["R"][:, 0, MOUNTING]
+    turn = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
+    true = world.view("camera_turn")[:, 0]
+    frame = world.model.camera.numpy()["rotation"][0]
+    error = turn - true @ frame.T
+    P = world.memory.P.numpy()[:, 0, MOUNTING, MOUNTING, :3, :3]
+    sizes = np.einsum("wi,wi->w", error, np.linalg.solve(P, error[..., None])[..., 0])
+    assert sizes.mean() < 9.0  # of three numbers; about 6 was seen, with a standard error of 1.5
+    assert np.sqrt((error**2).mean()) < 0.7 * TURNED["camera.extrinsics_error"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["busy_intersection_tracking", "lane:8", "tree:15"])
+def test_figures_in_other_worlds(name: str) -> None:
+    seeds = range(700, 732)
+    nees, error, _ = judged(name, seeds, 10, 40)
+    without, good, _ = judged(name, seeds, 10, 40, **{"camera.extrinsics_error": 0.0})
+    print(f"\n{name}: ANEES/6 {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
+    assert (nees.mean(axis=0) < 2.5).all()
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(f"{m:.2f}({s:.2f})" for m, s in zip(values.mean(axis=0), _error(values), strict=True))
+
+
+def _cm(values: np.ndarray) -> str:
+    return " ".join(f"{100 * m:.1f}" for m in values.mean(axis=0))
+
+
+def _error(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))

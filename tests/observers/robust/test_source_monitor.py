@@ -242,7 +242,7 @@ def test_a_sender_that_lies_costs_little() -> None:
 def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
     """Of 1 deg/s from 12 s on."""
     step, ratios = CHANGES["gyro bias steps to 1 deg/s at 12 s"], []
-    for seed in range(4):
+    for seed in range(2):  # as above, so that nothing is estimated twice
         without = usual(busy, 24.0, seed)
         ratios.append(cost(watch(step(without.recording, np.random.default_rng(seed))), without, STEP_AT))
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)

@@ -19,8 +19,7 @@ from coopenv.cars.profile import NEUTRAL, Role
 from coopenv.cars.transport.zenoh import LEASE, open_zenoh
 from coopenv.cli import main
 from tests.cars.link.gate import messages
-from tests.cars.link.gate.bench import CAR
-from tests.cars.link.gate.hostile import messages_of_strangers
+from tests.cars.link.gate.bench import CAR, messages_of_strangers
 from tests.cars.link.gate.station import Station, end, start_gate
 from tests.helpers.processes import start, wait_until
 from tests.helpers.wire import free_endpoint, heard_by, running

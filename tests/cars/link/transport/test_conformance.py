@@ -1,21 +1,29 @@
-"""What every transport does, tried on each."""
+"""What every network does alike, and the names and types of the authors' topics."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.transport.base import Transport, matcher
+from coopenv.cars.codec import decode, encode, header, make, ros1, ros1_of
+from coopenv.cars.deployment import Car, DeploymentError
+from coopenv.cars.profile import SVEA, Role
+from coopenv.cars.readings import CarPose, read
+from coopenv.cars.transport.authors import Authors, routes_of
+from coopenv.cars.transport.base import Arrival, Transport, matcher
 from coopenv.cars.transport.nats import open_nats
 from coopenv.cars.transport.ros1 import open_ros1
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.brokers import nats_server, ros_master
-from tests.helpers.hub import Hub
+from tests.helpers.hub import Hub, HubTransport
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_endpoint, free_port, heard_by, seen_by
 
@@ -39,7 +47,7 @@ def nats(folder: Path) -> Iterator[Connect]:
         yield lambda: open_nats([f"nats/127.0.0.1:{port}"])
 
 
-def ros1(folder: Path) -> Iterator[Connect]:
+def ros1_network(folder: Path) -> Iterator[Connect]:
     with ros_master() as endpoint:  # one for all tests: a process can be a node of one master only
         yield lambda: open_ros1(endpoint, {})
 
@@ -48,7 +56,7 @@ NETWORKS = [
     pytest.param(local, id="local"),
     pytest.param(zenoh, id="zenoh"),
     pytest.param(nats, id="nats", marks=pytest.mark.nats),
-    pytest.param(ros1, id="ros1", marks=pytest.mark.ros1),
+    pytest.param(ros1_network, id="ros1", marks=pytest.mark.ros1),
 ]
 
 
@@ -147,3 +155,172 @@ def test_patterns_match_as_in_zenoh(pattern: list[str], topic: list[str]) -> Non
     keys = pytest.importorskip("zenoh", reason="needs the extra 'svea'").KeyExpr
     meant = keys.autocanonize("/".join(pattern)).includes(keys("/".join(topic)))
     assert matcher("/".join(pattern))("/".join(topic)) == meant
+
+
+CAR = Car(name="svea1", agent=7)
+STAMP = 3_000_000_004
+POINT = struct.pack("<IIII", 0, 3, 4, 3) + b"map" + struct.pack("<3d", 1.5, -2.0, 0.25)
+ESTIMATE, HEARD = SVEA.topic_of("svea1", Role.ESTIMATE), SVEA.topic_of("svea1", Role.POINT)
+
+
+def ends() -> tuple[Authors, HubTransport, list[Arrival]]:
+    """Return a translating end, a plain one on the same network and what that hears."""
+    hub = Hub()
+    plain, heard = hub.connect(), []  # type: ignore[var-annotated]
+    plain.subscribe("**", heard.append)
+    return Authors(hub.connect(), routes_of(CAR)), plain, heard
+
+
+def geometry(kind: str, **fields: Any) -> Any:
+    return make(f"geometry_msgs/msg/{kind}", **fields)
+
+
+def estimate() -> bytes:
+    turned = geometry("Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
+    pose = geometry("Pose", position=geometry("Point", x=1.5, y=-2.0, z=0.25), orientation=turned)
+    uncertain = geometry("PoseWithCovariance", pose=pose, covariance=np.eye(6).ravel())
+    return encode(geometry("PoseWithCovarianceStamped", header=header(STAMP, "map"), pose=uncertain))
+
+
+def test_an_estimate_is_the_43_bytes_of_a_riccati_point_and_itself() -> None:
+    authors, _, heard = ends()
+    authors.publish(ESTIMATE, estimate(), b"signed")
+    assert [(a.topic, a.payload, a.attachment) for a in heard] == [
+        (ESTIMATE, estimate(), b"signed"),
+        ("agent7/riccatiPoint", POINT, b""),
+    ]
+    assert len(POINT) == 43
+
+
+def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> None:
+    authors, plain, _ = ends()
+    heard = heard_by(authors, HEARD)
+    plain.publish("agent7/riccatiPoint", struct.pack("<I", 77) + POINT[4:], b"signed")
+    plain.publish("agent8/riccatiPoint", POINT)
+    assert [(a.topic, a.attachment) for a in heard] == [(HEARD, b"signed")]
+    message = decode(heard[0].payload, SVEA.topics[Role.POINT].type)
+    told = read(Role.POINT, message)
+    assert isinstance(told, CarPose)
+    np.testing.assert_array_equal(told.position, [1.5, -2.0, 0.25])
+    assert told.rotation is None
+    assert told.covariance is None
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == STAMP
+
+
+@pytest.mark.parametrize(
+    ("y", "z", "steering", "velocity"),
+    [
+        (0.0, 500.0, 0, 0),
+        (-286.48, 500.0 - 5 * 100 * 0.8 / 1.7, 36, 70),  # 0.2 rad to the left and 0.8 m/s, as KTH's interface says it
+        (-900.0, 50.0, 114, 116),  # 90 %: 0.85 * 90 + 15 = 91.5
+        (900.0, 950.0, -114, -116),
+    ],
+)
+def test_what_the_gate_lets_through_is_what_the_low_level_takes(
+    y: float, z: float, steering: int, velocity: int
+) -> None:
+    authors, _, heard = ends()
+    message = make(SVEA.topics[Role.MANUAL].type)
+    message.y, message.z, message.aux3 = y, z, 1000.0
+    authors.publish(SVEA.topic_of("svea1", Role.MANUAL), encode(message))
+    sent = {arrival.topic: arrival.payload for arrival in heard}["agent7/lli/ctrl_request"]
+    assert struct.unpack("<bb", sent[:2]) == (steering, velocity)
+    assert len(sent) == 4
+
+
+def test_commands_reach_the_low_level_only_through_the_gate() -> None:
+    authors, _, heard = ends()
+    topic = SVEA.topic_of("svea1", Role.COMMAND)
+    authors.publish(topic, encode(make(SVEA.topics[Role.COMMAND].type)), b"signed")
+    assert [(arrival.topic, arrival.attachment) for arrival in heard] == [(topic, b"signed")]
+
+
+NAMES = {
+    Role.DETECTIONS: "agent7/pixy_node/objectsInfo",
+    Role.BEARINGS: "agent7/pixy_landmark_detection/objectsBearing",
+    Role.CAMERA_INFO: "agent7/pixy_node/camera_info",
+    Role.WHEEL: "agent7/actuation_twist",
+    Role.TRUTH: "qualisys/svea1/odom",
+    Role.POINT: "agent7/riccatiPoint",
+}
+
+
+def filled(kind: str, draw: Any) -> Any:
+    """Return a message of a type full of numbers."""
+    message = make(kind)
+
+    def fill(part: Any) -> None:
+        for name, value in vars(part).items():
+            if name == "__msgtype__":
+                continue
+            if isinstance(value, np.ndarray):
+                value[:] = draw(st.floats(-1e3, 1e3))
+            elif isinstance(value, str):
+                setattr(part, name, draw(st.text(max_size=9, alphabet="abc/_")))
+            elif isinstance(value, bool | int):
+                setattr(part, name, type(value)(draw(st.integers(0, 1))))
+            elif isinstance(value, float):
+                setattr(part, name, draw(st.floats(width=32, allow_nan=False)))
+            elif isinstance(value, list):
+                block = "ObjectInfo" if name == "objects" else "ObjectBearing"
+                value.extend(filled(f"pixy_camera/msg/{block}", draw) for _ in range(draw(st.integers(0, 3))))
+            else:
+                fill(value)
+
+    fill(message)
+    return message
+
+
+@given(data=st.data(), role=st.sampled_from(list(NAMES)))
+def test_exact_counterparts_come_back_as_the_bytes_they_were(data: st.DataObject, role: Role) -> None:
+    sender, plain, on_the_wire = ends()
+    receiver = Authors(plain, routes_of(CAR))
+    heard = heard_by(receiver, "fleet/**")
+    sent = encode(filled(SVEA.topics[role].type, data.draw))
+    sender.publish(SVEA.topic_of("svea1", role), sent, b"signed")
+    assert [arrival.topic for arrival in on_the_wire] == [NAMES[role]]
+    assert ros1().deserialize_ros1(on_the_wire[0].payload, SVEA.topics[role].type).header.seq == 0
+    assert [(a.topic, a.payload, a.attachment) for a in heard] == [(SVEA.topic_of("svea1", role), sent, b"signed")]
+
+
+def test_matrices_of_a_camera_keep_their_values() -> None:
+    kind = "sensor_msgs/msg/CameraInfo"
+    info = make(kind, k=np.arange(9.0), d=np.arange(5.0))
+    told = ros1().deserialize_ros1(ros1_of(encode(info), kind), kind)
+    np.testing.assert_array_equal(told.K, np.arange(9.0))
+    np.testing.assert_array_equal(told.D, np.arange(5.0))
+
+
+def test_bytes_that_are_no_such_message_go_no_further() -> None:
+    authors, plain, heard = ends()
+    back = heard_by(authors, HEARD)
+    plain.publish("agent7/riccatiPoint", b"junk")
+    authors.publish(SVEA.topic_of("svea1", Role.WHEEL), b"junk")
+    assert not back
+    assert [arrival.payload for arrival in heard] == [b"junk"]
+
+
+def test_messages_of_ours_and_presences_pass_untouched() -> None:
+    authors, plain, _ = ends()
+    back = heard_by(authors, "**")
+    seen = seen_by(authors)
+    plain.announce("fleet/alive/svea1")
+    plain.publish("fleet/svea1/coopenv/gate", b"anything", b"signed")
+    plain.publish("agent7/riccatiPoint", POINT)
+    assert seen == [("fleet/alive/svea1", True)]
+    assert [arrival.topic for arrival in back] == ["fleet/svea1/coopenv/gate", HEARD]
+    authors.close()
+    plain.publish("fleet/svea1/coopenv/gate", b"anything")
+    assert len(back) == 2
+
+
+def test_a_car_has_the_number_of_its_marker_or_needs_one() -> None:
+    assert {route.name for route in routes_of(Car(name="c", marker=3))} >= {"agent3/riccatiPoint", "qualisys/c/odom"}
+    with pytest.raises(DeploymentError, match=r"^cars: c: agent is missing: "):
+        routes_of(Car(name="c"))
+
+
+def test_every_counterpart_has_another_name_unless_it_is_of_the_same_thing() -> None:
+    names = [route.name for route in routes_of(CAR)]
+    assert len(names) == len(set(names)) + 1
+    assert {route.role for route in routes_of(CAR) if route.exact} == set(NAMES)

@@ -29,8 +29,7 @@ from coopenv.cars.transport.nats import (
     subjects_of,
 )
 from coopenv.cars.transport.zenoh import open_transport
-from tests.helpers.authority import Authority
-from tests.helpers.brokers import nats_server
+from tests.helpers.brokers import Authority, nats_server
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port, heard_by, listening, seen_by
 

@@ -1,0 +1,245 @@
+"""The package's ground floor: errors in one line, numbers for people, results as JSON, seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import coopenv
+from coopenv.base.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown, training_seed, world_keys
+from coopenv.base.format import column, fixed, in_parentheses, json_text, jsonable, number, seconds, with_error
+
+
+class Unspeakable:
+    def __repr__(self) -> str:
+        raise RuntimeError
+
+
+def test_one_line_without_control_characters() -> None:
+    error = DataError("file\n  \t'\x1b]0;owned\x07\u202e\udc80' is\nwrong: größer ≥ 1 µm")
+    assert str(error) == r"file '\x1b]0;owned\x07\u202e\udc80' is wrong: größer ≥ 1 µm"
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_long_messages_keep_both_ends() -> None:
+    message = str(CoopenvError("begin " + "a" * 5000 + " end"))
+    assert len(message) <= MAX_MESSAGE and message.startswith("begin a") and message.endswith("a end")
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("a", "'a'"),
+        (1.5, "1.5"),
+        ("x" * 100, "'" + "x" * 27 + "..." + "x" * 27 + "'"),
+        (10**5000, "a int"),
+        (Unspeakable(), "a Unspeakable"),
+    ],
+    ids=["text", "number", "long", "huge", "unspeakable"],
+)
+def test_values_as_errors_quote_them(value: object, expected: str) -> None:
+    assert shown(value) == expected
+
+
+def test_memory() -> None:
+    check_memory(2**20, "this")
+    with pytest.raises(CoopenvError, match=r"^this would need 3 GiB of memory, there are 2$"):
+        check_memory(3 * 2**30, "this", 2**31)
+    with pytest.raises(CoopenvError, match=r"^that would need 9.31e\+08 GiB"):
+        check_memory(1e18, "that")
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (0.0, 4, "0"),
+        (-0.0, 4, "0"),
+        (1 / 3, 4, "0.3333"),
+        (12345.6, 4, "12346"),
+        (12345.6, 3, "12346"),
+        (2.5e6, 3, "2.5e+06"),
+        (-0.5, 3, "-0.5"),
+        (1e-5, 3, "1e-05"),
+        (NAN, 3, "-"),
+        (math.inf, 3, "inf"),
+    ],
+)
+def test_numbers(value: float, digits: int, text: str) -> None:
+    assert number(value, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "texts"),
+    [
+        ([11.5, 90.0, 7.25], ["11.5", "90.0", "7.2"]),
+        ([0.0042, 0.0135, 0.1], ["0.0042", "0.0135", "0.1000"]),
+        ([6.8e-4, 0.04, NAN], ["0.00068", "0.04000", "-"]),
+        ([1e-12, 0.5, 0.0], ["1e-12", "0.500", "0.000"]),
+        ([123.0, 4567.0], ["123", "4567"]),
+        ([3.0, 2e7, math.inf], ["3.00", "2e+07", "inf"]),
+        ([0.0, 0.0], ["0", "0"]),
+        ([NAN], ["-"]),
+        ([], []),
+    ],
+)
+def test_a_column_has_equal_decimals(values: list[float], texts: list[str]) -> None:
+    assert column(values) == texts
+
+
+def test_lengths_align_below_ten() -> None:
+    assert [fixed(value, 3) for value in (0.01, 9.5, 12.34, 54321.0, NAN)] == ["0.010", "9.500", "12.3", "5e+04", "-"]
+
+
+def test_times() -> None:
+    assert seconds([2.934, NAN]) == ["2.93", "never"]
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.01234, 0.00042, "0.0123(4)"),
+        (0.01234, 0.00096, "0.012(1)"),
+        (12.34, 3.2, "12(3)"),
+        (123.4, 27.0, "123(27)"),
+        (0.5, 2.0, "0.5(20)"),
+        (1.0, 0.0, "1.000(0)"),
+        (0.0, 0.0, "0(0)"),
+        (0.01234, NAN, "0.0123"),
+        (NAN, 0.1, "-"),
+    ],
+)
+def test_standard_errors_in_parentheses(value: float, error: float, text: str) -> None:
+    assert in_parentheses(value, error) == text
+
+
+def test_a_number_and_its_error_have_the_same_decimals() -> None:
+    assert with_error(0.01234, 0.00042) == ("0.0123", "0.0004")
+    assert with_error(0.01234, NAN) == ("0.0123", "")
+
+
+@dataclass
+class Row:
+    name: str
+    value: float
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (np.float64("nan"), None),
+        ([math.inf, np.int64(3), np.array([1.0, np.nan])], [None, 3, [1.0, None]]),
+        ((True, "x", None, np.bool_(False)), [True, "x", None, False]),
+        (Row("y", -math.inf), {"name": "y", "value": None}),
+        (Path("out/run"), "out/run"),
+        (np.float32(0.5), 0.5),
+    ],
+)
+def test_numpy_and_nan_are_written_as_json_knows_them(value: Any, plain: Any) -> None:
+    assert json.loads(json_text({"a": value})) == {"a": plain}
+    assert json.loads(json.dumps(jsonable(value), allow_nan=False)) == plain
+    assert json_text(value).endswith("\n")
+
+
+NAME = "urban_crossing"
+WORD = 2**32
+
+
+@given(
+    a=st.tuples(st.integers(0, WORD - 1), st.integers(0, WORD - 1)),
+    b=st.tuples(st.integers(0, WORD - 1), st.integers(0, WORD - 1)),
+)
+def test_a_key_is_that_of_one_seed_and_world(a: tuple[int, int], b: tuple[int, int]) -> None:
+    keys = [world_keys(seed, 1, world)[0] for seed, world in (a, b)]
+    assert (keys[0] == keys[1]) == (a == b)
+    assert keys[0] < 2**64
+    assert (keys[0] >> 31) % 2 == (a[0] in coopenv.EVALUATION_SEEDS)
+
+
+@given(st.integers(WORD, 2**200))
+def test_larger_seeds_are_for_training(seed: int) -> None:
+    (key,) = world_keys(seed)
+    assert key not in coopenv.EVALUATION_SEEDS
+    assert key < 2**31
+    assert world_keys(seed, 3) == [key, key + WORD, key + 2 * WORD]
+
+
+def test_larger_seeds_differ() -> None:
+    assert len({world_keys(WORD + k)[0] for k in range(1000)}) == 1000
+
+
+def test_evaluation_seeds() -> None:
+    assert [coopenv.evaluation_seed(k) for k in (0, 1, 2**31 - 1)] == [2**31, 2**31 + 1, 2**32 - 1]
+    for wrong in (-1, 2**31, 1.0, None):
+        with pytest.raises(CoopenvError, match="seed"):
+            coopenv.evaluation_seed(wrong)  # type: ignore[arg-type]
+
+
+def test_batches_of_different_seeds_have_no_world_in_common() -> None:
+    env = coopenv.make_vec(NAME, num_worlds=32)
+    drawn = [env.world_major(env.reset(seed=seed)[0]).reshape(32, -1) for seed in (*range(6), WORD - 1)]
+    assert len(np.unique(np.concatenate(drawn), axis=0)) == 7 * 32
+
+
+@pytest.fixture(scope="module")
+def single() -> Any:
+    return coopenv.parallel_env(NAME)
+
+
+def first(env: Any, **arguments: Any) -> np.ndarray:
+    return np.stack(list(env.reset(**arguments)[0].values()))
+
+
+def present(batch: Any, observations: np.ndarray) -> list[np.ndarray]:
+    """Return the observations by world of the vehicles that are there."""
+    there = batch.engine.view("alive")
+    return [rows[alive] for rows, alive in zip(batch.world_major(observations), there, strict=True)]
+
+
+def test_a_world_of_a_batch_alone(single: Any) -> None:
+    batch = coopenv.make_vec(NAME, num_worlds=3)
+    rows = present(batch, batch.reset(seed=7)[0])
+    for world in range(3):
+        np.testing.assert_array_equal(first(single, seed=7, options={"world": world}), rows[world])
+    np.testing.assert_array_equal(first(single, seed=7), rows[0])
+
+
+def test_a_sequence_of_seeds_is_of_single_worlds_and_none_goes_on(single: Any) -> None:
+    batch = coopenv.make_vec(NAME, num_worlds=3)
+    rows = present(batch, batch.reset(seed=[5, None, 9])[0])
+    np.testing.assert_array_equal(first(single, seed=5), rows[0])
+    np.testing.assert_array_equal(first(single, seed=9), rows[2])
+    keys = batch.engine.view("seed").copy()
+    assert keys[1] % WORD < 2**31
+    again = present(batch, batch.reset(seed=[None, 4, 9])[0])
+    assert batch.engine.view("seed").tolist() == [5, 4, 9]
+    first(single, seed=5)
+    np.testing.assert_array_equal(first(single), again[0])
+    np.testing.assert_array_equal(first(single, seed=4), again[1])
+    np.testing.assert_array_equal(again[2], rows[2])
+
+
+def test_without_a_seed_worlds_are_for_training() -> None:
+    assert all(training_seed() < 2**31 for _ in range(100))
+    env = coopenv.make_vec(NAME, num_worlds=4)
+    env.reset()
+    keys = env.engine.view("seed")
+    assert len({int(key) % WORD for key in keys}) == 1
+    assert int(keys[0]) < 2**31
+
+
+@pytest.mark.parametrize("world", [-1, WORD, 1.0, "2", True])
+def test_wrong_worlds(single: Any, world: Any) -> None:
+    with pytest.raises(CoopenvError, match="option 'world' must be a whole number"):
+        single.reset(seed=0, options={"world": world})

@@ -1,0 +1,293 @@
+"""Devices, functions that are handed records by reference, and the cache of compiled kernels."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import coopenv
+from coopenv.backends.simulated import Simulated
+from coopenv.world import launch
+from coopenv.world.launch import start_warp
+from coopenv.world.warp_internals import device_function
+from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.processes import COOPENV, ROOT, small_disk
+
+start_warp()
+CUDA = pytest.param("cuda:0", marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"))
+OVERRIDES: dict[str, Any] = {"horizon": 3.0}
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("name", ["busy_intersection", FOUR_WAY])
+def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
+    scenario = coopenv.load_scenario(name, OVERRIDES)
+    worlds = [Simulated(scenario).world(5, "float64", where, None) for where in ("cpu", device)]
+    actions = np.random.default_rng(0).uniform(-1, 1, (5, len(scenario.vehicles), 2))
+    for world in worlds:
+        world.reset(range(5))
+        world.actions.assign(actions)
+        for _ in range(10):
+            world.advance(scenario.ticks_per_decision)
+    here, there = (world.get_state() for world in worlds)
+    for name_of, value in here.items():
+        if value.dtype.kind == "f":
+            np.testing.assert_allclose(there[name_of], value, rtol=1e-7, atol=1e-8, err_msg=name_of)
+        else:
+            np.testing.assert_array_equal(there[name_of], value, err_msg=name_of)
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_tensors_share_memory_and_agree_with_numpy(device: str, autoreset: str) -> None:
+    torch = pytest.importorskip("torch", reason="needs the extra 'train'")
+    options: dict[str, Any] = {"num_worlds": 4, "autoreset": autoreset, "overrides": OVERRIDES}
+    tensors = coopenv.make_vec(FOUR_WAY, device=device, arrays="torch", **options)
+    arrays = coopenv.make_vec(FOUR_WAY, **options)
+    seen, _ = tensors.reset(seed=3)
+    assert str(seen.device) == device and seen.dtype == torch.float32
+    np.testing.assert_allclose(seen.cpu().numpy(), arrays.reset(seed=3)[0], atol=1e-4)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        actions = rng.uniform(-1, 1, (16, 2)).astype(np.float32)
+        given = tensors.step(torch.as_tensor(actions, device=device))
+        expected = arrays.step(actions)
+        assert given[0].data_ptr() == seen.data_ptr()
+        assert given[2].cpu().numpy().tolist() == expected[2].tolist()
+        assert given[3].cpu().numpy().tolist() == expected[3].tolist()
+        np.testing.assert_allclose(given[0].cpu().numpy(), expected[0], atol=2e-3)
+        np.testing.assert_allclose(given[1].cpu().numpy(), expected[1], atol=2e-3)
+
+
+@wp.struct
+class Single:
+    values: wp.array(dtype=wp.float32)
+    step: wp.float32
+
+
+@wp.struct
+class Double:
+    values: wp.array(dtype=wp.float64)
+    step: wp.float64
+
+
+@device_function
+def stepped(state: Any, i: int, times: int):
+    return state.values[i] + state.step * type(state.step)(times)
+
+
+@device_function
+def advance(state: Any, i: int, times: int):
+    state.values[i] = stepped(state, i, times)
+
+
+def make_twice(function: Any) -> Any:
+    """Return a function that closes over another one, as an observer's do."""
+
+    @device_function
+    def twice(state: Any, i: int, times: int):
+        function(state, i, times)
+        function(state, i, times)
+
+    return twice
+
+
+advance_twice = make_twice(advance)
+
+
+def move(state: Any, times: int):
+    advance_twice(state, wp.tid(), times)
+
+
+def start_of(record: Any, dtype: Any) -> Any:
+    state = record()
+    state.values = wp.array([1.0, 2.0, 3.0], dtype=dtype, device="cpu")
+    state.step = 0.5
+    return state
+
+
+@pytest.mark.parametrize(("record", "dtype"), [(Single, wp.float32), (Double, wp.float64)])
+def test_functions_write_into_the_arrays_of_records(record: Any, dtype: Any) -> None:
+    state = start_of(record, dtype)
+    wp.launch(launch.kernel(move, dtype.__name__), dim=3, inputs=[state, 3], device="cpu")
+    np.testing.assert_allclose(state.values.numpy(), [4.0, 5.0, 6.0])
+
+
+def test_records_are_handed_over_by_reference_and_numbers_are_not() -> None:
+    for function in (advance, advance_twice, stepped):
+        overload = function.get_overload([Single, wp.int32, wp.int32], {})
+        assert overload.input_types == {"state": wp.ref[Single], "i": wp.int32, "times": wp.int32}
+
+
+def test_what_is_no_record_stays_a_value() -> None:
+    @device_function
+    def increased(state: Any):
+        return state + type(state)(1.0)
+
+    assert increased.get_overload([wp.float32], {}).input_types == {"state": wp.float32}
+
+
+def test_the_threshold_of_inlining_replaces_that_of_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = "-march=native -mllvm=-inline-threshold=9000 -O1 -mllvm=-slp-recursion-max-depth=4"
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
+    monkeypatch.setattr(launch, "INLINE_THRESHOLD", 7)
+    assert launch.compiler_options()["cpu_compiler_flags"] == "-march=native -O1 -mllvm=-inline-threshold=7"
+
+
+@pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])
+def test_flags_of_the_user_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
+    assert launch.compiler_options() == {}
+
+
+PRIVATE = {"_cls", "_wp_scalar_type_", "native_func", "hooks", "adj", "runtime"}
+PACKAGE = Path(coopenv.__file__).parent
+OWN = PACKAGE / "world" / "warp_internals.py"
+
+
+def private_uses(path: Path) -> list[int]:
+    """Return the lines of a file in which private names of Warp stand, as attributes, texts or imports."""
+    uses = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if (
+            (isinstance(node, ast.Attribute) and (node.attr in PRIVATE or (node.attr == "_src")))
+            or (isinstance(node, ast.Attribute) and node.attr == "__class__" and isinstance(node.ctx, ast.Store))
+            or (isinstance(node, ast.Constant) and node.value == "_wp_scalar_type_")
+            or (isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp._"))
+            or (isinstance(node, ast.Import) and any(alias.name.startswith("warp._") for alias in node.names))
+        ):
+            uses.append(node.lineno)
+    return uses
+
+
+def test_no_other_file_uses_the_private_interface_of_warp() -> None:
+    assert private_uses(OWN)
+    found = {str(path): lines for path in PACKAGE.rglob("*.py") if path != OWN and (lines := private_uses(path))}
+    assert found == {}
+
+
+PROGRAM = """
+import sys
+from typing import Any
+import numpy as np
+import warp as wp
+from coopenv.base.errors import CoopenvError
+from coopenv.world.launch import Launcher, start_warp
+
+def twice(x: wp.array(dtype=Any)):
+    i = wp.tid()
+    x[i] = x[i] + x[i]
+
+try:
+    start_warp()
+    x = wp.array(np.arange(3.0), dtype=wp.float64, device="cpu")
+    Launcher(3, "cpu", "float64")("twice", twice, [x])
+    print(x.numpy().tolist())
+except CoopenvError as error:
+    print("error:", error)
+"""
+DONE = "[0.0, 2.0, 4.0]\n"
+"""What the program prints."""
+
+
+def double(x: wp.array(dtype=Any)):
+    i = wp.tid()
+    x[i] = x[i] + x[i]
+
+
+@pytest.fixture
+def doubled(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], list[float]]:
+    """A function that launches a kernel with a cache, as if this process had loaded nothing yet."""
+    launch.start_warp()
+    kernel = launch.kernel(double, "float64")
+
+    def run(cache: Path) -> list[float]:
+        monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
+        kernel.module.unload()
+        launch._loaded.discard(kernel.module.name)
+        x = wp.array(np.arange(3.0), dtype=wp.float64, device="cpu")
+        launch.Launcher(3, "cpu", "float64")("double", double, [x])
+        return list(x.numpy())
+
+    return run
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    return tmp_path / "program.py"
+
+
+def run(*command: str | Path, **variables: str | Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **{name: str(value) for name, value in variables.items()}}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_what_is_damaged_is_built_again(doubled: Callable[[Path], list[float]], tmp_path: Path) -> None:
+    assert doubled(tmp_path) == [0.0, 2.0, 4.0]
+    for suffix, left in ((".o", 0.5), (".o", 0.0), (".meta", 0.5)):
+        (part,) = tmp_path.glob(f"wp_*double*/*{suffix}")
+        good = part.read_bytes()
+        part.write_bytes(good[: int(left * len(good))])
+        assert doubled(tmp_path) == [0.0, 2.0, 4.0]
+        assert len(part.read_bytes()) == len(good)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of files")
+def test_of_many_processes_one_compiles(program: Path, tmp_path: Path) -> None:
+    loud = "    start_warp()\n    wp.config.log_level = wp.LOG_INFO\n"
+    program.write_text(PROGRAM.replace("    start_warp()\n", loud))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path / "cache")}
+    command = [sys.executable, str(program)]
+    started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=120)[0] for process in started]
+    assert all(words.endswith(DONE) for words in said)
+    loaded = [next(line for line in words.splitlines() if "twice" in line) for words in said]
+    assert sorted("(compiled)" in line for line in loaded) == [False, True]
+
+
+@pytest.mark.parametrize(("variable", "place"), [("WARP_CACHE_PATH", "/dev/null"), ("HOME", "/proc/nowhere")])
+def test_a_place_that_cannot_be_is_one_line(variable: str, place: str, tmp_path: Path) -> None:
+    unset = [word for name in {"WARP_CACHE_PATH", "XDG_CACHE_HOME"} - {variable} for word in ("-u", name)]
+    command = (*COOPENV, "run", "overtaking", "--steps", "1", "--out", tmp_path / "result")
+    done = run("env", *unset, *command, **{variable: place})
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"error: cannot keep compiled kernels in {place}/")
+    assert "WARP_CACHE_PATH" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", "20m") as place:
+        yield place
+
+
+def test_a_read_only_cache_serves_what_it_has(doubled: Callable[[Path], list[float]], disk: Path) -> None:
+    remount = ["mount", "-o", "remount,ro", disk]
+    subprocess.run(remount, check=True)
+    with pytest.raises(launch.KernelCacheError, match=f"cannot keep compiled kernels in {disk}: Read-only"):
+        doubled(disk)
+    subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
+    assert doubled(disk) == [0.0, 2.0, 4.0]
+    subprocess.run(remount, check=True)
+    assert doubled(disk) == [0.0, 2.0, 4.0]
+
+
+def test_a_full_disk_is_told_before_the_compiler_meets_it(program: Path, disk: Path) -> None:
+    with (disk / "filler").open("wb", buffering=0) as stream:
+        while stream.write(bytes(1 << 16)) == 1 << 16:
+            if stream.tell() > 18 << 20:
+                break
+    done = run(sys.executable, program, WARP_CACHE_PATH=disk)
+    assert "No space left on device; set the variable WARP_CACHE_PATH" in done.stdout
+    assert done.stderr == ""
