@@ -178,10 +178,6 @@ def test_targets_are_projected_to_where_cameras_measure_them() -> None:
     assert seen
 
 
-msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
-zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
-
-
 def scene(name: str, **overrides: Any) -> SceneRecord:
     scenario = coopenv.load_scenario(name, {"horizon": 4.0, **overrides})
     return scene_of(Engine(scenario), Origin.of(name, scenario, seed=1))
@@ -194,6 +190,8 @@ def overtaking() -> SceneRecord:
 
 def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
     """Return the length of the recording in a page, s, and its messages with their times."""
+    msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
+    zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
     found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
     assert found
     packed = base64.b64decode(found[1])

@@ -296,8 +296,6 @@ def test_a_bag_is_no_scenario() -> None:
         load_scenario("drive.bag")
 
 
-pytest.importorskip("rosbags", reason="needs the extra 'log'")
-
 TOPIC, KIND = "/blob", "std_msgs/msg/String"
 LARGE = 40 * 2**20
 """Bytes of a message of zeros, more than any may have."""
