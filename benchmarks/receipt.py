@@ -80,7 +80,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     return {
         "nothing": [],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
-        "monitor of odometry": [(constants, "ODOMETRY_FAULT", 1e-9)],
+        "monitors of the own odometry": [(constants, "ODOMETRY_FAULT", 1e-9)],
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
         "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
