@@ -1,0 +1,156 @@
+"""In every environment that is there to learn to look, looking pays, and levels make it harder.
+
+Nobody's edit takes its question away, and "normal" is what its file says.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, score
+from coopenv.policies import load_agent
+from coopenv.scenario import load_scenario
+from coopenv.scenario.learning import Difficulty
+from tests.helpers.marks import largest_slow
+
+pytestmark = pytest.mark.headroom
+
+WORLDS = {"open_square": 32, "facade": 32, "behind_truck": 32, "urban_crossing": 48, "large_crossing": 6}
+"""How many suffice for intervals that tell the drivers apart."""
+MOST_TIME = 0.05
+"""Share of the travel time that looking may cost."""
+
+
+@cache
+def episodes(environment: str, agent: str, sensing: str = "sensed", times: int = 2) -> Episodes:
+    """Return a driver's episodes in so many times half of the environment's worlds."""
+    scenario = load_scenario(environment, {"sensing": sensing})
+    worlds = times * WORLDS[environment] // 2
+    return drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
+
+
+@cache
+def figures(
+    environment: str, agent: str, sensing: str = "sensed", times: int = 2
+) -> dict[str, tuple[float, float, float]]:
+    return {r.metric: (r.mean, r.ci_low, r.ci_high) for r in score(episodes(environment, agent, sensing, times))}
+
+
+def change_of_time(environment: str, times: int = 2) -> Difference:
+    """Return what looking does to the travel time."""
+    of = (episodes(environment, agent, times=times) for agent in ("peek", "route_follower"))
+    return next(each for each in compare_paired(*of) if each.metric == "travel_time_s")
+
+
+@pytest.mark.parametrize("environment", largest_slow(WORLDS))
+def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environment: str) -> None:
+    straight, lookout = figures(environment, "route_follower"), figures(environment, "peek")
+    assert lookout["e95_m"][0] <= 0.5 * straight["e95_m"][0]
+    assert lookout["e95_m"][2] < straight["e95_m"][1]  # the intervals are apart
+    assert change_of_time(environment).relative_ci_low <= MOST_TIME  # so few worlds do not show more
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["open_square", "urban_crossing"])
+def test_no_deadlock_where_all_receive_each_other(environment: str) -> None:
+    scenario = load_scenario(environment, {"topology.acyclic": False})
+    found = score(drive(Engine(scenario, 64), load_agent("peek", scenario), held_out_seeds(9, 64)))
+    rates = {result.metric: result.mean for result in found}
+    assert rates["arrival_rate"] >= 0.97 and rates["collision_rate"] <= 0.02, rates
+
+
+@pytest.mark.slow
+def test_a_planner_knows_better_where_it_is_and_loses_little_time() -> None:
+    straight, planner = figures("open_square", "route_follower"), figures("open_square", "look_ahead")
+    assert planner["e95_m"][0] < 0.6 * straight["e95_m"][0] and planner["e50_m"][0] < 0.7 * straight["e50_m"][0]
+    assert planner["few_targets_share"][0] < straight["few_targets_share"][0]
+    assert planner["travel_time_s"][0] < 1.15 * straight["travel_time_s"][0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", WORLDS)
+def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
+    assert change_of_time(environment, 15).relative <= MOST_TIME
+
+
+@pytest.mark.parametrize("environment", largest_slow(WORLDS))
+def test_errors_depend_on_what_is_sensed(environment: str) -> None:
+    sensed = figures(environment, "route_follower")
+    ideal, blind = (figures(environment, "route_follower", how, 1) for how in ("ideal", "blind"))
+    assert ideal["e95_m"][2] < 0.5 * sensed["e95_m"][1]
+    assert sensed["e50_m"][2] < blind["e50_m"][1]  # these intervals are apart, too
+    assert ideal["arrival_rate"][0] > 0.97
+
+
+@pytest.mark.parametrize("environment", WORLDS)
+def test_sensing_is_all_that_the_dial_changes(environment: str) -> None:
+    """Under the same actions the truth is the same."""
+    engines = [Engine(load_scenario(environment, {"sensing": how}), 4) for how in ("ideal", "sensed", "blind")]
+    generator = np.random.default_rng(0)
+    for engine in engines:
+        engine.reset([0, 1, 2, 3])
+    for _ in range(20):
+        actions = generator.uniform(-1.0, 1.0, engines[0].view("actions").shape)
+        for engine in engines:
+            engine.step(actions)
+    for name in ("position", "rotation", "speed", "odometry_velocity", "route", "ended"):
+        for engine in engines[1:]:
+            np.testing.assert_array_equal(engine.view(name), engines[0].view(name), err_msg=name)
+
+
+def observations(environment: str, level: str, **options: object) -> np.ndarray:
+    """Return what 2 worlds are observed to be in the first steps at a level, which the file or a reset says."""
+    overrides = {} if options else {"difficulty.level": level}
+    env = coopenv.make_vec(environment, num_worlds=2, overrides=overrides, autoreset="disabled")
+    seen = [env.reset(seed=3, options=options or None)[0]]
+    seen += [env.step(np.full((env.num_envs, 2), 0.3, np.float32))[0] for _ in range(10)]
+    env.close()
+    return np.stack(seen)
+
+
+@pytest.mark.parametrize("environment", WORLDS)
+def test_a_level_is_said_in_the_file_or_at_a_reset(environment: str) -> None:
+    easy, hard = observations(environment, "easy"), observations(environment, "hard")
+    assert (easy != hard).mean() > 0.1
+    np.testing.assert_array_equal(hard, observations(environment, "", difficulty="hard"))
+    np.testing.assert_array_equal(easy, observations(environment, "", difficulty=0.0))
+
+
+@pytest.mark.parametrize("environment", WORLDS)
+def test_normal_is_what_the_file_says(environment: str) -> None:
+    scenario = load_scenario(environment)
+    assert scenario.difficulty.neutral and scenario.difficulty.matters
+    found = []
+    for difficulty in (scenario.difficulty, Difficulty()):
+        engine = Engine(scenario.model_copy(update={"difficulty": difficulty}), 2)
+        engine.reset([3, 4])
+        for _ in range(10):
+            engine.step(np.full(engine.view("actions").shape, 0.3))
+        found.append(engine.view("observation").copy())
+    np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", WORLDS)
+@pytest.mark.parametrize("agent", ["route_follower", "peek"])
+def test_what_is_harder_is_worse_known(environment: str, agent: str) -> None:
+    errors = []
+    for level in ("easy", "hard"):
+        scenario = load_scenario(environment, {"difficulty.level": level})
+        worlds = 128 // len(scenario.vehicles)
+        episodes = drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
+        errors.append({result.metric: result for result in score(episodes)}["e50_m"])
+    assert errors[0].ci_high < errors[1].ci_low
+
+
+def test_a_level_that_means_nothing_is_refused() -> None:
+    with pytest.raises(coopenv.CoopenvError, match=r"difficulty.*level: nothing depends on it; give factors"):
+        load_scenario("busy_intersection", {"difficulty.level": "hard"})
+    env = coopenv.parallel_env("busy_intersection")
+    with pytest.raises(coopenv.CoopenvError, match="option 'difficulty': nothing depends on it here"):
+        env.reset(seed=0, options={"difficulty": "hard"})
