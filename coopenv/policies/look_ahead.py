@@ -46,19 +46,21 @@ class _Path(NamedTuple):
 class _Follower(NamedTuple):
     """Another vehicle that may measure the planning one; it is predicted to drive straight on along its route.
 
-    An entry per row; its covariance, (rows, plans), has the axes of its route.
+    An entry for each of F rows of planning vehicles.
     """
 
+    row: np.ndarray
+    """(F,), of the planning vehicle."""
     vehicle: np.ndarray
-    counts: np.ndarray
-    """(rows, 1): 1 where it may measure the planning vehicle and is under way, otherwise 0."""
+    """(F,), its own number."""
     place: np.ndarray
-    """(rows, 2), m, in the frame of the planning vehicle."""
-    turn: np.ndarray
-    """(rows, 2, 2), from that frame to its own."""
+    """(F, 2), m, in the frame of the planning vehicle."""
+    forward: np.ndarray
+    """(F, 2), direction of its route in that frame."""
     speed: np.ndarray
-    """(rows, 1), m/s."""
+    """(F, 1), m/s."""
     covariance: PlanarCovariance
+    """(F, plans), along its route and across."""
 
 
 def _repeated(covariance: PlanarCovariance, count: int) -> PlanarCovariance:
@@ -157,15 +159,14 @@ class LookAhead(RouteFollower):
             odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
             camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
             odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, self.cruise * STEP * (step + 1))
-            linearisation_variance = BENT * radial * lateral / np.maximum((line**2).sum(axis=-1), 0.01) ** 2
+            linearisation_variance = BENT * radial * lateral / np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 0.01) ** 2
             covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
             # Uncertainty costs per metre: what a slow plan does not drive is counted at its end.
             cost = cost + STEP * self.price * paces * np.maximum(covariance.std - self.tolerated, 0.0)
             missing = missing + (1.0 - paces) * top * STEP
             followers = [self.follow(each, STEP * (step + 1), place, covariance) for each in followers]
             for each in followers:
-                lost = np.maximum(each.covariance.std - self.tolerated, 0.0)
-                cost = cost + STEP * self.price * each.counts * lost
+                cost[each.row] += STEP * self.price * np.maximum(each.covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
             # Vehicles with a received message are expected to drive straight on at top speed.
             driven = theirs * (STEP * (step + 1)) * forward
@@ -176,8 +177,7 @@ class LookAhead(RouteFollower):
         cost = cost + self.price * (FAR + missing) / top * np.maximum(later.std - self.tolerated, 0.0)
         for each in followers:
             later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
-            lost = np.maximum(later.std - self.tolerated, 0.0)
-            cost = cost + self.price * FAR / each.speed * each.counts * lost
+            cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / top + BACK * np.abs(now.aside))
 
     def follow(
@@ -191,20 +191,21 @@ class LookAhead(RouteFollower):
             place: (rows, plans, 2), m, of this vehicle.
             covariance: (rows, plans), of this vehicle.
         """
-        stride = follower.speed * STEP
+        row, stride = follower.row, follower.speed * STEP
         own = follower.covariance.driven(stride, np.zeros_like(stride), self.drift * STEP, self.turn_drift * STEP)
-        there = follower.place + follower.speed * time * follower.turn[:, 0]
-        offset = place - there[:, None]
-        line = np.einsum("rij,rpj->rpi", follower.turn, offset)[:, :, None]
+        offset = place[row] - (follower.place + follower.speed * time * follower.forward)[:, None]
+        x, y = (follower.forward[:, None, k] for k in (0, 1))
+        ahead, left = x * offset[..., 0] + y * offset[..., 1], x * offset[..., 1] - y * offset[..., 0]
+        line = np.stack([ahead, left], axis=-1)[:, :, None]
         bearing, radial, lateral = own.along(line)
         odds, stds = np.zeros_like(bearing), (np.sqrt(bearing), np.sqrt(radial))
         for vehicle, view in enumerate(self._views):
-            rows = follower.vehicle == vehicle
-            odds[rows] = view.odds(line[rows], np.zeros((1, 1, 1)), *(std[rows] for std in stds))
-        square = np.maximum((line**2).sum(axis=-1), 0.01)
-        sender = covariance.along(offset[:, :, None])[2] / square
+            of_it = follower.vehicle == vehicle
+            odds[of_it] = view.odds(line[of_it], np.zeros((1, 1, 1)), *(std[of_it] for std in stds))
+        square = np.maximum(ahead**2 + left**2, 0.01)[..., None]
+        sender = PlanarCovariance(*(part[row] for part in covariance)).along(offset[:, :, None])[2] / square
         variance = (self.bearing + BENT * radial * lateral / square**2) / (self.frames * STEP) + sender
-        return follower._replace(covariance=own.measured(line, variance, odds * follower.counts[..., None]))
+        return follower._replace(covariance=own.measured(line, variance, odds))
 
     def _route_pieces(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the route (rows, P), rad, own frame, and where they begin, (P,), m."""
@@ -251,17 +252,18 @@ class TeamLookAhead(LookAhead):
         mask, place, forward = (part[due] for part in self.received(observations))
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         heading, left = (self.read(observations, name)[:, 0] for name in ("route_heading", "route_left"))
-        found, senders = [], _senders(due % count, mask.shape[1])
-        for slot, vehicle in enumerate(senders.T):
-            row = due - due % count + vehicle
-            counts = self._measures[vehicle, due % count] & mask[:, slot] & (left[row] > self._radius[vehicle])
-            angle = np.arctan2(forward[:, slot, 1], forward[:, slot, 0]) - heading[row]
-            cosine, sine, none = np.cos(angle), np.sin(angle), np.zeros((len(due), 1))
-            turn = np.stack([np.stack([cosine, sine], axis=-1), np.stack([-sine, cosine], axis=-1)], axis=1)
-            covariance = PlanarCovariance(axes[row, :1] ** 2, none, none, axes[row, 1:2] ** 2, none, std[row] ** 2)
+        found, own = [], due % count
+        for slot, vehicle in enumerate(_senders(own, mask.shape[1]).T):
+            other = due - own + vehicle
+            counts = self._measures[vehicle, own] & mask[:, slot] & (left[other] > self._radius[vehicle])
+            row = np.flatnonzero(counts)
+            vehicle, other, none = vehicle[row], other[row], np.zeros((len(row), 1))
+            angle = np.arctan2(forward[row, slot, 1], forward[row, slot, 0]) - heading[other]
+            along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            variances = (axes[other, :1] ** 2, none, none, axes[other, 1:2] ** 2, none, std[other] ** 2)
             speed = self._top[vehicle][:, None]
-            found.append(_Follower(vehicle, 1.0 * counts[:, None], place[:, slot], turn, speed, covariance))
-        return [each for each in found if each.counts.any()]
+            found.append(_Follower(row, vehicle, place[row, slot], along, speed, PlanarCovariance(*variances)))
+        return [each for each in found if len(each.row)]
 
 
 class Peek(RouteFollower):
