@@ -135,7 +135,8 @@ def page(
     measure: Annotated[
         bool,
         typer.Option(
-            "--measure", help="Measure the value of sensing or cooperation, for ENV.json; else the file that is there is shown."
+            "--measure",
+            help="Measure the value of sensing or cooperation for ENV.json; else that file is shown.",
         ),
     ] = False,
     film: Annotated[

@@ -76,7 +76,7 @@ class LookAhead(RouteFollower):
     that turn to landmarks and back do not keep their headings for longer.
     """
 
-    needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
+    needs: tuple[str, ...] = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
     remembers = 2  # decisions until the next plan, and the present one
     price = 10.0  # s/s, that a second with a standard deviation of 1 m is worth
     tolerated = 0.02  # m, standard deviation that costs nothing
@@ -159,8 +159,7 @@ class LookAhead(RouteFollower):
             odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
             camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
             odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, self.cruise * STEP * (step + 1))
-            linearisation_variance = BENT * radial * lateral / np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 0.01) ** 2
-            covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
+            covariance = covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
             # Uncertainty costs per metre: what a slow plan does not drive is counted at its end.
             cost = cost + STEP * self.price * paces * np.maximum(covariance.std - self.tolerated, 0.0)
             missing = missing + (1.0 - paces) * top * STEP
@@ -180,9 +179,7 @@ class LookAhead(RouteFollower):
             cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / top + BACK * np.abs(now.aside))
 
-    def follow(
-        self, follower: _Follower, time: float, place: np.ndarray, covariance: PlanarCovariance
-    ) -> _Follower:
+    def follow(self, follower: _Follower, time: float, place: np.ndarray, covariance: PlanarCovariance) -> _Follower:
         """Return a follower a step later, after the bearings to this vehicle that it can be expected to have.
 
         Args:
@@ -202,10 +199,17 @@ class LookAhead(RouteFollower):
         for vehicle, view in enumerate(self._views):
             of_it = follower.vehicle == vehicle
             odds[of_it] = view.odds(line[of_it], np.zeros((1, 1, 1)), *(std[of_it] for std in stds))
-        square = np.maximum(ahead**2 + left**2, 0.01)[..., None]
-        sender = PlanarCovariance(*(part[row] for part in covariance)).along(offset[:, :, None])[2] / square
-        variance = (self.bearing + BENT * radial * lateral / square**2) / (self.frames * STEP) + sender
+        sender = PlanarCovariance(*(part[row] for part in covariance)).along(offset[:, :, None])[2]
+        variance = self.bearing_variance(line, radial, lateral) + sender / _square(line)
         return follower._replace(covariance=own.measured(line, variance, odds))
+
+    def bearing_variance(self, line: np.ndarray, radial: np.ndarray, lateral: np.ndarray) -> np.ndarray:
+        """Return the variances, rad^2, of all bearings of a step along lines (..., 2), m, with that of linearisation.
+
+        The other arguments are the variances of the distance and across it, m^2.
+        """
+        linearisation_variance = BENT * radial * lateral / _square(line) ** 2
+        return np.asarray((self.bearing + linearisation_variance) / (self.frames * STEP))
 
     def _route_pieces(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the route (rows, P), rad, own frame, and where they begin, (P,), m."""
@@ -214,6 +218,10 @@ class LookAhead(RouteFollower):
         leg = np.diff(points[:, 1:], axis=1)
         ahead = np.arctan2(leg[..., 1], leg[..., 0])
         return np.column_stack([heading, ahead]), distance[:-1]
+
+
+def _square(line: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 0.01))
 
 
 def _senders(vehicle: np.ndarray, slots: int) -> np.ndarray:
