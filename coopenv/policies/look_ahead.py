@@ -103,6 +103,7 @@ class LookAhead(RouteFollower):
         self._sees_landmarks = np.array([any(target < landmarks for target in row) for row in self._neighbours])
         self._top = np.array([limits.max_speed for limits in scenario.limits])
         self._views = [FieldOfView(camera) for camera in scenario.cameras]
+        self._one_view = all(vars(view) == vars(self.view) for view in self._views)
         self._sharpest = np.tan(self.layout.action[1].high) / self.wheelbase  # rad/m
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -130,6 +131,7 @@ class LookAhead(RouteFollower):
         landmarks = self.read(observations, "map_position")[..., :2]
         boxes = self.occluders.boxes(partial(self.read, observations))
         known = (self.known(observations) & self._sees_landmarks[vehicle][:, None])[:, None]
+        view = self.view if self._one_view else FieldOfView.of_rows(self._views, vehicle)
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         none = np.zeros_like(std)
         covariance = PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, std**2)
@@ -156,8 +158,8 @@ class LookAhead(RouteFollower):
             place = np.stack([now.x, now.y], axis=-1)
             line = landmarks[:, None] - place[:, :, None]
             bearing, radial, lateral = covariance.along(line)
-            odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
-            camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
+            odds = view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
+            camera = place + view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
             odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, self.cruise * STEP * (step + 1))
             covariance = covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
             # Uncertainty costs per metre: what a slow plan does not drive is counted at its end.
@@ -195,10 +197,8 @@ class LookAhead(RouteFollower):
         ahead, left = x * offset[..., 0] + y * offset[..., 1], x * offset[..., 1] - y * offset[..., 0]
         line = np.stack([ahead, left], axis=-1)[:, :, None]
         bearing, radial, lateral = own.along(line)
-        odds, stds = np.zeros_like(bearing), (np.sqrt(bearing), np.sqrt(radial))
-        for vehicle, view in enumerate(self._views):
-            of_it = follower.vehicle == vehicle
-            odds[of_it] = view.odds(line[of_it], np.zeros((1, 1, 1)), *(std[of_it] for std in stds))
+        view = FieldOfView.of_rows(self._views, follower.vehicle)
+        odds = view.odds(line, np.zeros((1, 1, 1)), np.sqrt(bearing), np.sqrt(radial))
         sender = PlanarCovariance(*(part[row] for part in covariance)).along(offset[:, :, None])[2]
         variance = self.bearing_variance(line, radial, lateral) + sender / _square(line)
         return follower._replace(covariance=own.measured(line, variance, odds))

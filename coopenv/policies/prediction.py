@@ -8,7 +8,7 @@ Automatic Control 49, 2004.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -233,6 +233,14 @@ class FieldOfView:
             focal, middle, width = camera.focal_length[0], camera.principal_point[0], camera.image_size[0]
             self.left = math.atan(middle / focal) - MARGIN
             self.right = -math.atan((width - middle) / focal) + MARGIN
+
+    @classmethod
+    def of_rows(cls, views: Sequence["FieldOfView"], index: np.ndarray) -> "FieldOfView":
+        """Return the view that each row has, of those with these indices, (rows,)."""
+        found = cls.__new__(cls)
+        for name in vars(views[0]):
+            setattr(found, name, np.array([getattr(view, name) for view in views])[index][:, None, None])
+        return found
 
     def sees(self, offset: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Return whether points are in view, (...).

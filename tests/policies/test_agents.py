@@ -32,12 +32,12 @@ def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
 
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_drives(agent: str, name: str) -> None:
-    """Actions are within the space, the same for the same seed, and each row's its own affair: a fleet's planner's,
-    each world's."""
+    """Actions are within the space, the same for the same seed, and each row's its own affair: a planner's, which
+    predicts with each vehicle's camera, each world's."""
     scenario = coopenv.load_scenario(name)
     envs = coopenv.make_vec(name, num_worlds=2)
     policy, again, alone = (load_agent(agent, scenario) for _ in range(3))
-    rows, some = np.arange(envs.num_envs), len(scenario.vehicles) if agent == "team_look_ahead" else 1
+    rows, some = np.arange(envs.num_envs), len(scenario.vehicles) if "look_ahead" in agent else 1
     observations, _ = envs.reset(seed=1000)
     for each, count in ((policy, len(rows)), (again, len(rows)), (alone, some)):
         restart(each, np.ones(count, dtype=bool))
