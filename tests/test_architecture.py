@@ -95,7 +95,7 @@ LINES_AND_FILES = {
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
-    "policies": (1490, 8),
+    "policies": (1500, 8),
     "runs": (3060, 13),
     "scenario": (3090, 12),
     "training": (1170, 5),
