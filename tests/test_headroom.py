@@ -76,6 +76,12 @@ def team_episodes(environment: str, agent: str, setting: str) -> tuple[Episodes,
     return found, {r.metric: (r.mean, r.ci_low, r.ci_high) for r in score(found)}
 
 
+def dependent_e95(found: Episodes, environment: str) -> float:
+    """Return the 95th percentile of the position error, m, of the vehicles that do not help, from 3 s on."""
+    counted = (found.under_way & (found.time >= 3.0)[:, None, None])[..., HELPERS[environment] :]
+    return float(np.quantile(found.position_error[..., HELPERS[environment] :][counted], 0.95))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", HELPERS)
 def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) -> None:
@@ -89,7 +95,9 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
     lost = own_return - others_return
     assert lost.mean() > 2.0 * lost.std() / np.sqrt(len(lost))  # beyond the 95 % interval
     assert others.reward.sum() > own.reward.sum()  # the team's reward ranks them as the team's score does
-    unseen = [team_episodes(environment, agent, "cars unseen")[1]["e95_m"][0] for agent in agents]
+    # Slow helpers count for longer in the fleet's e95: the vehicles that depend on them are judged by themselves, too.
+    assert dependent_e95(others, environment) <= 0.8 * dependent_e95(own, environment)
+    unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
     assert unseen[1] >= 0.9 * unseen[0]
 
 
