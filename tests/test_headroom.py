@@ -12,6 +12,7 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.bench.pages import cooperation_settings
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
@@ -62,6 +63,44 @@ def test_no_deadlock_where_all_receive_each_other(environment: str) -> None:
     found = score(drive(Engine(scenario, 64), load_agent("peek", scenario), held_out_seeds(9, 64)))
     rates = {result.metric: result.mean for result in found}
     assert rates["arrival_rate"] >= 0.97 and rates["collision_rate"] <= 0.02, rates
+
+
+HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3}
+"""How many vehicles, the first ones, can help the others."""
+
+
+@cache
+def team_episodes(environment: str, agent: str, setting: str) -> tuple[Episodes, dict[str, tuple[float, float, float]]]:
+    """Return episodes with each vehicle's own reward, and their figures, in worlds that nothing was tuned on."""
+    overrides = cooperation_settings(load_scenario(environment))[setting]
+    scenario = load_scenario(environment, {**overrides, "reward.team": "own"})
+    found = drive(Engine(scenario, 32), load_agent(agent, scenario), held_out_seeds(9, 32))
+    return found, {r.metric: (r.mean, r.ci_low, r.ci_high) for r in score(found)}
+
+
+def dependent_e95(found: Episodes, environment: str) -> float:
+    """Return the 95th percentile of the position error, m, of the vehicles that do not help, from 3 s on."""
+    counted = (found.under_way & (found.time >= 3.0)[:, None, None])[..., HELPERS[environment] :]
+    return float(np.quantile(found.position_error[..., HELPERS[environment] :][counted], 0.95))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", HELPERS)
+def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) -> None:
+    """A dilemma of planners, before anything is trained; where cars do not see each other there is none."""
+    agents = ("look_ahead", "team_look_ahead")
+    (own, selfish), (others, team) = (team_episodes(environment, agent, "as it is") for agent in agents)
+    assert team["e95_m"][0] <= 0.8 * selfish["e95_m"][0] and team["e95_m"][2] < selfish["e95_m"][1]
+    for found in (selfish, team):
+        assert found["arrival_rate"][0] >= 0.97 and found["collision_rate"][0] < 0.01
+    own_return, others_return = (e.reward[..., : HELPERS[environment]].sum(axis=(0, 2)) for e in (own, others))
+    lost = own_return - others_return
+    assert lost.mean() > 2.0 * lost.std() / np.sqrt(len(lost))  # beyond the 95 % interval
+    assert others.reward.sum() > own.reward.sum()  # the team's reward ranks them as the team's score does
+    # Slow helpers count for longer in the fleet's e95: the vehicles that depend on them are judged by themselves, too.
+    assert dependent_e95(others, environment) <= 0.8 * dependent_e95(own, environment)
+    unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
+    assert unseen[1] >= 0.9 * unseen[0]
 
 
 @pytest.mark.slow

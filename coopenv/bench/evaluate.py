@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -46,6 +47,11 @@ def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
         "rows": evaluation.rows(),
         "reference": evaluation.reference,
         "differences": evaluation.difference_rows(),
+        "seen_share": {
+            name: {own: dict(zip(e.vehicles, row, strict=True)) for own, row in zip(e.vehicles, shares, strict=True)}
+            for name, e in evaluation.episodes.items()
+            for shares in [e.seen_share.tolist()]
+        },
     }
 
 
@@ -111,6 +117,11 @@ def report(evaluation: Evaluation, out: Console) -> None:
     out.print()
     for words, meaning in EXPLANATIONS.items():
         out.print(f"{words}: {meaning}.")
+    for name, e in evaluation.episodes.items():
+        pairs = [(e.vehicles[i], e.vehicles[j], e.seen_share[i, j]) for i, j in np.argwhere(e.seen_share >= 0.01)]
+        if pairs:
+            words = ", ".join(f"{own} measures {other} {share:.0%}" for own, other, share in pairs)
+            out.print(f"{name}, share of the time under way: {words}.")
 
 
 def _results_table(evaluation: Evaluation) -> Table:

@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +64,8 @@ SETTINGS = ("ideal", "sensed", "blind")
 """Values of the key `sensing` of the scenario; all else is equal."""
 DRIVERS = ("route_follower", "peek")
 """A driver that looks straight ahead, and one that plans its view."""
+TEAM_DRIVERS = ("look_ahead", "team_look_ahead")
+"""A driver that plans for itself, and one that plans for the fleet."""
 KEYS = ("sensing", "agent", "metric", "mean", "ci_low", "ci_high", "n")
 
 
@@ -73,21 +74,45 @@ def has_value_of_sensing(name: str) -> bool:
     return {*DRIVERS} <= {*agents_for(name)}
 
 
-def contest(environment: str, worlds: int, sensing: str = "sensed") -> Contest:
-    """Return the drivers at a setting of `sensing`, built.
+def has_value_of_cooperation(name: str) -> bool:
+    """Return whether the value of cooperation is measured in place of that of sensing."""
+    return {*TEAM_DRIVERS} <= {*agents_for(name)}
+
+
+def is_measured(name: str) -> bool:
+    """Return whether the page of an environment shows figures."""
+    return has_value_of_sensing(name) or has_value_of_cooperation(name)
+
+
+def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
+    """Return overrides of the scenario by the name of the setting: without bearings to cars, without messages."""
+    hidden = {f"vehicles.{i}.marker": (0.0, 0.0, 9.0) for i in range(len(scenario.vehicles))}  # m; above all images
+    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}}
+
+
+def studied(name: str, scenario: Scenario) -> tuple[tuple[str, str], dict[str, Mapping[str, Any]]]:
+    """Return the drivers that are measured, and the overrides of each setting that they are measured at."""
+    if has_value_of_cooperation(name):
+        return TEAM_DRIVERS, cooperation_settings(scenario)
+    return DRIVERS, {how: {"sensing": how} for how in SETTINGS}
+
+
+def contests(environment: str, scenario: Scenario, worlds: int) -> dict[str, Contest]:
+    """Return the drivers that are measured, built, by the name of the setting.
 
     Raises:
         CoopenvError: one cannot drive here, or nothing is driven.
     """
-    return Contest.of(environment, {"sensing": sensing}, DRIVERS, worlds)
+    drivers, settings = studied(Path(environment).stem, scenario)
+    return {how: Contest.of(environment, overrides, drivers, worlds) for how, overrides in settings.items()}
 
 
 def write_figures(
     environment: str, scenario: Scenario, folder: Path, worlds: int, on_progress: Callable[[float, str], None]
 ) -> None:
-    """Measure what sensing is worth in an environment, and write it for the page.
+    """Measure what sensing, or cooperation, is worth in an environment, and write it for the page.
 
-    Both drivers drive in the same held-out worlds at every setting of `sensing`.
+    Both drivers drive in the same held-out worlds at every setting.
 
     Args:
         environment: name or TOML file.
@@ -97,12 +122,13 @@ def write_figures(
         on_progress: called with the share that is done, and the driver.
     """
     rows: list[dict[str, Any]] = []
-    for place, how in enumerate(SETTINGS):
+    built = contests(environment, scenario, worlds)
+    for place, (how, contest) in enumerate(built.items()):
 
         def report(done: float, name: str, place: int = place, how: str = how) -> None:
-            on_progress((place + done / len(DRIVERS)) / len(SETTINGS), f"{how}: {name}")
+            on_progress((place + done / len(DRIVERS)) / len(built), f"{how}: {name}")
 
-        found = contest(environment, worlds, how).drive(report).rows()
+        found = contest.drive(report).rows()
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]
     value = {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
     replace_text(folder / f"{Path(environment).stem}.json", json_text(value))
@@ -130,7 +156,8 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
     return rendered(
         "sensing.md.j2",
         environment=environment,
-        drivers=DRIVERS,
+        team=has_value_of_cooperation(environment),
+        drivers=studied(environment, scenario)[0],
         rows=_rows(value),
         worlds=value["worlds"],
         coopenv=value["coopenv"],
@@ -139,11 +166,12 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
 
 
 def _rows(value: Mapping[str, Any]) -> dict[tuple[str, str], str]:
-    """Return the cells of the table by sensing and agent."""
+    """Return the cells of the table by setting and agent."""
     found = {(row["sensing"], row["agent"], row["metric"]): row for row in value["rows"]}
     return {
         (how, agent): cells({metric: found[how, agent, metric] for metric in OVERVIEW}, OVERVIEW)
-        for how, agent in product(SETTINGS, DRIVERS)
+        for how, agent, first in found
+        if first == OVERVIEW[0]
     }
 
 

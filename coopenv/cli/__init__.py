@@ -135,7 +135,8 @@ def page(
     measure: Annotated[
         bool,
         typer.Option(
-            "--measure", help="Measure the value of sensing, for ENV.json; else the file that is there is shown."
+            "--measure",
+            help="Measure the value of sensing or cooperation for ENV.json; else that file is shown.",
         ),
     ] = False,
     film: Annotated[
@@ -156,9 +157,9 @@ def page(
     if len(stems) < len(names):
         raise CoopenvError("two environments have the same name")
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
-    measured = [name for name in stems if measure and (pages.has_value_of_sensing(name) or not everything)]
+    measured = [name for name in stems if measure and (pages.is_measured(name) or not everything)]
     for name in measured:
-        pages.contest(stems[name], worlds)
+        pages.contests(stems[name], scenarios[name], worlds)
     pages.prepare(out, list(stems))
     log = options.console(stderr=True)
     with Progress(log, "pages", total=len(stems)) as progress:

@@ -8,6 +8,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.base.errors import evaluation_seed, world_keys
+from coopenv.estimation.outcomes import Sight
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 
@@ -44,6 +45,8 @@ class Episodes:
     """(K, W, N), how often the vehicle had arrived by the end of the decision."""
     outcome: np.ndarray
     """(W, N), an `Outcome`, or a condition of the scenario's own; negative: the vehicle was not there."""
+    sees: np.ndarray
+    """(K, W, N, N) bool: the vehicle measured another driven one in the last frame of the decision."""
 
     @property
     def worlds(self) -> int:
@@ -65,6 +68,12 @@ class Episodes:
     def present(self) -> np.ndarray:
         """(W, N) bool: the vehicle was there."""
         return np.asarray(self.outcome >= 0)
+
+    @property
+    def seen_share(self) -> np.ndarray:
+        """(N, N) share of a vehicle's time under way for which it measured another driven one."""
+        counted = (self.sees & self.under_way[..., None]).sum(axis=(0, 1))
+        return np.asarray(counted / np.maximum(self.under_way.sum(axis=(0, 1)), 1)[:, None])
 
     @property
     def looking(self) -> np.ndarray:
@@ -191,7 +200,7 @@ def drive(
     scenario, view = engine.backend.scenario, engine.view
     chosen, ticks = driven_vehicles(scenario), scenario.horizon_ticks
     agents = [len(scenario.landmarks) + i for i in chosen]
-    kept, place, headings = Views(engine, KEPT), [], []
+    kept, place, headings, sees = Views(engine, KEPT), [], [], []
     for tick in play(engine, seeds, ticks, policy, False, stride=scenario.ticks_per_decision):
         if tick == 0:
             route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
@@ -199,6 +208,7 @@ def drive(
         place.append(view("position")[:, agents, :2].astype(np.float32))
         forward = view("rotation")[:, agents][..., :2, 0]
         headings.append(np.arctan2(forward[..., 1], forward[..., 0]).astype(np.float32))
+        sees.append(view("sight")[:, chosen][..., agents] == Sight.VISIBLE)
         on_progress(tick / ticks)
     record = {name: kept[name][1:, :, chosen] for name in KEPT}
     errors = {name: np.nan_to_num(record.pop(name), nan=DIVERGED, posinf=DIVERGED) for name in ERRORS}
@@ -211,6 +221,7 @@ def drive(
         heading=np.stack(headings[1:]),
         route=route,
         outcome=view("ended")[:, chosen].copy(),
+        sees=np.stack(sees[1:]),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from coopenv.policies.prediction import LEAST_ODDS, FieldOfView, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
+from coopenv.scenario.schema import neighbour_sets
 
 OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the heading from the direction of the route
 STEP, FIRST, STEPS = 0.4, 4, 10  # s; steps with the first of two offsets; steps in all
@@ -42,6 +43,30 @@ class _Path(NamedTuple):
         return _Path(self.x + dx, self.y + dy, heading, along, self.aside + stride * np.sin(heading - bend)), dx, dy
 
 
+class _Follower(NamedTuple):
+    """Another vehicle that may measure the planning one; it is predicted to drive straight on along its route.
+
+    An entry for each of F rows of planning vehicles.
+    """
+
+    row: np.ndarray
+    """(F,), of the planning vehicle."""
+    vehicle: np.ndarray
+    """(F,), its own number."""
+    place: np.ndarray
+    """(F, 2), m, in the frame of the planning vehicle."""
+    forward: np.ndarray
+    """(F, 2), direction of its route in that frame."""
+    speed: np.ndarray
+    """(F, 1), m/s."""
+    covariance: PlanarCovariance
+    """(F, plans), along its route and across."""
+
+
+def _repeated(covariance: PlanarCovariance, count: int) -> PlanarCovariance:
+    return PlanarCovariance(*(np.repeat(part, count, axis=1) for part in covariance))
+
+
 class LookAhead(RouteFollower):
     """The route follower with the heading of the best of many plans.
 
@@ -51,11 +76,13 @@ class LookAhead(RouteFollower):
     that turn to landmarks and back do not keep their headings for longer.
     """
 
-    needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
+    needs: tuple[str, ...] = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
     remembers = 2  # decisions until the next plan, and the present one
     price = 10.0  # s/s, that a second with a standard deviation of 1 m is worth
     tolerated = 0.02  # m, standard deviation that costs nothing
     farthest = 0.8  # m, offset from the route that costs nothing
+    plan_paces: tuple[float, ...] = (1.0,)
+    """Speeds of plans, as shares of the top speed."""
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
@@ -68,9 +95,15 @@ class LookAhead(RouteFollower):
         self.turn_drift = noise.angular_velocity**2 / per_second + np.max(noise.gyro_bias) ** 2  # rad^2/s
         self.bearing = max(noise.bearing.scale, LEAST_BEARING_STD) ** 2
         self.frames = rates.camera if noise.bearing.rate == "sample" else noise.bearing.rate
-        plans = product(OFFSETS, repeat=2)
-        self._first, self._second = (np.array(part, dtype=np.float32) for part in zip(*plans, strict=True))
-        self._offsets = np.array(OFFSETS, dtype=np.float32)
+        legs = [*product(self.plan_paces, OFFSETS)]
+        self._legs = np.array([pace for pace, _ in legs]), np.array([offset for _, offset in legs], dtype=np.float32)
+        self._pace, self._first = (np.repeat(part, len(OFFSETS)) for part in self._legs)
+        self._second = np.tile(np.array(OFFSETS, dtype=np.float32), len(legs))
+        landmarks, self._neighbours = len(scenario.landmarks), neighbour_sets(scenario)
+        self._sees_landmarks = np.array([any(target < landmarks for target in row) for row in self._neighbours])
+        self._top = np.array([limits.max_speed for limits in scenario.limits])
+        self._views = [FieldOfView(camera) for camera in scenario.cameras]
+        self._one_view = all(vars(view) == vars(self.view) for view in self._views)
         self._sharpest = np.tan(self.layout.action[1].high) / self.wheelbase  # rad/m
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -78,36 +111,46 @@ class LookAhead(RouteFollower):
         left, plan = self.memory(observations)
         due = np.flatnonzero(left == 0)
         if len(due):
-            plan[due] = np.argmin(self.costs(observations[due]), axis=1)
+            vehicle = due % len(self._top)
+            plan[due] = np.argmin(self.costs(observations[due], vehicle, self.followers(observations, due)), axis=1)
             left[due] = HOLD
         left -= 1
         heading = self.read(observations, "route_heading")[:, 0]
         offset = self._first[plan]
         along = self.pursue(self.direction(observations))
         steering = np.where(offset == 0.0, along, self.pursue(offset - heading))
-        return self.speed(observations), steering
+        return np.minimum(self.speed(observations), self._pace[plan] * self.cruise), steering
 
-    def costs(self, observations: np.ndarray) -> np.ndarray:
-        """Return the costs, (rows, plans) in s."""
+    def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
+        """Return the vehicles whose losses count for the rows `due` of the observations; here none."""
+        return []
+
+    def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[_Follower]) -> np.ndarray:
+        """Return the costs, (rows, plans) in s, for rows that are of these vehicles, (rows,)."""
         pieces, bends = self._route_pieces(observations)
         landmarks = self.read(observations, "map_position")[..., :2]
         boxes = self.occluders.boxes(partial(self.read, observations))
-        known = self.known(observations)[:, None]
+        known = (self.known(observations) & self._sees_landmarks[vehicle][:, None])[:, None]
+        view = self.view if self._one_view else FieldOfView.of_rows(self._views, vehicle)
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         none = np.zeros_like(std)
         covariance = PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, std**2)
-        offsets, shape = self._offsets, (len(observations), len(self._offsets))
-        zero = np.zeros(shape, dtype=np.float32)
-        now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), shape[1], axis=1))
+        (paces, offsets), top = self._legs, self._top[vehicle][:, None]
+        zero = np.zeros((len(observations), len(offsets)), dtype=np.float32)
+        now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), zero.shape[1], axis=1))
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
-        cost, stride = np.zeros_like(now.x), self.cruise * STEP
+        theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
+        followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
+        cost, missing = np.zeros_like(now.x), zero
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
-                count = len(self._offsets)
+                count = len(OFFSETS)
                 now = _Path(*(np.repeat(part, count, axis=1) for part in now))
-                covariance = PlanarCovariance(*(np.repeat(part, count, axis=1) for part in covariance))
-                cost = np.repeat(cost, count, axis=1)
-                offsets = np.tile(self._offsets, count)
+                covariance = _repeated(covariance, count)
+                followers = [each._replace(covariance=_repeated(each.covariance, count)) for each in followers]
+                cost, missing = (np.repeat(part, count, axis=1) for part in (cost, missing))
+                paces, offsets = self._pace, self._second
+            stride = paces * top * STEP
             bend = np.take_along_axis(pieces, np.searchsorted(bends, now.along, side="right") - 1, axis=1)
             wanted = bend + np.where(offsets == 0.0, -np.arctan(now.aside / self.look_ahead), offsets)
             now, dx, dy = now.moved(wanted, bend, stride, self._sharpest * stride)
@@ -115,21 +158,58 @@ class LookAhead(RouteFollower):
             place = np.stack([now.x, now.y], axis=-1)
             line = landmarks[:, None] - place[:, :, None]
             bearing, radial, lateral = covariance.along(line)
-            odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
-            camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
-            odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, stride * (step + 1))
-            linearisation_variance = BENT * radial * lateral / np.maximum((line**2).sum(axis=-1), 0.01) ** 2
-            covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
-            cost = cost + STEP * self.price * np.maximum(covariance.std - self.tolerated, 0.0)
+            odds = view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
+            camera = place + view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
+            odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, self.cruise * STEP * (step + 1))
+            covariance = covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
+            # Uncertainty costs per metre: what a slow plan does not drive is counted at its end.
+            cost = cost + STEP * self.price * paces * np.maximum(covariance.std - self.tolerated, 0.0)
+            missing = missing + (1.0 - paces) * top * STEP
+            followers = [self.follow(each, STEP * (step + 1), place, covariance) for each in followers]
+            for each in followers:
+                cost[each.row] += STEP * self.price * np.maximum(each.covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
-            # Vehicles with a received message are expected to drive straight on at the speed `cruise`.
-            driven = self.cruise * (STEP * (step + 1)) * forward
+            # Vehicles with a received message are expected to drive straight on at top speed.
+            driven = theirs * (STEP * (step + 1)) * forward
             apart = (others + driven)[:, None] - place[:, :, None]
             distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
             cost = cost + STEP * CLOSE * np.maximum(keep - distance, 0.0)
         later = covariance.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
-        cost = cost + self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
-        return np.asarray(cost - now.along / self.cruise + BACK * np.abs(now.aside))
+        cost = cost + self.price * (FAR + missing) / top * np.maximum(later.std - self.tolerated, 0.0)
+        for each in followers:
+            later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
+            cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
+        return np.asarray(cost - now.along / top + BACK * np.abs(now.aside))
+
+    def follow(self, follower: _Follower, time: float, place: np.ndarray, covariance: PlanarCovariance) -> _Follower:
+        """Return a follower a step later, after the bearings to this vehicle that it can be expected to have.
+
+        Args:
+            follower: a step ago.
+            time: since the observation, s.
+            place: (rows, plans, 2), m, of this vehicle.
+            covariance: (rows, plans), of this vehicle.
+        """
+        row, stride = follower.row, follower.speed * STEP
+        own = follower.covariance.driven(stride, np.zeros_like(stride), self.drift * STEP, self.turn_drift * STEP)
+        offset = place[row] - (follower.place + follower.speed * time * follower.forward)[:, None]
+        x, y = (follower.forward[:, None, k] for k in (0, 1))
+        ahead, left = x * offset[..., 0] + y * offset[..., 1], x * offset[..., 1] - y * offset[..., 0]
+        line = np.stack([ahead, left], axis=-1)[:, :, None]
+        bearing, radial, lateral = own.along(line)
+        view = FieldOfView.of_rows(self._views, follower.vehicle)
+        odds = view.odds(line, np.zeros((1, 1, 1)), np.sqrt(bearing), np.sqrt(radial))
+        sender = PlanarCovariance(*(part[row] for part in covariance)).along(offset[:, :, None])[2]
+        variance = self.bearing_variance(line, radial, lateral) + sender / _square(line)
+        return follower._replace(covariance=own.measured(line, variance, odds))
+
+    def bearing_variance(self, line: np.ndarray, radial: np.ndarray, lateral: np.ndarray) -> np.ndarray:
+        """Return the variances, rad^2, of all bearings of a step along lines (..., 2), m, with that of linearisation.
+
+        The other arguments are the variances of the distance and across it, m^2.
+        """
+        linearisation_variance = BENT * radial * lateral / _square(line) ** 2
+        return np.asarray((self.bearing + linearisation_variance) / (self.frames * STEP))
 
     def _route_pieces(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the route (rows, P), rad, own frame, and where they begin, (P,), m."""
@@ -138,6 +218,60 @@ class LookAhead(RouteFollower):
         leg = np.diff(points[:, 1:], axis=1)
         ahead = np.arctan2(leg[..., 1], leg[..., 0])
         return np.column_stack([heading, ahead]), distance[:-1]
+
+
+def _square(line: np.ndarray) -> np.ndarray:
+    return np.asarray(np.maximum(line[..., 0] ** 2 + line[..., 1] ** 2, 0.01))
+
+
+def _senders(vehicle: np.ndarray, slots: int) -> np.ndarray:
+    """Return the vehicle whose message is in each slot, (rows, slots): all but the receiver, in order."""
+    slot = np.arange(slots)
+    return np.asarray(slot + (slot >= vehicle[:, None]))
+
+
+class TeamLookAhead(LookAhead):
+    """The planner for the fleet: plans also have a pace, and cost what they make other vehicles lose.
+
+    For every vehicle that may measure the planning one, the covariance of that vehicle is predicted, with the bearings
+    to the planning vehicle as the only ones; its uncertainty costs as much as the own. It plans with the covariances of
+    all vehicles, which no vehicle has by itself: a reference for cooperation, which needs the rows of the whole fleet.
+    """
+
+    needs = (*LookAhead.needs, "message_position", "route_left")
+    plan_paces = (1.0, 0.75, 0.5, 0.25)
+
+    def __init__(self, scenario: Scenario) -> None:
+        """See `Driver`."""
+        super().__init__(scenario)
+        fleet, landmarks = range(len(scenario.vehicles)), len(scenario.landmarks)
+        self._measures = np.array([[landmarks + vehicle in row for vehicle in fleet] for row in self._neighbours])
+        self._radius = np.array([vehicle.goal_radius for vehicle in scenario.vehicles])
+
+    def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
+        """See `LookAhead.followers`.
+
+        Raises:
+            ValueError: there are not the rows of all vehicles.
+        """
+        count = len(self._top)
+        if len(observations) % count:
+            raise ValueError(f"it plans for all vehicles: rows: {len(observations)}, allowed: multiples of {count}")
+        mask, place, forward = (part[due] for part in self.received(observations))
+        axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
+        heading, left = (self.read(observations, name)[:, 0] for name in ("route_heading", "route_left"))
+        found, own = [], due % count
+        for slot, vehicle in enumerate(_senders(own, mask.shape[1]).T):
+            other = due - own + vehicle
+            counts = self._measures[vehicle, own] & mask[:, slot] & (left[other] > self._radius[vehicle])
+            row = np.flatnonzero(counts)
+            vehicle, other, none = vehicle[row], other[row], np.zeros((len(row), 1))
+            angle = np.arctan2(forward[row, slot, 1], forward[row, slot, 0]) - heading[other]
+            along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            variances = (axes[other, :1] ** 2, none, none, axes[other, 1:2] ** 2, none, std[other] ** 2)
+            speed = self._top[vehicle][:, None]
+            found.append(_Follower(row, vehicle, place[row, slot], along, speed, PlanarCovariance(*variances)))
+        return [each for each in found if len(each.row)]
 
 
 class Peek(RouteFollower):

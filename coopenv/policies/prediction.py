@@ -8,7 +8,7 @@ Automatic Control 49, 2004.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -55,7 +55,7 @@ class PlanarCovariance(NamedTuple):
         Args:
             offset: (..., K, 2), m, from the vehicle to the landmarks.
         """
-        distance = np.sqrt(np.maximum((offset**2).sum(axis=-1), 0.01))
+        distance = np.sqrt(np.maximum(offset[..., 0] ** 2 + offset[..., 1] ** 2, 0.01))
         ux, uy = offset[..., 0] / distance, offset[..., 1] / distance
         xx, xy, xh, yy, yh, hh = (part[..., None] for part in self)
         radial = ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy
@@ -85,7 +85,7 @@ class PlanarCovariance(NamedTuple):
         return PlanarCovariance(*(part.reshape(shape) for part in parts))
 
     def _with_bearing(self, offset: np.ndarray, variance: np.ndarray, odds: np.ndarray) -> tuple[np.ndarray, ...]:
-        square = np.maximum((offset**2).sum(axis=-1), 0.01)
+        square = np.maximum(offset[..., 0] ** 2 + offset[..., 1] ** 2, 0.01)
         gx, gy = offset[..., 1] / square, -offset[..., 0] / square  # of the bearing, which falls by 1 with the heading
         x = self.xx * gx + self.xy * gy - self.xh
         y = self.xy * gx + self.yy * gy - self.yh
@@ -233,6 +233,14 @@ class FieldOfView:
             focal, middle, width = camera.focal_length[0], camera.principal_point[0], camera.image_size[0]
             self.left = math.atan(middle / focal) - MARGIN
             self.right = -math.atan((width - middle) / focal) + MARGIN
+
+    @classmethod
+    def of_rows(cls, views: Sequence["FieldOfView"], index: np.ndarray) -> "FieldOfView":
+        """Return the view that each row has, of those with these indices, (rows,)."""
+        found = cls.__new__(cls)
+        for name in vars(views[0]):
+            setattr(found, name, np.array([getattr(view, name) for view in views])[index][:, None, None])
+        return found
 
     def sees(self, offset: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Return whether points are in view, (...).

@@ -130,7 +130,6 @@ def _endings(scenario: Scenario) -> Iterator[str]:
 
 def _end(name: str, measured: str) -> Iterator[str]:
     if measured:
-        yield "## What sensing is worth"
         yield measured
     yield "## To try it"
     yield f"```\ncoopenv describe {name} --all\ncoopenv run {name} --seed 0\n```"

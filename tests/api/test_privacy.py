@@ -81,6 +81,7 @@ def test_truth_of_highway_env_is_not_observed_sent_or_estimated(name: str, obser
 def test_observation_does_not_move_when_everything_moves_together(name: str, observer: str) -> None:
     """Other vehicles' truth reaches a vehicle through bearings alone: scaling a scene about a camera keeps them."""
     plain = {"noise.enabled": False, "topology.mode": "fixed", "camera.miss_probability": 0.0}
+    plain |= {"v2x.links": "neighbours"}  # otherwise messages of followers are observed
     scenario = load_scenario(name, {**EVERYTHING, **plain, "observer.name": observer})
     engine = Engine(scenario, 2, "float64")
     engine.reset([5, 5])

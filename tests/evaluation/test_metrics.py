@@ -119,7 +119,7 @@ def test_looking_is_told_from_the_nearest_piece_of_the_route() -> None:
     position = np.array([[0.0, 0.0], [1.0, 0.3], [4.2, 2.0], [3.9, 6.0]])[:, None, None]
     heading = np.array([0.3, np.pi / 2 - 0.4, -np.pi])[:, None, None]
     none = np.zeros((3, 1, 1))
-    found = Episodes(("a",), 0.1, *(none,) * 5, position, heading, none, route, none, none[0])
+    found = Episodes(("a",), 0.1, *(none,) * 5, position, heading, none, route, none, none[0], none)
     np.testing.assert_allclose(found.looking[:, 0, 0], [0.3, -0.4, np.pi / 2], atol=1e-12)
     panned = replace(found, pan=np.array([0.2, -0.3, np.pi])[:, None, None])  # the camera, not the car, says where
     np.testing.assert_allclose(panned.looking[:, 0, 0], [0.5, -0.7, -np.pi / 2], atol=1e-12)

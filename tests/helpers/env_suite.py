@@ -150,9 +150,14 @@ def infos(make: Make) -> None:
             )
             assert set(info["visible"]) <= set(env.scenario.target_names) - {agent}
             assert info["nees"] >= 0.0
-            if len(step) == 5:
-                total = sum(weights[term] * value for term, value in info["reward_terms"].items())
-                assert step[1][agent] == pytest.approx(total, abs=1e-5)
+        if len(step) == 5:
+            totals = {
+                agent: sum(weights[term] * value for term, value in info["reward_terms"].items())
+                for agent, info in step[-1].items()
+            }
+            if env.scenario.reward.team == "mean":
+                totals = dict.fromkeys(totals, np.mean([*totals.values()]))
+            assert {agent: step[1][agent] for agent in totals} == pytest.approx(totals, abs=1e-5)
 
 
 @check

@@ -35,19 +35,20 @@ def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
 
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_drives(agent: str, name: str) -> None:
-    """Actions are within the space, the same for the same seed, and each row's its own affair."""
+    """Actions are within the space, the same for the same seed, and each row's its own affair: a planner's, which
+    predicts with each vehicle's camera, each world's."""
     scenario = coopenv.load_scenario(name)
     envs = coopenv.make_vec(name, num_worlds=2)
     policy, again, alone = (load_agent(agent, scenario) for _ in range(3))
-    rows = np.arange(envs.num_envs)
+    rows, some = np.arange(envs.num_envs), len(scenario.vehicles) if "look_ahead" in agent else 1
     observations, _ = envs.reset(seed=1000)
-    for each, count in ((policy, len(rows)), (again, len(rows)), (alone, 1)):
+    for each, count in ((policy, len(rows)), (again, len(rows)), (alone, some)):
         restart(each, np.ones(count, dtype=bool))
     for _ in range(15):
         actions = np.asarray(policy(observations))
         assert envs.action_space.contains(actions.astype(np.float32))
         np.testing.assert_array_equal(again(observations), actions)
-        np.testing.assert_allclose(alone(observations[-1:])[0], actions[-1], atol=1e-5)
+        np.testing.assert_allclose(alone(observations[-some:])[-1], actions[-1], atol=1e-5)
         observations, *_ = envs.step(actions)
 
 
