@@ -66,7 +66,6 @@ class TrainOptions:
         return plan
 
     def _settings(self, overrides: dict[str, Any]) -> Any:
-        from coopenv.backends.sources import open_simulation
         from coopenv.policies import find_agent
         from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_start
 
@@ -79,7 +78,7 @@ class TrainOptions:
                 raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
             path = folder / SETTINGS_FILE
         if path is None:
-            start = usual_start(open_simulation(self.environment, overrides))
+            start = usual_start(self.environment, overrides)
         name = Path(self.environment).stem
         return read_settings(path, self.arm, name, steps=self.steps, minutes=self.minutes, **start)
 

@@ -100,6 +100,7 @@ class LookAhead(RouteFollower):
         zero = np.zeros(shape, dtype=np.float32)
         now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), shape[1], axis=1))
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
+        mask = self.before(mask)
         cost, stride = np.zeros_like(now.x), self.cruise * STEP
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -122,7 +123,7 @@ class LookAhead(RouteFollower):
             covariance = covariance.measured(line, (self.bearing + linearisation_variance) / (self.frames * STEP), odds)
             cost = cost + STEP * self.price * np.maximum(covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
-            # Vehicles with a received message are expected to drive straight on at the speed `cruise`.
+            # Vehicles to give way to are expected to drive straight on at the speed `cruise`.
             driven = self.cruise * (STEP * (step + 1)) * forward
             apart = (others + driven)[:, None] - place[:, :, None]
             distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)

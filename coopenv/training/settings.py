@@ -5,6 +5,7 @@ import re
 import shutil
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -12,6 +13,8 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, model_validator
 
+from coopenv.api.terms.layout import observation_layout
+from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
 from coopenv.base.installation import is_scene, list_envs, scenario_path
@@ -84,6 +87,15 @@ class Clone(Section):
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
 
 
+class Variation(Section):
+    """Worlds to learn in that differ from the others."""
+
+    share: Annotated[float, Field(gt=0.0, le=1.0)]
+    """Of the worlds; one at least."""
+    scenario: dict[str, Any]
+    """Overrides that go before all others."""
+
+
 class EvaluationSettings(Section):
     """Judging the mean action on held-out maps."""
 
@@ -104,6 +116,10 @@ class Settings(Section):
     """Length of the training, min, instead of `steps`."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--set`."""
+    randomised: dict[str, Any] = Field(default={})
+    """Further ones for the worlds to learn in alone, such as `randomisation.camera_range = [0.7, 2.0]`."""
+    variations: tuple[Variation, ...] = ()
+    """Further ones for some of these worlds."""
     ppo: Ppo = Ppo()
     evaluation: EvaluationSettings = EvaluationSettings()
     clone: Clone | None = None
@@ -119,17 +135,36 @@ class Settings(Section):
 USUAL_START: dict[str, Any] = {
     "clone": {"agent": "look_ahead", "episodes": 128, "epochs": 30},
     "ppo": {"learning_rate": 5e-4, "initial_std": 0.25},
+    "randomised": {
+        "randomisation.camera_range": [0.7, 1.6],
+        "randomisation.bearing_noise": [0.5, 3.0],
+        "randomisation.odometry_noise": [0.5, 4.0],
+        "randomisation.initial_error": [0.5, 2.0],
+        "randomisation.landmark_presence": [0.3, 1.2],
+    },
+    "variations": [
+        {"share": 0.1, "scenario": {"vehicles.*.presence": 0.5}},
+        {"share": 0.1, "scenario": {"camera.model": "omnidirectional"}},
+        {"share": 0.06, "scenario": {"sensing": "ideal"}},
+    ],
 }
 """Settings of a training of which nothing else is said, where the planner can drive."""
 
 
-def usual_start(scenario: Scenario) -> dict[str, Any]:
-    """Return `USUAL_START`, or nothing where its agent cannot drive."""
+def usual_start(environment: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `USUAL_START`, or nothing where its agent cannot drive; without variations that are not possible."""
+    start = {name: USUAL_START[name] for name in ("clone", "ppo")}
     try:
-        load_agent(USUAL_START["clone"]["agent"], scenario)
+        load_agent(start["clone"]["agent"], open_simulation(environment, overrides))
     except CoopenvError:
         return {}
-    return USUAL_START
+    start["randomised"], start["variations"] = USUAL_START["randomised"], []
+    for own in USUAL_START["variations"]:
+        settings = Settings.model_validate({"randomised": start["randomised"], "variations": (own,)})
+        with suppress(CoopenvError):
+            TrainingPlan(environment, settings, 0, overrides=overrides).scenarios()
+            start["variations"].append(own)
+    return start
 
 
 @dataclass(frozen=True)
@@ -148,6 +183,26 @@ class TrainingPlan:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
 
+    def scenarios(self, worlds: int = 1) -> list[tuple[Scenario, int]]:
+        """Return of which scenarios so many worlds to learn in are, and how many of each.
+
+        Raises:
+            CoopenvError: an override is not possible there, or changes what is observed or what actions mean.
+        """
+        settings, found = self.settings, list[tuple[Scenario, int]]()
+        layout = observation_layout(open_simulation(self.environment, self.all_overrides))
+        randomised = {**self.all_overrides, **settings.randomised}
+        for own in settings.variations:
+            varied = open_simulation(self.environment, {**randomised, **own.scenario})
+            here = observation_layout(varied)
+            if (here, here.actions) != (layout, layout.actions):
+                raise CoopenvError(f"variations: {own.scenario} changes the observation or the action")
+            found.append((varied, max(1, round(own.share * worlds))))
+        left = worlds - sum(count for _, count in found)
+        if left > 0 or not found:
+            found.insert(0, (open_simulation(self.environment, randomised), max(1, left)))
+        return found
+
 
 def read_settings(
     path: Path | None, arm: str | None = None, environment: str | None = None, **changes: Any
@@ -165,7 +220,7 @@ def read_settings(
         CoopenvError: no such file or arm, or it is not valid; one line that names file and field.
     """
     where, raw = (str(path), read_toml(path)) if path is not None else ("settings", {})
-    raw["scenario"] = _flat(raw.get("scenario", {}), where)
+    raw = _flattened(raw, where)
     environments = _tables(raw.pop("environments", {}), f"{where}: environments")
     arms = _tables(raw.pop("arms", {}), f"{where}: arms")
     here = dict(environments.get(environment or "", {}))
@@ -177,8 +232,7 @@ def read_settings(
     if arm is not None:
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
     for place, change in changed.items():
-        scenario = _flat(change.get("scenario", {}), f"{where}: {place}")
-        raw = merged(raw, {**change, "scenario": scenario})
+        raw = merged(raw, _flattened(change, f"{where}: {place}"))
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
@@ -191,10 +245,19 @@ def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:
     return tables
 
 
+def _flattened(raw: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return settings with overrides of scenarios by dotted keys."""
+    flat = {name: _flat(raw[name], f"{where}: {name}") for name in ("scenario", "randomised") if name in raw}
+    variations = raw.get("variations")
+    if isinstance(variations, list):
+        flat["variations"] = [_flattened(own, f"{where}: variations.{i}") for i, own in enumerate(variations)]
+    return {**raw, **flat}
+
+
 def _flat(tables: Any, where: str) -> dict[str, Any]:
     """Return tables within tables as one of dotted keys."""
     if not isinstance(tables, dict):
-        raise CoopenvError(f"{where}: scenario: expected a table")
+        raise CoopenvError(f"{where}: expected a table")
     flat: dict[str, Any] = {}
     for key, value in tables.items():
         inner = _flat(value, where) if isinstance(value, dict) else None
