@@ -159,6 +159,9 @@ class EvaluateOptions:
     seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0
     overrides: options.Overrides = None
     ideal: Annotated[bool, typer.Option("--ideal", help="Also let route_follower drive under ideal sensing.")] = False
+    stress: Annotated[
+        bool, typer.Option("--stress", help="Also with other cameras, noise, landmarks and messages than in training.")
+    ] = False
     out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None
     figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
     width: options.FigureWidth = None
@@ -185,15 +188,17 @@ def evaluate(given: EvaluateOptions) -> None:
     environment, agents, out, log = given.environment, given.agents, given.out, options.console(stderr=True)
     if given.film and out is None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
+    if given.stress and (given.film or given.write_card):
+        raise CoopenvError("--stress prints a table: leave out --film and --write-card")
     names = options.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
     with options.warned():
         changes = options.parse_overrides(given.overrides)
-        contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal)
+        contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
     carded = cards.carded(contest) if given.write_card else []
     command = options.command_text("evaluate", given, OF_THE_OUTPUT)
-    drawn = {"figures": None if given.no_figures else given.figures.value, "width": given.width and given.width.value}
+    drawn = {"figures": None if given.no_figures or given.stress else given.figures.value, "width": given.width and given.width.value}
     result = evaluate.run(contest, command, log, out=out, film=given.film, force=given.force, **drawn)
     written = cards.write(result, carded, command)
     if given.as_json:

@@ -56,6 +56,7 @@ class LookAhead(RouteFollower):
     price = 10.0  # s/s, that a second with a standard deviation of 1 m is worth
     tolerated = 0.02  # m, standard deviation that costs nothing
     farthest = 0.8  # m, offset from the route that costs nothing
+    closest, clearance = 0.85, 1.0  # farther from others, which turn aside as it does
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
