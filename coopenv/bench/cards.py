@@ -28,25 +28,32 @@ BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
 IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
 
-STRESS: Mapping[str, Mapping[str, Any]] = {
-    "ideal sensing": IDEAL_SENSING,
-    "all-round cameras": {"camera.model": "omnidirectional"},
-    "twice the range": {"randomisation.camera_range": [2.0, 2.0]},
-    "three quarters of the range": {"randomisation.camera_range": [0.75, 0.75]},
-    "half of the landmarks": {"randomisation.landmark_presence": [0.5, 0.5]},
-    "a third of the landmarks": {"randomisation.landmark_presence": [0.333, 0.333]},
-    "bearing noise x 5": {"randomisation.bearing_noise": [5.0, 5.0]},
-    "odometry noise x 4": {
-        "randomisation.odometry_noise": [4.0, 4.0],
-        "noise.odometry_scale": 0.03,
-        "noise.gyro_bias": [0.0, 0.0, 0.0087],
-    },
-    "initial error x 2": {"randomisation.initial_error": [2.0, 2.0]},
+def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
+    """Return overrides for worlds that are harder or easier to sense than a scenario's, by what is changed."""
+    noise = scenario.noise
+    return {
+        "ideal sensing": dict(IDEAL_SENSING),
+        "all-round cameras": {"camera.model": "omnidirectional"},
+        "twice the range": {"randomisation.camera_range": [2.0, 2.0]},
+        "3/4 of the range": {"randomisation.camera_range": [0.75, 0.75]},
+        "half of the landmarks": {"randomisation.landmark_presence": [0.5, 0.5]},
+        "a third of the landmarks": {"randomisation.landmark_presence": [0.333, 0.333]},
+        "bearing noise x 5": {"noise.bearing.scale": 5.0 * noise.bearing.scale},
+        "odometry noise x 4": {
+            "noise.velocity": 4.0 * noise.velocity,
+            "noise.angular_velocity": 4.0 * noise.angular_velocity,
+            "noise.odometry_scale": 0.03,
+            "noise.gyro_bias": [0.0, 0.0, 0.0087],
+        },
+        "initial error x 2": {"randomisation.initial_error": [2.0, 2.0]},
+        **(OF_MESSAGES if len(scenario.vehicles) > 1 else {}),
+    }
+
+
+OF_MESSAGES: dict[str, dict[str, Any]] = {
     "60 % of messages lost": {"v2x.loss": 0.6},
     "vehicle_1 lies": {"vehicles.0.faults.lie": {"kind": "jump", "start": 2.0, "offset": 3.0}},
 }
-"""Other worlds than those of the training, by name: overrides of the scenario."""
-OF_MESSAGES = ("60 % of messages lost", "vehicle_1 lies")
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ class Contest:
         worlds: int,
         block: int = 0,
         ideal: bool = False,
-        stress: bool = False,
+        stressed: bool = False,
     ) -> "Contest":
         """Build the drivers.
 
@@ -92,7 +99,7 @@ class Contest:
             worlds: how many.
             block: number of the block of held-out seeds.
             ideal: let the baseline drive under ideal sensing, too.
-            stress: let the drivers drive in the worlds of `STRESS`, too.
+            stressed: let the drivers drive in the worlds of `stress`, too.
 
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
@@ -104,10 +111,9 @@ class Contest:
         if not found:
             raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
         entrants = [Entrant(agent, agent.name, agent.kind, scenario, agent.policy(scenario)) for agent in found]
-        for row, changed in STRESS.items() if stress else ():
-            if row not in OF_MESSAGES or len(scenario.vehicles) > 1:
-                other = open_simulation(environment, {**overrides, **changed})
-                entrants += [Entrant(a, f"{a.name}, {row}", a.kind, other, a.policy(other)) for a in found]
+        for row, changed in stress(scenario).items() if stressed else ():
+            other = open_simulation(environment, {**overrides, **changed})
+            entrants += [Entrant(a, f"{a.name}, {row}", a.kind, other, a.policy(other)) for a in found]
         names = [entrant.name for entrant in entrants]
         for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
             raise CoopenvError(f"--agents: two are called '{twice}'")

@@ -176,6 +176,8 @@ class EvaluateOptions:
     as_json: options.AsJson = False
 
 
+SHORT_NAME = 20
+"""Characters of an agent's name from which on the tables are wider."""
 OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", "force", "as_json")
 """Options of `evaluate` that do not change what is measured."""
 
@@ -204,7 +206,7 @@ def evaluate(given: EvaluateOptions) -> None:
     if given.as_json:
         options.print_json(evaluate.document(result, command))
         return
-    printed = options.console(least=evaluate.WIDTH)
+    printed = options.console(least=evaluate.WIDTH + max(0, max(map(len, result.results)) - SHORT_NAME))
     evaluate.report(result, printed)
     if out is not None:
         printed.print(f"Files in {out}:", soft_wrap=True)

@@ -118,8 +118,8 @@ class Network:
             return
         found = {name: share / self._rows for name, share in self._outside.items() if share > FOREIGN * self._rows}
         if found:
-            shares = ", ".join(f"{name} ({share:.0%})" for name, share in found.items())
-            text = f"agent {self._name}: observations beyond those of its training: {shares} of the entries"
+            worst = max(found, key=lambda name: found[name])
+            text = f"agent {self._name}: {found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
             warnings.warn(AgentWarning(text), stacklevel=2)
             self._seen = {}
 
