@@ -28,6 +28,7 @@ BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
 IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
 
+
 def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
     """Return overrides for worlds that are harder or easier to sense than a scenario's, by what is changed."""
     noise = scenario.noise

@@ -67,9 +67,9 @@ class TrainOptions:
 
     def _settings(self, overrides: dict[str, Any]) -> Any:
         from coopenv.policies import find_agent
-        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_start
+        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_settings
 
-        path, start = self.settings, {}
+        path, budget = self.settings, {"steps": self.steps, "minutes": self.minutes}
         if self.agent is not None:
             if path is not None:
                 raise CoopenvError("--agent and --settings: give one of them")
@@ -77,10 +77,11 @@ class TrainOptions:
             if folder is None or not (folder / SETTINGS_FILE).is_file():
                 raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
             path = folder / SETTINGS_FILE
-        if path is None:
-            start = usual_start(self.environment, overrides)
-        name = Path(self.environment).stem
-        return read_settings(path, self.arm, name, steps=self.steps, minutes=self.minutes, **start)
+        if path is None and self.arm is None:
+            if self.steps is not None and self.minutes is not None:
+                raise CoopenvError("--steps and --minutes: give one of them")
+            return usual_settings(self.environment, overrides, **budget)
+        return read_settings(path, self.arm, Path(self.environment).stem, **budget)
 
 
 @options.command
@@ -197,10 +198,15 @@ def evaluate(given: EvaluateOptions) -> None:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
     with options.warned():
         changes = options.parse_overrides(given.overrides)
-        contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
+        contest = cards.Contest.of(
+            environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress
+        )
     carded = cards.carded(contest) if given.write_card else []
     command = options.command_text("evaluate", given, OF_THE_OUTPUT)
-    drawn = {"figures": None if given.no_figures or given.stress else given.figures.value, "width": given.width and given.width.value}
+    drawn = {
+        "figures": None if given.no_figures or given.stress else given.figures.value,
+        "width": given.width and given.width.value,
+    }
     result = evaluate.run(contest, command, log, out=out, film=given.film, force=given.force, **drawn)
     written = cards.write(result, carded, command)
     if given.as_json:

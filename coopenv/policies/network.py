@@ -119,7 +119,9 @@ class Network:
         found = {name: share / self._rows for name, share in self._outside.items() if share > FOREIGN * self._rows}
         if found:
             worst = max(found, key=lambda name: found[name])
-            text = f"agent {self._name}: {found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
+            text = (
+                f"agent {self._name}: {found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
+            )
             warnings.warn(AgentWarning(text), stacklevel=2)
             self._seen = {}
 

@@ -17,7 +17,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
-from coopenv.base.installation import is_scene, list_envs, scenario_path
+from coopenv.base.installation import data_directory, is_scene, list_agents, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
@@ -132,41 +132,6 @@ class Settings(Section):
         return self.steps or 2_000_000, None
 
 
-USUAL_START: dict[str, Any] = {
-    "clone": {"agent": "look_ahead", "episodes": 128, "epochs": 30},
-    "ppo": {"learning_rate": 5e-4, "initial_std": 0.25},
-    "randomised": {
-        "randomisation.camera_range": [0.7, 1.6],
-        "randomisation.bearing_noise": [0.5, 3.0],
-        "randomisation.odometry_noise": [0.5, 4.0],
-        "randomisation.initial_error": [0.5, 2.0],
-        "randomisation.landmark_presence": [0.3, 1.2],
-    },
-    "variations": [
-        {"share": 0.1, "scenario": {"vehicles.*.presence": 0.5}},
-        {"share": 0.1, "scenario": {"camera.model": "omnidirectional"}},
-        {"share": 0.06, "scenario": {"sensing": "ideal"}},
-    ],
-}
-"""Settings of a training of which nothing else is said, where the planner can drive."""
-
-
-def usual_start(environment: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `USUAL_START`, or nothing where its agent cannot drive; without variations that are not possible."""
-    start = {name: USUAL_START[name] for name in ("clone", "ppo")}
-    try:
-        load_agent(start["clone"]["agent"], open_simulation(environment, overrides))
-    except CoopenvError:
-        return {}
-    start["randomised"], start["variations"] = USUAL_START["randomised"], []
-    for own in USUAL_START["variations"]:
-        settings = Settings.model_validate({"randomised": start["randomised"], "variations": (own,)})
-        with suppress(CoopenvError):
-            TrainingPlan(environment, settings, 0, overrides=overrides).scenarios()
-            start["variations"].append(own)
-    return start
-
-
 @dataclass(frozen=True)
 class TrainingPlan:
     """What is to be trained; two runs of one plan and one version on one machine give the same policy."""
@@ -237,6 +202,34 @@ def read_settings(
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
     return validated(Settings, json.dumps(raw, default=str), where)
+
+
+def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: Any) -> Settings:
+    """Return the settings of a training of which nothing else is said.
+
+    They are those of the agents that ship with coopenv, where the driver that these begin as can drive; in other
+    environments without their reward, and without variations that are not possible.
+    """
+    name, changed = Path(environment).stem, {key: value for key, value in changes.items() if value is not None}
+    shipped = read_settings(data_directory("agents") / SETTINGS_FILE, USUAL_ARM, name)
+    settings = shipped.model_copy(update={"steps": None, **changed} if "minutes" in changed else changed)
+    if f"{environment}_{USUAL_ARM}" not in list_agents():
+        settings = settings.model_copy(update={"scenario": {}})
+    try:
+        if settings.clone is not None:
+            load_agent(settings.clone.agent, open_simulation(environment, overrides))
+    except CoopenvError:
+        return read_settings(None, None, name, **changes)
+    fitting = []
+    for own in settings.variations:
+        with suppress(CoopenvError):
+            alone = settings.model_copy(update={"variations": (own,)})
+            TrainingPlan(environment, alone, 0, overrides=overrides).scenarios()
+            fitting.append(own)
+    return settings.model_copy(update={"variations": tuple(fitting)})
+
+
+USUAL_ARM = "quality"
 
 
 def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:

@@ -215,7 +215,13 @@ BATCH = 512  # rows per gradient step
 
 
 def watch(
-    scenario: Scenario, worlds: int, settings: Clone, gamma: float, seed: int, threads: int, report: Callable[[str], None]
+    scenario: Scenario,
+    worlds: int,
+    settings: Clone,
+    gamma: float,
+    seed: int,
+    threads: int,
+    report: Callable[[str], None],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
     env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
@@ -314,7 +320,15 @@ class Trainer:
         policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
         watched = [
-            watch(each, max(1, clone.episodes * count // all_worlds), clone, ppo.gamma, seed + APART * place, threads, report)
+            watch(
+                each,
+                max(1, clone.episodes * count // all_worlds),
+                clone,
+                ppo.gamma,
+                seed + APART * place,
+                threads,
+                report,
+            )
             for place, (each, count) in enumerate(self._scenarios)
         ]
         raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))

@@ -14,14 +14,13 @@ from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.installation import data_directory
 from coopenv.policies import find_agent
 from coopenv.training.settings import (
-    USUAL_START,
     Settings,
     TrainingPlan,
     check_settings,
     environment_file,
     read_settings,
     settings_digest,
-    usual_start,
+    usual_settings,
     write_settings,
 )
 
@@ -60,11 +59,12 @@ def test_defaults() -> None:
 
 
 def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_can_drive() -> None:
-    settings = read_settings(None, **usual_start("open_square", {}))
-    assert settings.clone and settings.clone.agent == "look_ahead" and settings.ppo.initial_std == 0.25
-    assert len(settings.variations) == len(USUAL_START["variations"])
-    blind = usual_start("open_square", {"observation.exclude": ["map"]})
-    assert blind == {} and read_settings(None, **blind) == read_settings(None)
+    settings = usual_settings("open_square", {}, steps=None)
+    assert settings == read_settings(data_directory("agents") / "train.toml", "quality", "open_square")
+    assert settings.clone and settings.clone.agent == "look_ahead" and settings.variations and settings.randomised
+    assert usual_settings("open_square", {}, minutes=2.0).budget == (None, 120.0)
+    assert usual_settings("open_square", {"observation.exclude": ["map"]}) == read_settings(None)
+    assert usual_settings("large_crossing", {}).scenario == {}, "its reward is its own"
 
 
 VARIED = """
