@@ -252,7 +252,7 @@ def command(function: Callable[[Options], None]) -> Callable[..., None]:
                 else:
                     shown(message, category, *where)
 
-            warnings.showwarning = show
+            warnings.showwarning = show  # type: ignore[assignment]
             function(record(**given))
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__

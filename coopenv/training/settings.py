@@ -240,10 +240,15 @@ def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:
 
 def _flattened(raw: dict[str, Any], where: str) -> dict[str, Any]:
     """Return settings with overrides of scenarios by dotted keys."""
-    flat = {name: _flat(raw[name], f"{where}: {name}") for name in ("scenario", "randomised") if name in raw}
+    flat: dict[str, Any] = {
+        name: _flat(raw[name], f"{where}: {name}") for name in ("scenario", "randomised") if name in raw
+    }
     variations = raw.get("variations")
     if isinstance(variations, list):
-        flat["variations"] = [_flattened(own, f"{where}: variations.{i}") for i, own in enumerate(variations)]
+        flat["variations"] = [
+            _flattened(own, f"{where}: variations.{i}") if isinstance(own, dict) else own
+            for i, own in enumerate(variations)
+        ]
     return {**raw, **flat}
 
 

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic, process_time
 from typing import Any
 
@@ -130,7 +131,8 @@ class MixedWorlds(CooperativeSB3VecEnv):
         self.batch_infos = {
             name: np.concatenate([part.batch_infos[name] for part in self.parts]) for name in ("time", "position_error")
         }
-        return np.concatenate(observations), np.concatenate(rewards), np.concatenate(dones), sum(infos, [])
+        together = [info for own in infos for info in own]
+        return np.concatenate(observations), np.concatenate(rewards), np.concatenate(dones), together
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return the states of all parts."""
@@ -146,6 +148,7 @@ class MixedWorlds(CooperativeSB3VecEnv):
         return np.concatenate([part.set_state(own) for part, own in zip(self.parts, states, strict=True)])
 
     def close(self) -> None:
+        """Close all parts."""
         for part in self.parts:
             part.close()
 
@@ -269,10 +272,9 @@ class Trainer:
         self.plan, self.scenario = plan, scenario
         ppo = plan.settings.ppo
         self._scenarios = plan.scenarios(max(1, ppo.vehicles // len(driven_vehicles(scenario))))
-        options = {"autoreset": "same_step", "arrays": "numpy", "threads": threads}
+        built = partial(CooperativeVectorEnv, autoreset="same_step", arrays="numpy", threads=threads)
         parts = [
-            CooperativeSB3VecEnv(CooperativeVectorEnv(each, plan.environment, num_worlds=count, **options))
-            for each, count in self._scenarios
+            CooperativeSB3VecEnv(built(each, plan.environment, num_worlds=count)) for each, count in self._scenarios
         ]
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
         self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
