@@ -54,10 +54,12 @@ def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environmen
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("agent", ["peek", "look_ahead"])
 @pytest.mark.parametrize("environment", ["open_square", "urban_crossing"])
-def test_no_deadlock_where_all_receive_each_other(environment: str) -> None:
-    scenario = load_scenario(environment, {"topology.acyclic": False})
-    found = score(drive(Engine(scenario, 64), load_agent("peek", scenario), held_out_seeds(9, 64)))
+def test_no_deadlock_where_all_receive_each_other(environment: str, agent: str) -> None:
+    scenario = load_scenario(environment)
+    assert scenario.v2x.links == "all"
+    found = score(drive(Engine(scenario, 64), load_agent(agent, scenario), held_out_seeds(9, 64)))
     rates = {result.metric: result.mean for result in found}
     assert rates["arrival_rate"] >= 0.97 and rates["collision_rate"] <= 0.02, rates
 
