@@ -101,7 +101,11 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         observation=observation,
         action=action,
         settings=settings,
-        seen={name: trainer.env.seen(slice(field.start, field.stop)) for name, field in observation.items()},
+        seen={
+            name: trainer.env.seen(slice(field.start, field.stop))
+            for name, field in observation.items()
+            if name != "time_left"  # goes on for vehicles that have arrived
+        },
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
     document = {
