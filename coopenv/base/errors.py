@@ -53,6 +53,10 @@ class ScenarioWarning(UserWarning):
     """The scenario is possible but the theory's conditions may not hold."""
 
 
+class AgentWarning(UserWarning):
+    """A learned agent observes what it has never seen in training."""
+
+
 class DataWarning(UserWarning):
     """A recorded or deployment file is what it claims to be, but lacks something that it should hold."""
 

@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,6 +27,34 @@ from coopenv.scenario import Scenario
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
 IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
+
+
+def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
+    """Return overrides for worlds that are harder or easier to sense than a scenario's, by what is changed."""
+    noise = scenario.noise
+    return {
+        "ideal sensing": dict(IDEAL_SENSING),
+        "all-round cameras": {"camera.model": "omnidirectional"},
+        "twice the range": {"randomisation.camera_range": [2.0, 2.0]},
+        "3/4 of the range": {"randomisation.camera_range": [0.75, 0.75]},
+        "half of the landmarks": {"randomisation.landmark_presence": [0.5, 0.5]},
+        "a third of the landmarks": {"randomisation.landmark_presence": [0.333, 0.333]},
+        "bearing noise x 5": {"noise.bearing.scale": 5.0 * noise.bearing.scale},
+        "odometry noise x 4": {
+            "noise.velocity": 4.0 * noise.velocity,
+            "noise.angular_velocity": 4.0 * noise.angular_velocity,
+            "noise.odometry_scale": 0.03,
+            "noise.gyro_bias": [0.0, 0.0, 0.0087],
+        },
+        "initial error x 2": {"randomisation.initial_error": [2.0, 2.0]},
+        **(OF_MESSAGES if len(scenario.vehicles) > 1 else {}),
+    }
+
+
+OF_MESSAGES: dict[str, dict[str, Any]] = {
+    "60 % of messages lost": {"v2x.loss": 0.6},
+    "vehicle_1 lies": {"vehicles.0.faults.lie": {"kind": "jump", "start": 2.0, "offset": 3.0}},
+}
 
 
 @dataclass(frozen=True)
@@ -60,6 +89,7 @@ class Contest:
         worlds: int,
         block: int = 0,
         ideal: bool = False,
+        stressed: bool = False,
     ) -> "Contest":
         """Build the drivers.
 
@@ -70,6 +100,7 @@ class Contest:
             worlds: how many.
             block: number of the block of held-out seeds.
             ideal: let the baseline drive under ideal sensing, too.
+            stressed: let the drivers drive in the worlds of `stress`, too.
 
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
@@ -81,6 +112,9 @@ class Contest:
         if not found:
             raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
         entrants = [Entrant(agent, agent.name, agent.kind, scenario, agent.policy(scenario)) for agent in found]
+        for row, changed in stress(scenario).items() if stressed else ():
+            other = open_simulation(environment, {**overrides, **changed})
+            entrants += [Entrant(a, f"{a.name}, {row}", a.kind, other, a.policy(other)) for a in found]
         names = [entrant.name for entrant in entrants]
         for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
             raise CoopenvError(f"--agents: two are called '{twice}'")
@@ -94,18 +128,17 @@ class Contest:
 
         `on_progress` is called with the number of drivers that are done, shares included, and the driver's name.
         """
-        seeds, episodes, engines = held_out_seeds(self.block, self.worlds), dict[str, Episodes](), dict[int, Engine]()
-        with ExitStack() as stack:
-            for place, entrant in enumerate(self.entrants):
-                world = id(entrant.scenario)
-                if world not in engines:
-                    engines[world] = stack.enter_context(closing(Engine(entrant.scenario, self.worlds)))
-                    engines[world].load()
+        seeds, episodes = held_out_seeds(self.block, self.worlds), dict[str, Episodes]()
+        for _, group in groupby(enumerate(self.entrants), lambda row: id(row[1].scenario)):
+            here = list(group)
+            with closing(Engine(here[0][1].scenario, self.worlds)) as engine:
+                engine.load()
+                for place, entrant in here:
 
-                def report(share: float, place: int = place, name: str = entrant.name) -> None:
-                    on_progress(place + share, name)
+                    def report(share: float, place: int = place, name: str = entrant.name) -> None:
+                        on_progress(place + share, name)
 
-                episodes[entrant.name] = drive(engines[world], entrant.policy, seeds, report)
+                    episodes[entrant.name] = drive(engine, entrant.policy, seeds, report)
         return Evaluation(**vars(self), episodes=episodes)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 
 import typer
 
-from coopenv.base.errors import CoopenvError, DataWarning, ScenarioWarning
+from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning
 from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
@@ -243,7 +243,17 @@ def command(function: Callable[[Options], None]) -> Callable[..., None]:
     own_first = sorted(parameters, key=lambda p: next(depth for depth, names in enumerate(own) if p.name in names))
 
     def run(**given: Any) -> None:
-        function(record(**given))
+        with warnings.catch_warnings():
+            shown = warnings.showwarning
+
+            def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+                if issubclass(category, AgentWarning):
+                    print(f"warning: {message}", file=sys.stderr)
+                else:
+                    shown(message, category, *where)
+
+            warnings.showwarning = show  # type: ignore[assignment]
+            function(record(**given))
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
     run.__signature__ = inspect.Signature([p.replace(annotation=kinds[p.name]) for p in own_first])  # type: ignore[attr-defined]

@@ -66,11 +66,10 @@ class TrainOptions:
         return plan
 
     def _settings(self, overrides: dict[str, Any]) -> Any:
-        from coopenv.backends.sources import open_simulation
         from coopenv.policies import find_agent
-        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_start
+        from coopenv.training.settings import SETTINGS_FILE, read_settings, usual_settings
 
-        path, start = self.settings, {}
+        path, budget = self.settings, {"steps": self.steps, "minutes": self.minutes}
         if self.agent is not None:
             if path is not None:
                 raise CoopenvError("--agent and --settings: give one of them")
@@ -78,10 +77,11 @@ class TrainOptions:
             if folder is None or not (folder / SETTINGS_FILE).is_file():
                 raise CoopenvError(f"--agent {self.agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
             path = folder / SETTINGS_FILE
-        if path is None:
-            start = usual_start(open_simulation(self.environment, overrides))
-        name = Path(self.environment).stem
-        return read_settings(path, self.arm, name, steps=self.steps, minutes=self.minutes, **start)
+        if path is None and self.arm is None:
+            if self.steps is not None and self.minutes is not None:
+                raise CoopenvError("--steps and --minutes: give one of them")
+            return usual_settings(self.environment, overrides, **budget)
+        return read_settings(path, self.arm, Path(self.environment).stem, **budget)
 
 
 @options.command
@@ -160,6 +160,9 @@ class EvaluateOptions:
     seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0
     overrides: options.Overrides = None
     ideal: Annotated[bool, typer.Option("--ideal", help="Also let route_follower drive under ideal sensing.")] = False
+    stress: Annotated[
+        bool, typer.Option("--stress", help="Also with other cameras, noise, landmarks and messages than in training.")
+    ] = False
     out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None
     figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
     width: options.FigureWidth = None
@@ -174,6 +177,8 @@ class EvaluateOptions:
     as_json: options.AsJson = False
 
 
+SHORT_NAME = 20
+"""Characters of an agent's name from which on the tables are wider."""
 OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", "force", "as_json")
 """Options of `evaluate` that do not change what is measured."""
 
@@ -186,21 +191,28 @@ def evaluate(given: EvaluateOptions) -> None:
     environment, agents, out, log = given.environment, given.agents, given.out, options.console(stderr=True)
     if given.film and out is None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
+    if given.stress and (given.film or given.write_card):
+        raise CoopenvError("--stress prints a table: leave out --film and --write-card")
     names = options.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
     with options.warned():
         changes = options.parse_overrides(given.overrides)
-        contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal)
+        contest = cards.Contest.of(
+            environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress
+        )
     carded = cards.carded(contest) if given.write_card else []
     command = options.command_text("evaluate", given, OF_THE_OUTPUT)
-    drawn = {"figures": None if given.no_figures else given.figures.value, "width": given.width and given.width.value}
+    drawn = {
+        "figures": None if given.no_figures or given.stress else given.figures.value,
+        "width": given.width and given.width.value,
+    }
     result = evaluate.run(contest, command, log, out=out, film=given.film, force=given.force, **drawn)
     written = cards.write(result, carded, command)
     if given.as_json:
         options.print_json(evaluate.document(result, command))
         return
-    printed = options.console(least=evaluate.WIDTH)
+    printed = options.console(least=evaluate.WIDTH + max(0, max(map(len, result.results)) - SHORT_NAME))
     evaluate.report(result, printed)
     if out is not None:
         printed.print(f"Files in {out}:", soft_wrap=True)

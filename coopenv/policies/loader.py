@@ -60,6 +60,8 @@ class NetworkCard(BaseModel):
     action: dict[str, NetworkColumn]
     settings: dict[str, float]
     """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
+    seen: dict[str, tuple[float, float]] = {}
+    """Between which values nearly all entries of a field lay in training, by its name."""
 
 
 class AgentCard(BaseModel):

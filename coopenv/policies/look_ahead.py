@@ -83,6 +83,7 @@ class LookAhead(RouteFollower):
     farthest = 0.8  # m, offset from the route that costs nothing
     plan_paces: tuple[float, ...] = (1.0,)
     """Speeds of plans, as shares of the top speed."""
+    closest, clearance = 0.85, 1.0  # farther from others, which turn aside as it does
 
     def __init__(self, scenario: Scenario) -> None:
         """See `Driver`."""
@@ -141,6 +142,7 @@ class LookAhead(RouteFollower):
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
         theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
+        mask = self.before(mask, vehicle)
         cost, missing = np.zeros_like(now.x), zero
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -169,7 +171,7 @@ class LookAhead(RouteFollower):
             for each in followers:
                 cost[each.row] += STEP * self.price * np.maximum(each.covariance.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
-            # Vehicles with a received message are expected to drive straight on at top speed.
+            # Vehicles to give way to are expected to drive straight on at top speed.
             driven = theirs * (STEP * (step + 1)) * forward
             apart = (others + driven)[:, None] - place[:, :, None]
             distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)

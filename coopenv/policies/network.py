@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -12,12 +13,18 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import AgentWarning, CoopenvError
 from coopenv.policies.loader import NetworkCard, NetworkColumn
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
 """The `entry` of learned agents."""
+FOREIGN = 0.1
+"""Share of a field's entries beyond what was seen in training from which on the agent warns."""
+SLACK = 0.01
+"""By which entries may lie beyond."""
+FIRST_LOOK = 100
+"""Rows, at least, before it does."""
 PLACE = {"start", "stop"}
 """Properties of a field that may differ between agent and environment."""
 
@@ -85,9 +92,14 @@ class Network:
         depth = len([name for name in tensors if name.endswith(".weight")])
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
         _check_shapes(path, len(self._columns), len(action), self._mean, self._std, self._layers)
+        self._name, self._seen, self._rows = folder.resolve().name, dict(network.seen), 0
+        self._places = {name: slice(observation[name].start, observation[name].stop) for name in self._seen}
+        self._outside = dict.fromkeys(self._seen, 0.0)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
+        if self._seen:
+            self._compare_with_training(observations[observations.any(axis=1)])
         scaled = (observations[:, self._columns] - self._mean) / self._std
         values = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
         for weight, bias in self._layers[:-1]:
@@ -95,6 +107,23 @@ class Network:
         weight, bias = self._layers[-1]
         actions: np.ndarray = np.clip(values @ weight + bias, -1.0, 1.0)
         return actions
+
+    def _compare_with_training(self, observations: np.ndarray) -> None:
+        """Warn, once, where many entries of a field lie beyond those of the training."""
+        self._rows += len(observations)
+        for name, (low, high) in self._seen.items():
+            entries = observations[:, self._places[name]]
+            self._outside[name] += ((entries < low - SLACK) | (entries > high + SLACK)).mean(axis=1).sum()
+        if self._rows < FIRST_LOOK:
+            return
+        found = {name: share / self._rows for name, share in self._outside.items() if share > FOREIGN * self._rows}
+        if found:
+            worst = max(found, key=lambda name: found[name])
+            text = (
+                f"agent {self._name}: {found[worst]:.0%} of the entries of '{worst}' are beyond those of its training"
+            )
+            warnings.warn(AgentWarning(text), stacklevel=2)
+            self._seen = {}
 
 
 def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str, NetworkColumn]) -> None:

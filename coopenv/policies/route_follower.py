@@ -183,6 +183,10 @@ class RouteFollower(Driver):
         place, forward = (self.read(observations, f"message_{name}")[..., :2] for name in ("position", "forward"))
         return mask, place, forward
 
+    def before(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
+        """Return those of the senders, (rows, M), over which the rows' vehicles, (rows,), have no right of way."""
+        return np.asarray(senders & ~self.goes_first[vehicle]) if self.goes_first.any() else senders
+
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
 
@@ -193,11 +197,12 @@ class RouteFollower(Driver):
         velocities = [pace * self.cruise * forward for pace in self.paces]
 
         keep, times = self.distance_to_keep(observations), distance / self.cruise
-        clear, first = np.ones(len(mask), dtype=bool), self.goes_first
-        if first.any() and len(mask) % len(first) == 0:
-            near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
-            clear = nearest(points, times, place, 0.0 * forward, mask, SOON) >= np.minimum(self.blocking, near)
-            mask = mask & ~np.tile(first, (len(mask) // len(first), 1))
+        near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
+        clear = nearest(points, times, place, 0.0 * forward, mask, SOON) >= np.minimum(self.blocking, near)
+        everyone, vehicles = mask, len(self.goes_first)
+        if len(mask) % vehicles == 0:  # else the rows are of unknown vehicles, which give way to all
+            mask = self.before(mask, np.arange(len(mask)) % vehicles)
+        clear |= (mask == everyone).all(axis=1)
 
         def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
             found = [nearest(path, times, place, velocity, mask, self.foresight) for velocity in velocities]

@@ -64,6 +64,10 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
          "least distance within 6 s to the neighbour, if that drives straight on at top speed and this vehicle follows "
          "its route at top speed, or stands; 4: farther, or nothing heard", None, 2.0),
     ],
+    "precedence": [
+        ("message_precedence", "neighbour", 1, "bool", 1, 0,
+         "1: a message is at hand from a neighbour with the right of way: not driven, or earlier in the order"),
+    ],
     "goal": [
         ("goal", "vehicle", 3, "m", "position_scale", -1,
          "goal seen from one's own estimate, body frame; 0 without a goal", XY),

@@ -73,13 +73,15 @@ def possible(plan: TrainingPlan) -> Scenario:
     """Return the scenario of a training, before anything is made.
 
     Raises:
-        CoopenvError: no vehicle is driven there, or the driver to begin as lacks what it needs to see.
+        CoopenvError: no vehicle is driven there, a variation is not possible, or the driver to begin as lacks what it
+            needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not scenario.driven:
         raise CoopenvError(f"{plan.environment}: all motion here is prescribed, there is nothing to learn")
-    if plan.settings.clone is not None:
-        load_agent(plan.settings.clone.agent, scenario)
+    for each, _ in plan.scenarios():
+        if plan.settings.clone is not None:
+            load_agent(plan.settings.clone.agent, each)
     return scenario
 
 

@@ -101,6 +101,11 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         observation=observation,
         action=action,
         settings=settings,
+        seen={
+            name: trainer.env.seen(slice(field.start, field.stop))
+            for name, field in observation.items()
+            if name != "time_left"  # goes on for vehicles that have arrived
+        },
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
     document = {
@@ -109,7 +114,7 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         "kind": "learned",
         "entry": ENTRY,
         "environments": [environment.name],
-        "network": _with_rows(card.model_dump(), "observation", "action"),
+        "network": _with_rows(card.model_dump(mode="json"), "observation", "action"),
         "training": {
             # trains the same once more, in the agent's folder
             "command": join(

@@ -5,6 +5,7 @@ import re
 import shutil
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -12,9 +13,11 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, model_validator
 
+from coopenv.api.terms.layout import observation_layout
+from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
-from coopenv.base.installation import is_scene, list_envs, scenario_path
+from coopenv.base.installation import data_directory, is_scene, list_agents, list_envs, scenario_path
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
@@ -84,6 +87,15 @@ class Clone(Section):
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
 
 
+class Variation(Section):
+    """Worlds to learn in that differ from the others."""
+
+    share: Annotated[float, Field(gt=0.0, le=1.0)]
+    """Of the worlds; one at least."""
+    scenario: dict[str, Any]
+    """Overrides that go before all others."""
+
+
 class EvaluationSettings(Section):
     """Judging the mean action on held-out maps."""
 
@@ -104,6 +116,10 @@ class Settings(Section):
     """Length of the training, min, instead of `steps`."""
     scenario: dict[str, Any] = Field(default={})
     """Overrides of the scenario, as tables or dotted keys, as with `--set`."""
+    randomised: dict[str, Any] = Field(default={})
+    """Further ones for the worlds to learn in alone, such as `randomisation.camera_range = [0.7, 2.0]`."""
+    variations: tuple[Variation, ...] = ()
+    """Further ones for some of these worlds."""
     ppo: Ppo = Ppo()
     evaluation: EvaluationSettings = EvaluationSettings()
     clone: Clone | None = None
@@ -114,22 +130,6 @@ class Settings(Section):
         if self.minutes is not None:
             return None, 60.0 * self.minutes
         return self.steps or 2_000_000, None
-
-
-USUAL_START: dict[str, Any] = {
-    "clone": {"agent": "look_ahead", "episodes": 128, "epochs": 30},
-    "ppo": {"learning_rate": 5e-4, "initial_std": 0.25},
-}
-"""Settings of a training of which nothing else is said, where the planner can drive."""
-
-
-def usual_start(scenario: Scenario) -> dict[str, Any]:
-    """Return `USUAL_START`, or nothing where its agent cannot drive."""
-    try:
-        load_agent(USUAL_START["clone"]["agent"], scenario)
-    except CoopenvError:
-        return {}
-    return USUAL_START
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,26 @@ class TrainingPlan:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
 
+    def scenarios(self, worlds: int = 1) -> list[tuple[Scenario, int]]:
+        """Return of which scenarios so many worlds to learn in are, and how many of each.
+
+        Raises:
+            CoopenvError: an override is not possible there, or changes what is observed or what actions mean.
+        """
+        settings, found = self.settings, list[tuple[Scenario, int]]()
+        layout = observation_layout(open_simulation(self.environment, self.all_overrides))
+        randomised = {**self.all_overrides, **settings.randomised}
+        for own in settings.variations:
+            varied = open_simulation(self.environment, {**randomised, **own.scenario})
+            here = observation_layout(varied)
+            if (here, here.actions) != (layout, layout.actions):
+                raise CoopenvError(f"variations: {own.scenario} changes the observation or the action")
+            found.append((varied, max(1, round(own.share * worlds))))
+        left = worlds - sum(count for _, count in found)
+        if left > 0 or not found:
+            found.insert(0, (open_simulation(self.environment, randomised), max(1, left)))
+        return found
+
 
 def read_settings(
     path: Path | None, arm: str | None = None, environment: str | None = None, **changes: Any
@@ -165,7 +185,7 @@ def read_settings(
         CoopenvError: no such file or arm, or it is not valid; one line that names file and field.
     """
     where, raw = (str(path), read_toml(path)) if path is not None else ("settings", {})
-    raw["scenario"] = _flat(raw.get("scenario", {}), where)
+    raw = _flattened(raw, where)
     environments = _tables(raw.pop("environments", {}), f"{where}: environments")
     arms = _tables(raw.pop("arms", {}), f"{where}: arms")
     here = dict(environments.get(environment or "", {}))
@@ -177,12 +197,39 @@ def read_settings(
     if arm is not None:
         changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
     for place, change in changed.items():
-        scenario = _flat(change.get("scenario", {}), f"{where}: {place}")
-        raw = merged(raw, {**change, "scenario": scenario})
+        raw = merged(raw, _flattened(change, f"{where}: {place}"))
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
     return validated(Settings, json.dumps(raw, default=str), where)
+
+
+def usual_settings(environment: str, overrides: Mapping[str, Any], **changes: Any) -> Settings:
+    """Return the settings of a training of which nothing else is said.
+
+    They are those of the agents that ship with coopenv, where the driver that these begin as can drive; in other
+    environments without their reward, and without variations that are not possible.
+    """
+    name, changed = Path(environment).stem, {key: value for key, value in changes.items() if value is not None}
+    shipped = read_settings(data_directory("agents") / SETTINGS_FILE, USUAL_ARM, name)
+    settings = shipped.model_copy(update={"steps": None, **changed} if "minutes" in changed else changed)
+    if f"{environment}_{USUAL_ARM}" not in list_agents():
+        settings = settings.model_copy(update={"scenario": {}})
+    try:
+        if settings.clone is not None:
+            load_agent(settings.clone.agent, open_simulation(environment, overrides))
+    except CoopenvError:
+        return read_settings(None, None, name, **changes)
+    fitting = []
+    for own in settings.variations:
+        with suppress(CoopenvError):
+            alone = settings.model_copy(update={"variations": (own,)})
+            TrainingPlan(environment, alone, 0, overrides=overrides).scenarios()
+            fitting.append(own)
+    return settings.model_copy(update={"variations": tuple(fitting)})
+
+
+USUAL_ARM = "quality"
 
 
 def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:
@@ -191,10 +238,24 @@ def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:
     return tables
 
 
+def _flattened(raw: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return settings with overrides of scenarios by dotted keys."""
+    flat: dict[str, Any] = {
+        name: _flat(raw[name], f"{where}: {name}") for name in ("scenario", "randomised") if name in raw
+    }
+    variations = raw.get("variations")
+    if isinstance(variations, list):
+        flat["variations"] = [
+            _flattened(own, f"{where}: variations.{i}") if isinstance(own, dict) else own
+            for i, own in enumerate(variations)
+        ]
+    return {**raw, **flat}
+
+
 def _flat(tables: Any, where: str) -> dict[str, Any]:
     """Return tables within tables as one of dotted keys."""
     if not isinstance(tables, dict):
-        raise CoopenvError(f"{where}: scenario: expected a table")
+        raise CoopenvError(f"{where}: expected a table")
     flat: dict[str, Any] = {}
     for key, value in tables.items():
         inner = _flat(value, where) if isinstance(value, dict) else None

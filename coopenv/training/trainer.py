@@ -2,9 +2,10 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic, process_time
 from typing import Any
 
@@ -28,6 +29,8 @@ from coopenv.training.settings import Clone, TrainingPlan
 
 EPISODES = 200
 """Last episodes of vehicles over which is averaged."""
+SEEN = 256
+"""Last decisions whose observations are kept, for the range of each field."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,60 @@ class Watch(BaseCallback):
         self._errors.clear()
 
 
+APART = 1_000_003
+"""Between the seeds of parts of a batch."""
 LEAST_VARIANCE = 1e-4
 """Added to variances: what hardly ever changes is not blown up to the size of the rest."""
+
+
+class MixedWorlds(CooperativeSB3VecEnv):
+    """Batches whose worlds differ in what they draw, or in their sensors, one below the other as one."""
+
+    def __init__(self, parts: Sequence[CooperativeSB3VecEnv]) -> None:
+        super().__init__(parts[0].envs)
+        self.parts = parts
+        self.num_envs = sum(part.num_envs for part in parts)
+        self._ends = np.cumsum([part.num_envs for part in parts])[:-1]
+        self.acted = np.zeros(self.num_envs, dtype=bool)
+
+    def reset(self) -> np.ndarray:
+        """Start a new episode in every world; parts draw other worlds than one another."""
+        for place, part in enumerate(self.parts):
+            if (seed := self._seeds[0]) is not None:
+                part.seed((seed + APART * place) % 2**31)
+        self._reset_seeds()
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        return np.concatenate([part.reset() for part in self.parts])
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Drive for one decision period in all parts."""
+        for part, actions in zip(self.parts, np.split(self._actions, self._ends), strict=True):
+            part.step_async(actions)
+        observations, rewards, dones, infos = zip(*(part.step_wait() for part in self.parts), strict=True)
+        self.acted = np.concatenate([part.acted for part in self.parts])
+        self.batch_infos = {
+            name: np.concatenate([part.batch_infos[name] for part in self.parts]) for name in ("time", "position_error")
+        }
+        together = [info for own in infos for info in own]
+        return np.concatenate(observations), np.concatenate(rewards), np.concatenate(dones), together
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return the states of all parts."""
+        states = enumerate(part.get_state() for part in self.parts)
+        return {f"{place}/{name}": values for place, state in states for name, values in state.items()}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Go on from what `get_state` returned. Raises CoopenvError: it does not fit."""
+        states: list[dict[str, np.ndarray]] = [{} for _ in self.parts]
+        for name, values in state.items():
+            place, _, own = name.partition("/")
+            states[int(place)][own] = values
+        return np.concatenate([part.set_state(own) for part, own in zip(self.parts, states, strict=True)])
+
+    def close(self) -> None:
+        """Close all parts."""
+        for part in self.parts:
+            part.close()
 
 
 class NormalisedEnv(VecEnvWrapper):
@@ -113,6 +168,7 @@ class NormalisedEnv(VecEnvWrapper):
         super().__init__(venv, observation_space=spaces.Box(-clip, clip, shape=shape, dtype=np.float32))
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._reward_scale = clip, reward_scale
+        self._seen: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
 
     def start(self) -> None:
@@ -133,6 +189,11 @@ class NormalisedEnv(VecEnvWrapper):
         """Standard deviations by which observations are divided, (D,)."""
         return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
 
+    def seen(self, columns: slice) -> tuple[float, float]:
+        """Return between which values nearly all of some entries of the last observations lay."""
+        low, high = np.percentile(np.concatenate(self._seen)[:, columns], (0.1, 99.9))
+        return round(float(low), 4), round(float(high), 4)
+
     def reset(self) -> np.ndarray:
         """Start new episodes, or continue with given observations."""
         if self._present is not None:
@@ -147,6 +208,7 @@ class NormalisedEnv(VecEnvWrapper):
         observations, rewards, dones, infos = self.venv.step_wait()
         if self.venv.acted.any():
             self.statistics.update(observations[self.venv.acted])
+            self._seen.append(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
         return self.normalise(observations), rewards * self._reward_scale, dones, infos
@@ -156,13 +218,16 @@ BATCH = 512  # rows per gradient step
 
 
 def watch(
-    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, report: Callable[[str], None]
+    scenario: Scenario,
+    worlds: int,
+    settings: Clone,
+    gamma: float,
+    seed: int,
+    threads: int,
+    report: Callable[[str], None],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
-    scenario = like.scenario
-    env = CooperativeVectorEnv(
-        scenario, "clone", num_worlds=settings.episodes, autoreset="disabled", threads=like.engine.world.threads
-    )
+    env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
     driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     restart(driver, np.ones(env.num_envs, dtype=bool))
@@ -206,15 +271,12 @@ class Trainer:
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
         self.plan, self.scenario = plan, scenario
         ppo = plan.settings.ppo
-        rows = CooperativeVectorEnv(
-            scenario,
-            plan.environment,
-            num_worlds=max(1, ppo.vehicles // len(driven_vehicles(scenario))),
-            autoreset="same_step",
-            arrays="numpy",
-            threads=threads,
-        )
-        self.batch = CooperativeSB3VecEnv(rows)
+        self._scenarios = plan.scenarios(max(1, ppo.vehicles // len(driven_vehicles(scenario))))
+        built = partial(CooperativeVectorEnv, autoreset="same_step", arrays="numpy", threads=threads)
+        parts = [
+            CooperativeSB3VecEnv(built(each, plan.environment, num_worlds=count)) for each, count in self._scenarios
+        ]
+        self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
         self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
@@ -258,7 +320,20 @@ class Trainer:
         its corrections of deviations are recorded (Laskey et al. 2017).
         """
         policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
-        raw, actions, returns = watch(self.batch.envs, clone, ppo.gamma, seed, report)
+        all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
+        watched = [
+            watch(
+                each,
+                max(1, clone.episodes * count // all_worlds),
+                clone,
+                ppo.gamma,
+                seed + APART * place,
+                threads,
+                report,
+            )
+            for place, (each, count) in enumerate(self._scenarios)
+        ]
+        raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))
         self.env.statistics.update(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))

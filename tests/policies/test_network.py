@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +14,7 @@ from safetensors.numpy import save
 
 import coopenv
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
+from coopenv.base.errors import AgentWarning
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import NetworkCard
 from coopenv.policies.network import Network, layout_hash, layout_tables
@@ -56,6 +58,22 @@ def test_is_a_multilayer_perceptron_of_normalised_observations(tmp_path: Path) -
             x = np.tanh(t[f"layers.{i}.weight"] @ x + t[f"layers.{i}.bias"])
         x = np.clip(t["layers.2.weight"] @ x + t["layers.2.bias"], -1.0, 1.0)
         assert action == pytest.approx(x, abs=1e-5)
+
+
+def test_warns_once_beyond_what_training_has_seen(tmp_path: Path) -> None:
+    scenario, tensors = coopenv.load_scenario(ENV), tensors_for(132)
+    seen = {"goal": (-0.5, 0.5), "velocity": (-1.0, 1.0)}
+    card = write(tmp_path, tensors).model_copy(update={"seen": seen})
+    rows = np.full((60, 132), 0.2, np.float32)
+    with warnings.catch_warnings(action="error"):
+        policy = Network(scenario, folder=tmp_path, network=card)
+        for _ in range(5):
+            policy(rows)
+            policy(np.zeros_like(rows))  # of vehicles that have ended
+    with pytest.warns(AgentWarning, match=r"agent \w+: 50% of the entries of 'goal' are beyond those of its training"):
+        policy = Network(scenario, folder=tmp_path, network=card)
+        for values in (rows, 3.0 * rows, rows, 3.0 * rows):
+            policy(values)
 
 
 def test_drives_where_there_is_more_to_see(tmp_path: Path) -> None:

@@ -10,17 +10,17 @@ import pytest
 from pydantic import TypeAdapter
 
 import coopenv
-from coopenv.base.errors import OutputError
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.installation import data_directory
 from coopenv.policies import find_agent
-from coopenv.scenario import load_scenario
 from coopenv.training.settings import (
+    Settings,
     TrainingPlan,
     check_settings,
     environment_file,
     read_settings,
     settings_digest,
-    usual_start,
+    usual_settings,
     write_settings,
 )
 
@@ -59,12 +59,39 @@ def test_defaults() -> None:
 
 
 def test_a_training_of_which_nothing_is_said_begins_as_the_planner_where_that_can_drive() -> None:
-    square, highway = (load_scenario(name) for name in ("open_square", "highway_roundabout"))
-    settings = read_settings(None, **usual_start(square))
-    assert settings.clone and settings.clone.agent == "look_ahead" and settings.ppo.initial_std == 0.25
-    blind = load_scenario("open_square", {"observation.exclude": ["map"]})
-    assert usual_start(blind) == {} and read_settings(None, **usual_start(blind)) == read_settings(None)
-    assert usual_start(highway) in ({}, usual_start(square))
+    settings = usual_settings("open_square", {}, steps=None)
+    assert settings == read_settings(data_directory("agents") / "train.toml", "quality", "open_square")
+    assert settings.clone and settings.clone.agent == "look_ahead" and settings.variations and settings.randomised
+    assert usual_settings("open_square", {}, minutes=2.0).budget == (None, 120.0)
+    assert usual_settings("open_square", {"observation.exclude": ["map"]}) == read_settings(None)
+    assert usual_settings("large_crossing", {}).scenario == {}, "its reward is its own"
+
+
+VARIED = """
+randomised.randomisation.camera_range = [0.5, 2.0]
+variations = [{ share = 0.25, scenario.camera.model = "omnidirectional" }]
+"""
+
+
+def test_shares_of_the_worlds_to_learn_in_differ(tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(VARIED)
+    plan = TrainingPlan("facade", read_settings(tmp_path / "train.toml"), 0)
+    (usual, most), (round_about, some) = plan.scenarios(16)
+    assert (most, some) == (12, 4)
+    assert usual.randomisation.camera_range == round_about.randomisation.camera_range == (0.5, 2.0)
+    assert (usual.camera.model, round_about.camera.model) == ("pinhole", "omnidirectional")
+    assert plan.all_overrides == {}, "held-out worlds are as the environment's"
+    assert [count for _, count in TrainingPlan("facade", read_settings(None), 0).scenarios(16)] == [16]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error"),
+    [({"observation.map_size": 2}, "changes the observation or the action"), ({"camera.range": -1}, "camera.range")],
+)
+def test_a_variation_that_is_not_possible_is_refused(overrides: dict[str, object], error: str) -> None:
+    settings = Settings.model_validate({"variations": ({"share": 0.1, "scenario": overrides},)})
+    with pytest.raises(CoopenvError, match=error):
+        TrainingPlan("facade", settings, 0).scenarios(8)
 
 
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:

@@ -31,6 +31,8 @@ pytestmark = pytest.mark.train
 SETTINGS = """
 steps = 3000
 scenario.horizon = 6.0
+randomised.randomisation.camera_range = [0.8, 2.0]
+variations = [{ share = 0.25, scenario.sensing = "ideal" }]
 [ppo]
 vehicles = 16
 decisions = 25
@@ -117,6 +119,9 @@ def test_leaves_an_agent(reference: Path) -> None:
     assert list((reference / "tensorboard").glob("events.*"))
     again = read_settings(reference / "train.toml")
     assert (again.steps, again.ppo.vehicles, again.scenario) == (3000, 16, {"horizon": 6.0})
+    assert again.variations[0].scenario == {"sensing": "ideal"}
+    seen = card.network.seen if card.network else {}
+    assert -1.0 <= seen["position_std"][0] < seen["position_std"][1] <= 1.0
 
 
 def same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:

@@ -16,6 +16,7 @@ from coopenv.world.camera import (
     segment_hits_box,
 )
 from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING, UNDER_WAY
+from coopenv.world.model import DRIVEN
 from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance, place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
@@ -228,6 +229,7 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
         neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
         neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
     target = model.landmarks + sender
+    neighbour.precedes = neighbour.received and (sender < vehicle or model.motion.kind[target] != DRIVEN)
     neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
     neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
     neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)

@@ -108,6 +108,7 @@ class Neighbour:
     bearing: wp.vec3  # unit vector camera to the vehicle, body, last measured; 0: never
     in_view: wp.bool  # measured in this frame
     bearing_age: wp.float32  # s since measured
+    precedes: wp.bool  # it was heard and has the right of way
 
 
 @wp.struct
@@ -241,6 +242,7 @@ def neighbour_values(ego: Ego, neighbour: Neighbour, clearance: bool) -> Neighbo
         wp.float32(neighbour.received),  # message_mask
         neighbour.age,  # message_age
         driving, standing,  # message_clearance
+        wp.float32(neighbour.precedes),  # message_precedence
         sighting[0], sighting[1], sighting[2],
         wp.float32(neighbour.in_view),  # sighting_mask
         neighbour.bearing_age,  # sighting_age

@@ -325,3 +325,14 @@ def test_clearance_is_the_least_distance_on_the_two_ways_that_are_expected() -> 
         expected = [np.linalg.norm(other - own, axis=-1).min(), np.linalg.norm(other, axis=-1).min()]
         np.testing.assert_allclose(read["message_clearance"][row], np.minimum(expected, FAR), atol=4e-3)
     assert (read["message_clearance"] < 1.0).any() and heard.any()
+
+
+def test_who_has_the_right_of_way_is_heard_and_earlier_or_not_driven() -> None:
+    heard = {"observation.include": ["messages", "precedence"], "v2x.loss": 0.0}
+    for name, expected in (("open_square", np.tri(4, 3, -1)), ("behind_truck", [[0.0], [1.0]])):
+        engine = Engine(load_scenario(name, heard), 1)
+        engine.reset([0])
+        layout = observation_layout(engine.backend.scenario)
+        assert not layout["message_precedence"].values(engine.view("observation")).any(), "nothing heard yet"
+        engine.step(np.zeros(engine.view("actions").shape))
+        np.testing.assert_array_equal(layout["message_precedence"].values(engine.view("observation"))[0], expected)

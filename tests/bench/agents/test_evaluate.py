@@ -64,6 +64,12 @@ def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     assert again == found
 
 
+def test_a_table_of_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", *SHORT, "--agents", "own.py:still", "--stress"]) == 0
+    out = capsys.readouterr().out
+    assert "still, a third of the landmarks" in out and "still, vehicle_1 lies" in out and "…" not in out
+
+
 def test_a_block_of_seeds_is_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
     rows = []
     for block in ("0", "1"):
@@ -97,6 +103,7 @@ def test_cards(capsys: pytest.CaptureFixture[str]) -> None:
         ([*SHORT, "--agents", "own.py:still,own.py:still"], "--agents: two are called 'still'"),
         ([*SHORT, "--agents", "own.py:still", "--write-card"], "still is a place in code; a card needs"),
         ([*SHORT, "--agents", "mine", "--write-card"], "mine/card.json: not a card"),
+        ([*SHORT, "--stress", "--write-card"], "--stress prints a table: leave out --film and --write-card"),
         ([*SHORT, "--film"], "--film: the film needs a folder, --out DIR"),
         ([*SHORT, "--worlds", "1"], "Invalid value for '--worlds'"),
     ],
