@@ -18,7 +18,7 @@ from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
-from tests.helpers.marks import largest_slow
+from tests.helpers.env_suite import largest_slow
 
 pytestmark = pytest.mark.headroom
 
