@@ -85,7 +85,7 @@ def dependent_e95(found: Episodes, environment: str) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", HELPERS)
 def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) -> None:
-    """A dilemma of planners, before anything is trained; where cars do not see each other it buys less than those 20 %."""
+    """A dilemma of planners, before anything is trained; where cars do not see each other it buys less than 20 %."""
     agents = ("look_ahead", "team_look_ahead")
     (own, selfish), (others, team) = (team_episodes(environment, agent, "as it is") for agent in agents)
     assert team["e95_m"][0] <= 0.8 * selfish["e95_m"][0] and team["e95_m"][2] < selfish["e95_m"][1]
