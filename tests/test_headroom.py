@@ -90,7 +90,7 @@ def dependent_e95(found: Episodes, environment: str) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", HELPERS)
 def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) -> None:
-    """A dilemma of planners, before anything is trained; where cars do not see each other there is none."""
+    """A dilemma of planners, before anything is trained; where cars do not see each other it buys less than 20 %."""
     agents = ("look_ahead", "team_look_ahead")
     (own, selfish), (others, team) = (team_episodes(environment, agent, "as it is") for agent in agents)
     assert team["e95_m"][0] <= 0.8 * selfish["e95_m"][0] and team["e95_m"][2] < selfish["e95_m"][1]
@@ -103,7 +103,7 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
     # Slow helpers count for longer in the fleet's e95: the vehicles that depend on them are judged by themselves, too.
     assert dependent_e95(others, environment) <= 0.8 * dependent_e95(own, environment)
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
-    assert unseen[1] >= 0.9 * unseen[0]
+    assert unseen[1] > 0.8 * unseen[0]
 
 
 LEAST = {"facade": 0.95, "behind_truck": 0.95, "open_square": 0.85}
