@@ -177,7 +177,10 @@ def test_who_looks_around_gives_way_to_what_is_soon(away: float, speed: float) -
 def test_plans_that_lead_towards_others_cost_more(side: float) -> None:
     """Towards the side where somebody comes, not away from it."""
     planner = LookAhead(SCENARIO)
-    coming = planner.costs(observation(**other(4.0, side, np.pi)))[0] - planner.costs(observation())[0]
+    with_other, alone = (
+        planner.costs(seen, np.zeros(1, int), [])[0] for seen in (observation(**other(4.0, side, np.pi)), observation())
+    )
+    coming = with_other - alone
     turned = side * planner._first
     assert coming[(turned > 0.3) & (side * planner._second >= 0.0)].min() > 0.5
     np.testing.assert_allclose(coming[(turned < -0.3) & (side * planner._second <= 0.0)], 0.0, atol=1e-6)
@@ -369,5 +372,5 @@ def test_what_the_truck_hides_is_worth_nothing() -> None:
     rows = np.concatenate([observation(scenario, **fields, message_mask=[heard]) for heard in (0.0, 1.0)])
     straight, aside = load_agent("peek", scenario)(rows)[:, 1]
     assert abs(straight) < 0.3 and aside > 0.6  # to the left
-    free, hidden = LookAhead(scenario).costs(rows)[:, 0]  # of the plan straight on
+    free, hidden = LookAhead(scenario).costs(rows, np.zeros(2, int), [])[:, 0]  # of the plan straight on
     assert hidden > free + 1.0

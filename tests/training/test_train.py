@@ -272,7 +272,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
     ("arguments", "message"),
     [
         (["train", "overtaking"], "all motion here is prescribed, there is nothing to learn"),
-        (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "steps and minutes: give one of them"),
+        (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "--steps and --minutes: give one of them"),
         (
             ["train", "urban_crossing", "--agent", "route_follower"],
             "--agent route_follower: there is no train.toml beside it",
