@@ -126,6 +126,10 @@ class LookAhead(RouteFollower):
         """Return the vehicles whose losses count for the rows `due` of the observations; here none."""
         return []
 
+    def avoided(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
+        """Return those of the senders, (rows, M), that plans keep away from: all to which the vehicle gives way."""
+        return self.before(senders, vehicle)
+
     def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[_Follower]) -> np.ndarray:
         """Return the costs, (rows, plans) in s, for rows that are of these vehicles, (rows,)."""
         pieces, bends = self._route_pieces(observations)
@@ -142,7 +146,7 @@ class LookAhead(RouteFollower):
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
         theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
-        mask = self.before(mask, vehicle)
+        mask = self.avoided(mask, vehicle)
         cost, missing = np.zeros_like(now.x), zero
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -249,6 +253,10 @@ class TeamLookAhead(LookAhead):
         fleet, landmarks = range(len(scenario.vehicles)), len(scenario.landmarks)
         self._measures = np.array([[landmarks + vehicle in row for vehicle in fleet] for row in self._neighbours])
         self._radius = np.array([vehicle.goal_radius for vehicle in scenario.vehicles])
+
+    def avoided(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
+        """See `LookAhead.avoided`: here all, as others do not expect a vehicle to slow down or turn aside for them."""
+        return senders
 
     def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
         """See `LookAhead.followers`.
