@@ -5,6 +5,7 @@ Commands import what they need when they run, so that `--help` and completion ar
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ def list_command(
     from coopenv.bench.observers.faults import variant_rows
     from coopenv.runs import summary
 
-    with options.warned():
+    with warnings.catch_warnings(action="ignore"):  # those of one environment do not name it
         rows = summary.list_rows(kind) if kind is not Kind.variants else variant_rows()
     if as_json:
         options.print_json(rows)

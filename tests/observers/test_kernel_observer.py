@@ -281,6 +281,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     for known in ("_registered", "_places"):
         monkeypatch.setattr(registry, known, {})
+    register(COUNTER.name, embedded=COUNTER)
     return tmp_path
 
 
