@@ -65,8 +65,8 @@ def test_no_deadlock_where_all_receive_each_other(environment: str, agent: str) 
     assert scenario.v2x.links == "all"
     found = score(drive(Engine(scenario, 64), load_agent(agent, scenario), held_out_seeds(9, 64)))
     rates = {result.metric: result.mean for result in found}
-    least = 0.97 if agent == "peek" else 0.94  # planners swing out farther
-    assert rates["arrival_rate"] >= least and rates["collision_rate"] <= 0.99 - least, rates
+    least = 0.97 if agent == "peek" else 0.95  # planners swing out farther
+    assert rates["arrival_rate"] >= least and rates["collision_rate"] <= 0.02, rates
 
 
 HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3}
@@ -140,8 +140,7 @@ def test_errors_depend_on_what_is_sensed(environment: str) -> None:
     ideal, blind = (figures(environment, "route_follower", how, 1) for how in ("ideal", "blind"))
     assert ideal["e95_m"][2] < 0.5 * sensed["e95_m"][1]
     assert sensed["e50_m"][2] < blind["e50_m"][1]  # these intervals are apart, too
-    # With the right of way a vehicle may stop for another one, while others expect it to go on: a few collide.
-    assert ideal["arrival_rate"][0] > (0.9 if environment == "open_square" else 0.97)
+    assert ideal["arrival_rate"][0] > 0.97
 
 
 @pytest.mark.parametrize("environment", WORLDS)

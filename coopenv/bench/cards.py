@@ -29,6 +29,12 @@ BASELINE, IDEAL = "route_follower", "ideal_sensing"
 IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
 
 
+OF_MESSAGES: dict[str, dict[str, Any]] = {
+    "60 % of messages lost": {"v2x.loss": 0.6},
+    "vehicle_1 lies": {"vehicles.0.faults.lie": {"kind": "jump", "start": 2.0, "offset": 3.0}},
+}
+
+
 def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
     """Return overrides for worlds that are harder or easier to sense than a scenario's, by what is changed."""
     noise = scenario.noise
@@ -49,12 +55,6 @@ def stress(scenario: Scenario) -> dict[str, dict[str, Any]]:
         "initial error x 2": {"randomisation.initial_error": [2.0, 2.0]},
         **(OF_MESSAGES if len(scenario.vehicles) > 1 else {}),
     }
-
-
-OF_MESSAGES: dict[str, dict[str, Any]] = {
-    "60 % of messages lost": {"v2x.loss": 0.6},
-    "vehicle_1 lies": {"vehicles.0.faults.lie": {"kind": "jump", "start": 2.0, "offset": 3.0}},
-}
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,11 @@ def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
         "reference": evaluation.reference,
         "differences": evaluation.difference_rows(),
         "seen_share": {
-            name: {own: dict(zip(e.vehicles, row, strict=True)) for own, row in zip(e.vehicles, shares, strict=True)}
+            name: {
+                own: dict(zip(e.vehicles, row, strict=True))
+                for own, row in zip(e.vehicles, e.seen_share.tolist(), strict=True)
+            }
             for name, e in evaluation.episodes.items()
-            for shares in [e.seen_share.tolist()]
         },
     }
 

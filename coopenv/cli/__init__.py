@@ -189,7 +189,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     closed, and 143 after SIGTERM.
     """
     try:
-        status = app(args=arguments, standalone_mode=False)
+        with options.warned():
+            status = app(args=arguments, standalone_mode=False)
         if sys.stdout is not None:
             sys.stdout.flush()
     except BaseException as error:

@@ -143,11 +143,10 @@ def bench_observers(given: ObserverOptions) -> None:
     if given.width is not None and given.figures is None:
         raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
     printed, log = options.console(least=WIDE), options.console(stderr=True)
-    with options.warned():
-        plan = given.plan()
-        if given.basin:
-            check_source(plan.source)
-        plan.source.check()
+    plan = given.plan()
+    if given.basin:
+        check_source(plan.source)
+    plan.source.check()
     perform(
         plan,
         given.command_of(plan),
@@ -184,9 +183,8 @@ def bench_learning(
 
     whole, log = learning.read_study(study), options.console(stderr=True)
     chosen, folder = whole.only(options.words(only)), out or study.parent
-    with options.warned():
-        for plans in chosen.agents.values():
-            options.load(plans[0].environment, plans[0].settings.scenario)
+    for plans in chosen.agents.values():
+        options.load(plans[0].environment, plans[0].settings.scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
     printed = options.console(least=learning.WIDTH)
     printed.print(learning.results_table(chosen, folder))

@@ -243,17 +243,7 @@ def command(function: Callable[[Options], None]) -> Callable[..., None]:
     own_first = sorted(parameters, key=lambda p: next(depth for depth, names in enumerate(own) if p.name in names))
 
     def run(**given: Any) -> None:
-        with warnings.catch_warnings():
-            shown = warnings.showwarning
-
-            def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
-                if issubclass(category, AgentWarning):
-                    print(f"warning: {message}", file=sys.stderr)
-                else:
-                    shown(message, category, *where)
-
-            warnings.showwarning = show  # type: ignore[assignment]
-            function(record(**given))
+        function(record(**given))
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
     run.__signature__ = inspect.Signature([p.replace(annotation=kinds[p.name]) for p in own_first])  # type: ignore[attr-defined]
@@ -306,11 +296,10 @@ class SourceOptions:
         return parse_overrides(self.overrides)
 
     def open(self) -> Backend:
-        """Return where the ticks come from, warnings printed as one line each."""
+        """Return where the ticks come from."""
         from coopenv.backends.sources import open_backend
 
-        with warned():
-            return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
+        return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
 
 
 def console(stderr: bool = False, least: int = 0) -> Console:
@@ -367,24 +356,30 @@ def has_display() -> bool:
 
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:
-    """Return the scenario of a simulation, its warnings printed as one line each."""
+    """Return the scenario of a simulation."""
     from coopenv.backends.sources import open_simulation
 
-    with warned():
-        return open_simulation(environment, overrides)
+    return open_simulation(environment, overrides)
 
 
 @contextmanager
 def warned() -> Iterator[None]:
-    """Print the warnings of scenarios and data that are loaded meanwhile as one line each."""
-    ours = (ScenarioWarning, DataWarning)
-    with warnings.catch_warnings(record=True) as caught:
+    """Print each warning about scenarios, data and agents meanwhile once, as one line."""
+    ours = (ScenarioWarning, DataWarning, AgentWarning)
+    printed: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if not issubclass(category, ours):
+            others(message, category, *where)
+        elif (text := f"warning: {message}") not in printed:
+            printed.add(text)
+            print(text, file=sys.stderr)
+
+    with warnings.catch_warnings():
+        others, warnings.showwarning = warnings.showwarning, show  # type: ignore[assignment]
         for category in ours:
             warnings.simplefilter("always", category)
         yield
-    for warning in caught:
-        if issubclass(warning.category, ours):
-            print(f"warning: {warning.message}", file=sys.stderr)
 
 
 def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:

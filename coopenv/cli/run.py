@@ -143,8 +143,7 @@ def record(given: RecordOptions) -> None:
     if replayed:
         if given.changes:
             raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
-        with options.warned():
-            recording = open_recording(environment, given.data, given.variant)
+        recording = open_recording(environment, given.data, given.variant)
     else:
         for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
             if value is not None:
@@ -202,7 +201,7 @@ def figures(
     from coopenv.runs.console import Progress
 
     results, folder = Results.read(run), out or run / "figures"
-    with options.warned(), Progress(options.console(stderr=True), "drawing figures"):
+    with Progress(options.console(stderr=True), "drawing figures"):
         paths = results.save_figures(folder, file_format.value, width and width.value, results.scenario())
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
@@ -282,8 +281,7 @@ def import_(
     if out is not None:
         check_log(out, observer, scene)
         check_new(out, force)
-    with options.warned():
-        bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    bag = open_bags(bags, topics, options.parse_overrides(overrides))
     _print(bag.log.rows, as_json)
     ticks = bag.capabilities.ticks or 0
     seconds = (ticks - 1) / bag.scenario.rates.camera

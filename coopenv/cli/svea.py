@@ -61,9 +61,8 @@ def demo(
     name = environment if fleet is None else fleet.stem
     folder = out or Path("out") / name
     chosen = Demo(name, folder, policy, seed, options.parse_overrides(overrides), seconds, beside, fleet)
-    with options.warned():
-        if not chosen.run(port, options.console(stderr=True), options.console()):
-            raise typer.Exit(STOPPED)
+    if not chosen.run(port, options.console(stderr=True), options.console()):
+        raise typer.Exit(STOPPED)
 
 
 @svea.command()
@@ -299,8 +298,7 @@ def run(given: SveaRunOptions) -> None:
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(given.overrides), options.console(stderr=True)
-    with options.warned():
-        backend = open_svea(given.config, None, changes, given.car, given.record, connect=given.connect)
+    backend = open_svea(given.config, None, changes, given.car, given.record, connect=given.connect)
     if given.arm and backend.deployment.security.keys is None and not backend.deployment.fakes:
         print("warning: without security.keys any station on the network can drive these cars", file=sys.stderr)
     also_kept(partial(kept_drive, given.record, backend))

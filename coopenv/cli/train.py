@@ -48,12 +48,19 @@ class TrainOptions:
         Raises:
             CoopenvError: a setting is not valid, or an option stands beside --resume that the folder decides.
         """
+        from coopenv.scenario.files import OVERRIDES
         from coopenv.training.command import resumed_plan
         from coopenv.training.settings import TrainingPlan
 
         if not self.resume:
             changes = options.parse_overrides(self.overrides)
-            return TrainingPlan(self.environment, self._settings(changes), self.seed or 0, self.arm, changes)
+            options.load(self.environment, changes)
+            plan = TrainingPlan(self.environment, self._settings(changes), self.seed or 0, self.arm, changes)
+            try:
+                plan.scenarios()
+            except CoopenvError as error:  # of the settings, because the options alone are possible
+                raise CoopenvError(str(error).replace(OVERRIDES, str(self.settings or "settings"), 1)) from None
+            return plan
         decided = {"--set": self.overrides}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
@@ -100,8 +107,6 @@ def train(given: TrainOptions) -> None:
         from coopenv.training.command import train as perform
     folder = given.out or Path("out", "train", Path(given.environment).stem)
     plan, log = given.plan(folder), options.console(stderr=True)
-    with options.warned():
-        options.load(given.environment, plan.all_overrides)
 
     def judged(at: int, results: list[Any]) -> None:
         log.print(f"{at:>10,} steps, held-out maps: {_figures(results)}", soft_wrap=True)
@@ -196,11 +201,8 @@ def evaluate(given: EvaluateOptions) -> None:
     names = options.words(agents)
     if agents is not None and not names:
         raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
-    with options.warned():
-        changes = options.parse_overrides(given.overrides)
-        contest = cards.Contest.of(
-            environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress
-        )
+    changes = options.parse_overrides(given.overrides)
+    contest = cards.Contest.of(environment, changes, names, given.worlds, given.seed_block, given.ideal, given.stress)
     carded = cards.carded(contest) if given.write_card else []
     command = options.command_text("evaluate", given, OF_THE_OUTPUT)
     drawn = {

@@ -116,8 +116,7 @@ def film(given: FilmOptions) -> None:
     check_file(out)
     record = given.saved()
     if record is None:
-        with options.warned():
-            backend = given.open()
+        backend = given.open()
         policy, driver = (None, "") if backend.capabilities.recorded else given.driver(backend.scenario)
         record = played_scene(backend, title_of(given.environment), log, given.seed, policy, driver)
     with Progress(log, f"filming {out.name}", 1.0) as progress:
@@ -203,7 +202,7 @@ def view(given: ViewOptions) -> None:
 
     viser_module()
     log = options.console(stderr=True)
-    with options.warned(), compile_notice(log):
+    with compile_notice(log):
         reel = given.reel()
     try:
         picked = None if given.vehicle is None else vehicle_index(reel.scenario, given.vehicle)

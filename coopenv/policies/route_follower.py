@@ -199,10 +199,10 @@ class RouteFollower(Driver):
         keep, times = self.distance_to_keep(observations), distance / self.cruise
         near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
         clear = nearest(points, times, place, 0.0 * forward, mask, SOON) >= np.minimum(self.blocking, near)
-        everyone, vehicles = mask, len(self.goes_first)
+        clear |= not self.goes_first.any()  # those who never have the right of way keep the larger distance below
+        vehicles = len(self.goes_first)
         if len(mask) % vehicles == 0:  # else the rows are of unknown vehicles, which give way to all
             mask = self.before(mask, np.arange(len(mask)) % vehicles)
-        clear |= (mask == everyone).all(axis=1)
 
         def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
             found = [nearest(path, times, place, velocity, mask, self.foresight) for velocity in velocities]

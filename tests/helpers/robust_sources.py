@@ -16,7 +16,7 @@ from coopenv.observers import Message, Recording, Run, Tick, run
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Tamper
 from coopenv.observers.robust.messages import from_six
-from coopenv.observers.robust.sources import NO_TARGET, ODOMETRY
+from coopenv.observers.robust.sources import NO_TARGET, VELOCITY
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.robust_ticks import OpenRobust, Pose
@@ -140,7 +140,7 @@ class Watched:
     def of(self, name: str, vehicle: int, target: int) -> np.ndarray:
         """Return (K, ...) a field of the monitor of a target, or its sensitivity; NaN without a slot."""
         held = self.source["target"][:, vehicle] == target
-        held[:, ODOMETRY] = target == NO_TARGET
+        held[:, VELOCITY] = target == NO_TARGET
         values = self.sensitivity if name == "sensitivity" else self.source[name].astype(float)
         found = values[:, vehicle][np.arange(len(held)), np.argmax(held, axis=1)]
         found[~held.any(axis=1)] = np.nan

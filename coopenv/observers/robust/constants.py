@@ -53,7 +53,7 @@ FAULT_GATE, FAULT_RISK = 35.0, 1e-2
 is excluded is right. Tuned: in honest worlds the largest of all ratios was 34, with 30 % of the messages lost 48."""
 ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
-ODOMETRY_FAULT = 0.1  # standard deviation of a fault of the own velocity, as a share of it, and of the gyro, rad/s
+ODOMETRY_FAULT = 0.1  # deviation of a fault of the own velocity, as a share of it, and of the gyro, rad/s. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
 """Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
 and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""

@@ -19,7 +19,7 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import Pose, PoseEstimate, mat33d, mat66d, vec6d
+from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
 from coopenv.observers.robust.reports import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.source_monitor import add_to_drift
@@ -115,15 +115,10 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
 
 
 @device_function
-def monitor_increment(
-    memory: Any, world: int, i: int, n: int, d: Any, before: Any, after: Any, more: Any, unknown: Any
-):
-    """Add an increment d of member n's report to the monitor of its drift; the sender's noise is `unknown` more."""
+def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, known: Any, unknown: Any):
+    """Add an increment d of member n's report to the monitor of its drift; covariances (3, 3) of the position."""
     R = memory.member[world, i, n].pose.R
-    N = block3(before - after + more, 3, 3)
-    if wp.trace(N) < wp.float64(0.0):
-        N = mat33d()
-    N = N + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3) + unknown
+    N = wp.where(wp.trace(known) < wp.float64(0.0), unknown, known + unknown)
     add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
@@ -147,8 +142,10 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
         memory.scratch[world, k].column = memory.P[world, i, n, k] - memory.scratch[world, k].row
     memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
-    N = before - after + more + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
-    monitor_increment(memory, world, i, n, d, before, after, more, unknown)
+    N = before - after + more
+    unknown = unknown + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
+    monitor_increment(memory, world, i, n, d, block3(N, 3, 3), unknown)
+    N = N + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
     variance = algebra.position_variance(before)
     reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):

@@ -29,7 +29,7 @@ from coopenv.observers.robust.reports import includes
 from coopenv.observers.robust.source_monitor import end_block, restart_gyro
 from coopenv.observers.robust.sources import (
     GYRO,
-    ODOMETRY,
+    VELOCITY,
     clear_drift,
     clear_source,
     is_active,
@@ -98,7 +98,7 @@ def exclude(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].exclusions += 1
     if is_own(q):
         inflate_by_fault(memory, world, i, q)
-        if q == ODOMETRY:
+        if q == VELOCITY:
             correct_scale(memory, world, i)
         else:
             correct_bias(memory, world, i)
@@ -206,8 +206,8 @@ def weight_of(ratio: Any, most: Any):
 @device_function
 def correct_scale(memory: Any, world: int, i: int):
     """Correct the odometry's scale by the estimated fault of its velocity, and add the uncertainty to its variance."""
-    f = memory.source[world, i, ODOMETRY].offset
-    covariance = memory.source[world, i, ODOMETRY].covariance
+    f = memory.source[world, i, VELOCITY].offset
+    covariance = memory.source[world, i, VELOCITY].covariance
     v = memory.belief[world, i].mean_v
     square = wp.dot(v, v)
     if square > wp.float64(constants.MIN_VELOCITY_STD * constants.MIN_VELOCITY_STD):

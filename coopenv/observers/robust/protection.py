@@ -74,8 +74,9 @@ def protection_level(memory: Any, world: int, i: int):
         if is_active(memory, world, i, q):
             Phi = memory.sensitivity[world, i, q, 0]
             information = wp.trace(memory.source[world, i, q].information)
+            # Before its first block, or since an exclusion; a gyro's fault has the covariance of its prior then.
             if q != GYRO and information == wp.float64(0.0) and wp.ddot(Phi, Phi) > wp.float64(0.0):
-                return vec2d(wp.float64(wp.inf))  # before its first block, or since an exclusion
+                return vec2d(wp.float64(wp.inf))
             variances = own + fault_variances(up, Phi, memory.source[world, i, q].covariance)
             if not (
                 variances[0] < wp.float64(KNOWN_POSITION_VARIANCE) and variances[1] < wp.float64(KNOWN_ANGLE_VARIANCE)

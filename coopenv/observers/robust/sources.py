@@ -21,7 +21,7 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.world.warp_internals import device_function
 
-ODOMETRY, GYRO = 0, SOURCES - 1
+VELOCITY, GYRO = 0, SOURCES - 1
 """The slots of the own velocity and angular velocity; between them are those of senders, then those of landmarks."""
 NO_TARGET = -1
 
@@ -35,7 +35,7 @@ def is_sender(q: int) -> bool:
 @wp.func
 def is_own(q: int) -> bool:
     """Return whether a slot is one of the own odometry."""
-    return q <= ODOMETRY or q >= GYRO
+    return q <= VELOCITY or q >= GYRO
 
 
 @device_function
@@ -173,7 +173,7 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             Phi = forward(step, memory.sensitivity[world, i, q, 0]) + G * memory.sensitivity[world, i, q, ERRORS]
-            if q == ODOMETRY:
+            if q == VELOCITY:
                 E = dt * wp.transpose(step.R)
                 for k in range(3):
                     Phi[k + 3] = Phi[k + 3] + E[k]
