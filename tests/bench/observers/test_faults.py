@@ -324,7 +324,7 @@ def test_faults_of_a_recording_are_those_of_a_scenario(text: str, faults: dict[s
     assert differing(plain, after) == ({"inbox_tick"} if name == "jammer" else set())
     for field in fields(Interference) if name != "jammer" else ():
         found, wanted = (getattr(r.interference, field.name) for r in (after, expected))
-        assert_allclose(found, wanted, atol=1e-6, err_msg=field.name)
+        assert_allclose(found, wanted, atol=1e-12 if name == "map_error" else 1e-6, err_msg=field.name)
     if name == "map_error":
         assert after.interference is not None
         assert_allclose(after.interference.map_error_of(2, 20), [[0, 0, 0], [0, 0.3, 0], [0, 0, 0]], atol=1e-12)
