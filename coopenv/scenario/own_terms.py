@@ -136,23 +136,23 @@ def record_count(where: str, function: Any, allowed: tuple[int, ...]) -> int:
     return taken
 
 
-def located(raw: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a scenario whose own terms name absolute files; relative ones are looked for in `folder`."""
+def located(
+    raw: Mapping[str, Any], folder: Path, place: Callable[[str, Path], str] = installation.absolute_reference
+) -> dict[str, Any]:
+    """Return a scenario with the references of its own terms, relative to `folder`, replaced (default: by absolute)."""
     result = dict(raw)
     for section in SECTIONS:
         part = result.get(section)
         if isinstance(part, dict) and isinstance(part.get("custom"), dict):
-            rows = {name: _located(row, folder) for name, row in part["custom"].items()}
+            rows = {name: _located(row, folder, place) for name, row in part["custom"].items()}
             result[section] = {**part, "custom": rows}
     return result
 
 
-def _located(row: Any, folder: Path) -> Any:
+def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
     if isinstance(row, dict) and "function" in row:
-        return {**row, "function": _located(row["function"], folder)}
-    if isinstance(row, str) and installation.is_reference(row):
-        return installation.absolute_reference(row, folder)
-    return row
+        return {**row, "function": _located(row["function"], folder, place)}
+    return place(row, folder) if isinstance(row, str) and installation.is_reference(row) else row
 
 
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:

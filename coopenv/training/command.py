@@ -121,7 +121,7 @@ def train(
             or something cannot be written; the last checkpoint stays.
     """
     report, path = reports or Reports(), out / CHECKPOINT_FILE
-    scenario, environment = possible(plan), environment_file(plan.environment)
+    scenario, environment = possible(plan), environment_file(plan.environment, plan.all_overrides)
     kept = read(path) if resume else None
     if kept is not None:
         onnx, logs = onnx or kept.onnx, logs or kept.logs
@@ -150,7 +150,7 @@ def train(
                 raise
             left = f"{path} is kept as it was after {read(path).progress['steps']} steps"
             raise DivergedError(f"{error}; {left}, remove it to begin anew with other settings") from None
-        with replacing_folder(out, (*NAMES, environment.name)) as folder:
+        with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
             export(folder, out, trainer, environment, results, curve, onnx)
     return results
 

@@ -59,6 +59,8 @@ def export(
         (folder / WEIGHTS_FILE).write_bytes(weights)
         if environment.text is not None:
             (folder / environment.name).write_text(environment.text, encoding="utf-8")
+        for name, path in environment.code.items():
+            (folder / name).write_bytes(path.read_bytes())
         card = _card(trainer, environment, results, sha256(weights).hexdigest())
         (folder / AGENT_FILE).write_text(card, encoding="utf-8")
         if curve:

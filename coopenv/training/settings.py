@@ -1,5 +1,6 @@
 """The settings of a training, read from a TOML file, what exactly is to be trained, and these files beside an agent."""
 
+import ast
 import json
 import re
 import shutil
@@ -7,6 +8,7 @@ import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -17,7 +19,15 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError, OutputError, check_one_of
 from coopenv.base.files import writing
-from coopenv.base.installation import data_directory, is_scene, list_agents, list_envs, scenario_path
+from coopenv.base.installation import (
+    absolute_reference,
+    data_directory,
+    is_reference,
+    is_scene,
+    list_agents,
+    list_envs,
+    scenario_path,
+)
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
@@ -272,26 +282,62 @@ class EnvironmentFile(NamedTuple):
     """By which `agent.toml` names it: one of coopenv's, or a file beside `agent.toml`."""
     text: str | None = None
     """Contents of that file."""
+    code: Mapping[str, Path] = {}
+    """Files of own terms, by the names of their copies beside it."""
 
 
-def environment_file(environment: str) -> EnvironmentFile:
-    """Return an environment, by its name or TOML file, as it goes with an agent. Raises CoopenvError: there is none."""
+def environment_file(environment: str, overrides: Mapping[str, Any] | None = None) -> EnvironmentFile:
+    """Return an environment, by its name or TOML file, as it goes with an agent that learnt with these overrides.
+
+    Raises:
+        CoopenvError: there is none, or two different files of own terms have one name.
+    """
+    code: dict[str, Path] = {}
+    _with_code_beside(overrides or {}, code)
     if environment in list_envs():
-        return EnvironmentFile(environment, environment)
+        return EnvironmentFile(environment, environment, None, code)
     if is_scene(environment):
         name = re.sub(r"[^A-Za-z0-9]+", "_", environment)
-        return EnvironmentFile(environment, f"{name}.toml", scene_text(environment))
+        return EnvironmentFile(environment, f"{name}.toml", scene_text(environment), code)
     path = scenario_path(environment)
     name = f"{path.stem}.toml"
     if name in (AGENT_FILE, SETTINGS_FILE):  # which stand there
         name = "environment.toml"
-    return EnvironmentFile(path.stem, name, _movable(path.read_text(encoding="utf-8-sig"), path.parent))
+    return EnvironmentFile(path.stem, name, _movable(path.read_text(encoding="utf-8-sig"), path.parent, code), code)
 
 
-def _movable(text: str, folder: Path) -> str:
-    """Return a scenario of some folder as it means the same in every other: with absolute places of its own terms."""
+def _beside(reference: str, folder: Path, code: dict[str, Path]) -> str:
+    """Return a reference of some folder as one to a copy beside; note the file, and those it imports, in `code`."""
+    place, _, name = absolute_reference(reference, folder).rpartition(":")
+    if not place.endswith(".py"):
+        return reference
+    _add_code(Path(place), code)
+    return f"{Path(place).name}:{name}"
+
+
+def _add_code(path: Path, code: dict[str, Path]) -> None:
+    if path.name in code:
+        if code[path.name] != path:
+            raise CoopenvError(f"{path} and {code[path.name]}: one folder must hold both; give one another name")
+        return
+    code[path.name] = path
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in [node.module or ""] if isinstance(node, ast.ImportFrom) else names:
+            if (imported := path.with_name(f"{name}.py")).is_file():
+                _add_code(imported, code)
+
+
+def _with_code_beside(overrides: Mapping[str, Any], code: dict[str, Path]) -> dict[str, Any]:
+    """Return overrides, in which own terms name copies of their files, which are noted in `code`."""
+    own = {key: value for key, value in overrides.items() if ".custom." in key and isinstance(value, str)}
+    return {**overrides, **{key: _beside(value, Path.cwd(), code) for key, value in own.items() if is_reference(value)}}
+
+
+def _movable(text: str, folder: Path, code: dict[str, Path]) -> str:
+    """Return a scenario of some folder as it means the same with copies of its own terms beside it, see `_beside`."""
     raw = tomllib.loads(text)
-    changed = located(raw, folder)
+    changed = located(raw, folder, partial(_beside, code=code))
     if changed == raw:
         return text
     import tomlkit  # of the extra `train`
@@ -309,7 +355,7 @@ def settings_text(plan: TrainingPlan) -> str:
     import tomlkit  # of the extra `train`
 
     values = plan.settings.model_dump(mode="json", exclude_none=True)
-    return tomlkit.dumps({**values, "scenario": plan.all_overrides})
+    return tomlkit.dumps({**values, "scenario": _with_code_beside(plan.all_overrides, {})})
 
 
 def settings_digest(plan: TrainingPlan) -> str:
@@ -357,7 +403,7 @@ def _says(path: Path, plan: TrainingPlan, environment: EnvironmentFile) -> bool:
         settings = read_settings(path, None, Path(environment.name).stem)
     except CoopenvError:
         return False
-    return settings == plan.settings.model_copy(update={"scenario": plan.all_overrides})
+    return settings == plan.settings.model_copy(update={"scenario": _with_code_beside(plan.all_overrides, {})})
 
 
 def _is_the_agents(path: Path) -> bool:

@@ -263,7 +263,7 @@ SQUARE = data_directory("envs") / "open_square.toml"
 
 
 def test_a_shipped_environment_goes_by_its_name() -> None:
-    assert environment_file("open_square") == ("open_square", "open_square", None)
+    assert environment_file("open_square") == ("open_square", "open_square", None, {})
 
 
 @pytest.mark.parametrize(
@@ -272,22 +272,28 @@ def test_a_shipped_environment_goes_by_its_name() -> None:
 )
 def test_a_file_goes_as_it_is_and_hides_no_other_of_the_agent(given: str, name: str, tmp_path: Path) -> None:
     (tmp_path / given).write_text(SQUARE.read_text())
-    assert environment_file(str(tmp_path / given)) == (Path(given).stem, name, SQUARE.read_text())
+    assert environment_file(str(tmp_path / given)) == (Path(given).stem, name, SQUARE.read_text(), {})
 
 
-def test_code_that_it_names_is_found_from_the_copy_too(tmp_path: Path) -> None:
+def test_code_that_it_names_goes_with_the_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("tomlkit", reason="needs the extra 'train'")
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "terms.py").write_text("def calm(q):\n    return 0.0 * q.speed\n")
+    (tmp_path / "mine" / "factors.py").write_text("FACTOR = 0.0\n")
+    (tmp_path / "mine" / "terms.py").write_text(
+        "from factors import FACTOR\n\ndef calm(q):\n    return FACTOR * q.speed\n"
+    )
     text = SQUARE.read_text()
     assert "[reward]\n" in text
-    text = text.replace("[reward]\n", '[reward]\ncustom.calm = "terms.py:calm"\nweights.calm = 1.0\n')
+    text = text.replace("[reward]\n", '[reward]\ncustom.calm = "../mine/terms.py:calm"\nweights.calm = 1.0\n')
     (tmp_path / "mine" / "square.toml").write_text(text)
-    kept = environment_file(str(tmp_path / "mine" / "square.toml")).text
-    assert kept is not None
-    (tmp_path / "copy.toml").write_text(kept)
-    original, copied = (coopenv.load_scenario(tmp_path / name) for name in ("mine/square.toml", "copy.toml"))
-    assert copied == original
+    kept = environment_file(str(tmp_path / "mine" / "square.toml"))
+    assert kept.text == text.replace("../mine/", "") and {*kept.code} == {"terms.py", "factors.py"}
+    monkeypatch.chdir(tmp_path / "mine")
+    overrides = {"reward.custom.calm": "terms.py:calm", "reward.weights.calm": 1.0}
+    assert environment_file("facade", overrides).code == kept.code
+    (tmp_path / "terms.py").write_text("")
+    with pytest.raises(CoopenvError, match="one folder must hold both"):
+        environment_file("square.toml", {"reward.custom.calm": "../terms.py:calm"})
 
 
 def test_an_agent_names_files_of_its_folder(tmp_path: Path) -> None:
