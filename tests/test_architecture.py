@@ -98,7 +98,7 @@ LINES_AND_FILES = {
     "policies": (1545, 8),
     "runs": (3060, 13),
     "scenario": (3095, 12),
-    "training": (1310, 5),
+    "training": (1360, 5),
     "viz": (4450, 17),
     "world": (4312, 17),
 }
