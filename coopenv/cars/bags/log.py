@@ -85,21 +85,17 @@ ReadValue = Callable[[Chosen, Any], Value]
 """Returns the value of a message of a topic. Raises CoopenvError: it is malformed."""
 
 
-def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], files: Sequence[BagFile]) -> ReadValue:
-    """Return what reads messages by the map; calibrations that cars publish count before the environment's.
+def value_reader(
+    given: TopicMap, binding: Binding, chosen: Collection[Chosen], calibrations: Mapping[str, Calibration]
+) -> ReadValue:
+    """Return what reads messages by the map.
 
     Args:
         given: the map.
-        binding: the cars and their vehicles, whose cameras are those of the environment.
+        binding: the cars and their vehicles.
         chosen: the topics that are read.
-        files: the bags.
-
-    Raises:
-        DataError: a calibration makes no sense.
+        calibrations: of the cars' cameras.
     """
-    cameras = binding.scenario.cameras
-    calibrations = {name: Calibration.of(cameras[vehicle]) for name, vehicle in binding.cars.items()}
-    calibrations |= _published(files, chosen)
     known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
     frames = {Role.TRUTH: given.frames.truth or given.frames.map}
 
@@ -263,6 +259,7 @@ class BagLog:
     samples: tuple[Sample, ...]  # in the order of their stamps, which all are on one clock
     rows: tuple[TopicRow, ...]  # what there is, by topic
     notes: tuple[str, ...]  # what a user should know
+    lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -281,7 +278,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         files = [stack.enter_context(BagFile(path)) for path in paths]
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = select(given, topics, where)
-        value, stamped = value_reader(given, binding, chosen, files), given.clocks.mode != "received"
+        lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
+        lenses |= _published(files, chosen)  # a calibration that a car publishes replaces the environment's
+        value, stamped = value_reader(given, binding, chosen, lenses), given.clocks.mode != "received"
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
@@ -289,7 +288,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
     clocks = reconcile(delays_of(tracks, len(files)), tolerance, stated)
     samples = _samples(tracks, clocks)
-    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)))
+    rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
+    pixels = {name: lens for name, lens in lenses.items() if name not in rays}
+    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)), pixels)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

@@ -1,0 +1,439 @@
+"""One batch least squares over the poses of all cars and the constants of their sensors.
+
+States are planar poses at keyframes, ten per second. Odometry carries them to the times of sightings and of motion
+capture, so that wheel scale, gyro bias and time offsets act within a keyframe too. All derivatives are differences:
+a residual depends on the pose of one keyframe, or of two neighbours, so that six evaluations give the derivatives by all
+poses. The poses are eliminated by a banded factor (Schur complement). Sightings and motion capture have the loss of
+Cauchy, whose scale follows from the residuals; odometry has the density of its own noise.
+
+Standard errors are the larger of those by the information and of those by the spread of the scores of stretches of a
+second ("sandwich"): whole pixels give residuals that are correlated in time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from coopenv.base.errors import DataError
+from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.estimation.lens import distort, largest_radius
+from coopenv.estimation.poses import Array, Mask, skew
+
+KEYFRAME = 0.1  # s
+GRID = 0.005  # s, of dead reckoning
+LOSS = 3.0  # standard deviations where the loss of Cauchy bends
+STRETCH = 1.0  # s, over which scores are summed
+LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
+"""Least standard deviations of a sighting (pixels; rad without pixels) and of motion capture (m, rad)."""
+LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of odometry noise
+WINDOW = 6.0  # s of sightings from which a first pose is found
+HEADINGS = 72  # that are tried for it
+
+Kind = NamedTuple("Kind", [("name", str), ("unit", str), ("prior", float), ("step", float)])
+PER_CAR = (
+    *(Kind(f"camera.{name}", "deg", 0.2, 1e-6) for name in ("roll", "pitch", "yaw")),
+    *(Kind(f"camera.{name}", "m", 0.3, 1e-6) for name in "xyz"),
+    *(Kind(f"camera.{name}", "px", 40.0, 1e-4) for name in ("fx", "fy", "cx", "cy")),
+    *(Kind(f"camera.{name}", "", 0.5, 1e-7) for name in ("k1", "k2")),
+    *(Kind(f"camera.{name}", "", 0.02, 1e-7) for name in ("p1", "p2")),
+    Kind("camera.k3", "", 0.2, 1e-7),
+    Kind("wheel.scale", "", 0.15, 1e-7),
+    Kind("gyro.bias", "rad/s", 0.1, 1e-7),
+    Kind("camera.offset", "s", 0.5, 1e-5),
+    Kind("wheel.offset", "s", 0.05, 1e-5),
+    Kind("truth.offset", "s", 0.5, 1e-5),
+    Kind("truth.body_yaw", "deg", 0.2, 1e-6),
+    *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6) for axis in "xy"),
+)
+"""Constants of a car, deviations from the given values: prior standard deviation (rad for deg) and step."""
+MARKER_KNOWN, MARKER_FREE = 0.01, 0.3  # m, prior of a marker's coordinate without and with motion capture
+FRAME = (Kind("truth.frame_yaw", "deg", 0.2, 1e-6), *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6) for axis in "xy"))
+ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 15), 15, 16
+CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 17, 18, 19, slice(20, 23)
+NUISANCE = (SCALE, BIAS)
+"""Constants that every drive has anew."""
+
+
+class Path(NamedTuple):
+    """Dead reckoning."""
+
+    time: Array
+    yaw: Array
+    place: NDArray[np.complex128]
+
+    def step(self, begin: Array, end: Array) -> tuple[NDArray[np.complex128], Array]:
+        """Return the motion from times to others, in the body at the first: m, rad."""
+        yaw = np.interp(begin, self.time, self.yaw)
+        moved = np.interp(end, self.time, self.place) - np.interp(begin, self.time, self.place)
+        return np.exp(-1j * yaw) * moved, np.interp(end, self.time, self.yaw) - yaw
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit."""
+
+    x: Array  # (G,) deviations of all constants
+    poses: tuple[Array, ...]  # per car (M, 3): x, y, yaw at keyframes
+    sigma: Array  # (C, 3) sightings, places and yaws of motion capture
+    free: Mask  # (G,)
+    cost: float = np.inf
+
+
+class Batch:
+    """The least squares of a drive."""
+
+    def __init__(self, drive: Drive, truth: bool) -> None:
+        """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
+        self.drive, self.cars, self.places = drive, drive.cars, drive.places
+        self.truth = [truth and len(car.truth_time) > 1 for car in self.cars]
+        marker = Kind("", "m", MARKER_FREE if any(self.truth) else MARKER_KNOWN, 1e-6)
+        self.kinds = [kind._replace(name=f"{car.name}.{kind.name}") for car in self.cars for kind in PER_CAR]
+        self.kinds += [marker._replace(name=f"marker.{name}.{axis}") for name in drive.landmarks for axis in "xyz"]
+        self.kinds += FRAME
+        self.markers = len(PER_CAR) * len(self.cars)
+        self.frame = len(self.kinds) - len(FRAME)
+        self.prior = np.array([kind.prior for kind in self.kinds])
+        self.steps = np.array([kind.step for kind in self.kinds])
+        self.known = np.ones(len(self.kinds), dtype=bool)
+        for c, car in enumerate(self.cars):
+            mine = self.known[self.own(c)]
+            mine[LENS] = car.lens is not None
+            mine[WHEEL_TIME] = len(car.wheel_time) != len(car.gyro_time) or bool((car.wheel_time != car.gyro_time).any())
+            mine[TRUTH_TIME] = self.truth[c]
+            mine[BODY] = self.truth[c]
+        self.known[self.frame :] = any(self.truth)
+        seen = {int(t) for car in self.cars for t in np.unique(car.target)}
+        for i in range(len(self.places)):
+            self.known[self.marker(i)] = i in seen
+        self.keys = [np.arange(car.time.min() - KEYFRAME, car.time.max() + 2 * KEYFRAME, KEYFRAME) for car in self.cars]
+        self.density = []  # of the odometry noise of each car, x, y and yaw
+        for car in self.cars:
+            stated, rate = drive.scenario.noises[car.vehicle], drive.scenario.rates.odometry
+            speed = max(density(car.wheel_time, car.wheel.real), stated.velocity**2 / rate, LEAST_SPEED)
+            turn = max(density(car.gyro_time, car.gyro), stated.angular_velocity**2 / rate, LEAST_TURN)
+            self.density.append(np.array([speed, speed, turn]))
+        self.start = np.zeros((len(self.cars), 2))  # offsets by which keyframes were assigned
+
+    def own(self, c: int) -> slice:
+        """Return where the constants of a car are."""
+        return slice(c * len(PER_CAR), (c + 1) * len(PER_CAR))
+
+    def marker(self, i: int) -> slice:
+        """Return where the coordinates of a marker are."""
+        return slice(self.markers + 3 * i, self.markers + 3 * i + 3)
+
+    def path(self, c: int, x: Array) -> Path:
+        """Return the dead reckoning of a car."""
+        car, own = self.cars[c], x[self.own(c)]
+        time = np.arange(self.keys[c][0] - 1.0, self.keys[c][-1] + 1.0, GRID)
+        rate = np.interp(time, car.gyro_time, car.gyro) - own[BIAS]
+        speed = np.interp(time, car.wheel_time + own[WHEEL_TIME], car.wheel) / (1.0 + own[SCALE])
+        yaw = np.concatenate([[0.0], np.cumsum(0.5 * GRID * (rate[1:] + rate[:-1]))])
+        going = speed * np.exp(1j * yaw)
+        return Path(time, yaw, np.concatenate([[0.0], np.cumsum(0.5 * GRID * (going[1:] + going[:-1]))]))
+
+    def residuals(self, c: int, x: Array, pose: Array) -> tuple[Array, Array, Array]:
+        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3) of a car, px or rad, m, rad."""
+        car, own, keys = self.cars[c], x[self.own(c)], self.keys[c]
+        path = self.path(c, x)
+        place, yaw = pose[:, 0] + 1j * pose[:, 1], pose[:, 2]
+        when = car.time + own[CAMERA_TIME]
+        k = self.nearest(c, car.time + self.start[c, 0])
+        moved, turned = path.step(keys[k], when)
+        at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
+        points = self.places + x[self.markers : self.frame].reshape(-1, 3)
+        point = points[car.target]
+        flat = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1] - at)
+        body = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever - own[LEVER]
+        ray = body @ (Rotation.from_rotvec(own[ROT]).as_matrix() @ car.mounting)
+        seen = self._off(car, own, ray)
+        step, bend = path.step(keys[:-1], keys[1:])
+        gap = np.exp(-1j * yaw[:-1]) * np.diff(place) - step
+        odometry = np.stack([gap.real, gap.imag, np.diff(yaw) - bend], axis=-1)
+        if not self.truth[c]:
+            return seen, odometry, np.zeros((0, 3))
+        k = self.nearest(c, car.truth_time + self.start[c, 1])
+        moved, turned = path.step(keys[k], car.truth_time + own[TRUTH_TIME])
+        at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
+        offset, frame = own[BODY], x[self.frame :]
+        at = at + np.exp(1j * heading) * (offset[1] + 1j * offset[2])
+        at = np.exp(1j * frame[0]) * at + frame[1] + 1j * frame[2]
+        gap, angle = car.truth - at, car.truth_yaw - heading - offset[0] - frame[0]
+        return seen, odometry, np.stack([gap.real, gap.imag, (angle + np.pi) % (2 * np.pi) - np.pi], axis=-1)
+
+    def nearest(self, c: int, time: Array) -> NDArray[np.int64]:
+        """Return the keyframes that are nearest to times."""
+        k = np.rint((time - self.keys[c][0]) / KEYFRAME).astype(np.int64)
+        return np.asarray(k.clip(0, len(self.keys[c]) - 1))
+
+    def _off(self, car: CarDrive, own: Array, ray: Array) -> Array:
+        if car.lens is None:
+            across = np.cross(car.ray, np.array([0.0, 1.0, 0.0]))
+            across /= np.linalg.norm(across, axis=-1, keepdims=True)
+            unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+            off = [(unit * axis).sum(axis=-1) for axis in (across, np.cross(car.ray, across))]
+            far = np.where((unit * car.ray).sum(axis=-1) < 0.0, 1.0, 0.0)
+            return np.stack([off[0] + far, off[1] + far], axis=-1)
+        lens, change = car.lens, own[LENS]
+        flat = ray[:, :2] / np.maximum(ray[:, 2:], 0.05)
+        bent = tuple((np.array(lens.distortion) + change[4:]).tolist())
+        radius = np.linalg.norm(flat, axis=-1, keepdims=True)
+        flat = flat * np.minimum(1.0, min(largest_radius(bent), 2.0) / np.maximum(radius, 1e-9))
+        return np.asarray(
+            car.pixel
+            - distort(flat, bent) * (np.array(lens.focal_length) + change[:2])
+            - (np.array(lens.principal_point) + change[2:4])
+        )
+
+    def weights(self, c: int, parts: tuple[Array, Array, Array], sigma: Array) -> tuple[Array, float]:
+        """Return the weight of every row of a car's residuals, one after the other, and the cost of all."""
+        seen, odometry, truth = parts
+        variance = self.density[c] * KEYFRAME
+        found, cost = [], 0.5 * float((odometry**2 / variance).sum())
+        for part, scale in ((seen, sigma[0]), (truth[:, :2], sigma[1]), (truth[:, 2:], sigma[2])):
+            square = (part**2).sum(axis=-1) / (scale * LOSS) ** 2
+            cost += 0.5 * LOSS**2 * float(np.log1p(square).sum())
+            found.append(np.repeat((1.0 / (1.0 + square) / scale**2)[:, None], part.shape[1], axis=1))
+        rows = [found[0], np.broadcast_to(1.0 / variance, odometry.shape), np.concatenate(found[1:], axis=1)]
+        return np.concatenate([part.ravel() for part in rows]), cost
+
+    def scales(self, x: Array, poses: Sequence[Array]) -> Array:
+        """Return the standard deviations (C, 3) that residuals have, by their medians."""
+        found = np.ones((len(self.cars), 3))
+        for c, car in enumerate(self.cars):
+            seen, _, truth = self.residuals(c, x, poses[c])
+            found[c, 0] = max(_deviation(seen), LEAST_ANGLE if car.lens is None else LEAST_PIXEL)
+            if len(truth):
+                found[c, 1:] = max(_deviation(truth[:, :2]), LEAST_PLACE), max(_deviation(truth[:, 2:]), LEAST_YAW)
+        return found
+
+    def cost(self, x: Array, poses: Sequence[Array], sigma: Array, free: Mask) -> float:
+        """Return the cost of constants and poses, that of the priors included."""
+        parts = [self.weights(c, self.residuals(c, x, poses[c]), sigma[c])[1] for c in range(len(self.cars))]
+        return sum(parts) + 0.5 * float(((x / self.prior)[free] ** 2).sum())
+
+    def linearised(self, c: int, fit: Fit, columns: NDArray[np.int64]) -> tuple[Array, Array, csr_array, Array]:
+        """Return residuals (r,), weights (r,), the derivatives by the poses, sparse, and by constants (r, columns)."""
+        pose, parts = fit.poses[c], self.residuals(c, fit.x, fit.poses[c])
+        W, _ = self.weights(c, parts, fit.sigma[c])
+        r = _flat(parts)
+        car, M = self.cars[c], len(pose)
+        keys = (self.nearest(c, car.time + self.start[c, 0]), np.arange(M - 1))
+        late = self.nearest(c, car.truth_time + self.start[c, 1]) if self.truth[c] else np.zeros(0, np.int64)
+        key = np.concatenate([np.repeat(keys[0], 2), np.repeat(keys[1], 3), np.repeat(late, 3)])
+        between = np.zeros(len(r), dtype=bool)
+        between[parts[0].size : parts[0].size + parts[1].size] = True
+        here, after = np.zeros((len(r), 3)), np.zeros((len(r), 3))
+        for parity in (0, 1):
+            for axis in range(3):
+                moved = pose.copy()
+                moved[parity::2, axis] += 1e-6
+                change = (_flat(self.residuals(c, fit.x, moved)) - r) / 1e-6
+                here[:, axis] = np.where(key % 2 == parity, change, here[:, axis])
+                after[:, axis] = np.where(between & (key % 2 != parity), change, after[:, axis])
+        J = np.zeros((len(r), len(columns)))
+        for n, column in enumerate(columns):
+            x = fit.x.copy()
+            x[column] += self.steps[column]
+            J[:, n] = (_flat(self.residuals(c, x, pose)) - r) / self.steps[column]
+        rows = np.arange(len(r))
+        first = np.repeat(rows, 3), (3 * key[:, None] + np.arange(3)).ravel(), here.ravel()
+        second = (
+            np.repeat(rows[between], 3),
+            (3 * key[between, None] + np.arange(3, 6)).ravel(),
+            after[between].ravel(),
+        )
+        row, column, value = (np.concatenate(pair) for pair in zip(first, second, strict=True))
+        return r, W, csr_array((value, (row, column)), shape=(len(r), 3 * M)), J
+
+    def touching(self, c: int, columns: NDArray[np.int64]) -> Mask:
+        """Return which constants have an effect on a car."""
+        other = (columns < self.markers) & ((columns < self.own(c).start) | (columns >= self.own(c).stop))
+        return np.asarray(~other)
+
+    def solved(self, fit: Fit, columns: NDArray[np.int64]) -> "System":
+        """Return the normal equations of constants, from which poses are eliminated."""
+        G = len(columns)
+        S, g, scores = np.diag(1.0 / self.prior[columns] ** 2), -fit.x[columns] / self.prior[columns] ** 2, []
+        back = []
+        for c in range(len(self.cars)):
+            mine = np.flatnonzero(self.touching(c, columns))
+            r, W, P, J = self.linearised(c, fit, columns[mine])
+            PW = P.T.multiply(W).tocsr()
+            information = (PW @ P).tocsr()
+            bands = np.zeros((6, information.shape[0]))
+            for d in range(6):
+                bands[d, : information.shape[0] - d] = information.diagonal(-d)
+            bands[0] += 1e-6
+            cross = PW @ np.column_stack([J, r])
+            solution = cho_solve_banded((cholesky_banded(bands, lower=True), True), cross)
+            S[np.ix_(mine, mine)] += (J.T * W) @ J - cross[:, :-1].T @ solution[:, :-1]
+            effective = J - P @ solution[:, :-1]
+            rest = r - P @ solution[:, -1]
+            g[mine] -= (effective.T * W) @ r
+            score = np.zeros((int(np.ptp(self.times(c)) / STRETCH) + 1, G))
+            stretch = ((self.times(c) - self.times(c).min()) / STRETCH).astype(int)
+            part = effective * (W * rest)[:, None]
+            for n, column in enumerate(mine):
+                score[:, column] = np.bincount(stretch, part[:, n], minlength=len(score))
+            scores.append(score)
+            back.append((mine, solution))
+        return System(columns, S, g, np.concatenate(scores), back)
+
+    def times(self, c: int) -> Array:
+        """Return when the rows of a car's residuals are, s."""
+        car = self.cars[c]
+        truth = car.truth_time if self.truth[c] else np.zeros(0)
+        return np.concatenate([np.repeat(car.time, 2), np.repeat(self.keys[c][:-1], 3), np.repeat(truth, 3)])
+
+    def fit(self, begin: Fit, most: int = 25) -> Fit:
+        """Return the fit from a start, of the constants that are free there."""
+        fit, columns = begin, np.flatnonzero(begin.free)
+        for _ in range(most):
+            own = [fit.x[self.own(c)] for c in range(len(self.cars))]
+            self.start = np.array([[o[CAMERA_TIME], o[TRUTH_TIME]] for o in own])
+            sigma = self.scales(fit.x, fit.poses)
+            before = self.cost(fit.x, fit.poses, sigma, fit.free)
+            fit = replace(fit, sigma=sigma, cost=before)
+            system = self.solved(fit, columns)
+            change = np.linalg.solve(system.S, system.g)
+            moves = [-(y[:, -1] + y[:, :-1] @ change[mine]).reshape(-1, 3) for mine, y in system.back]
+            for share in 0.5 ** np.arange(6):
+                x = fit.x.copy()
+                x[columns] += share * change
+                poses = tuple(pose + share * move for pose, move in zip(fit.poses, moves, strict=True))
+                cost = self.cost(x, poses, sigma, fit.free)
+                if cost < before:
+                    break
+            else:
+                return fit
+            fit = replace(fit, x=x, poses=poses, cost=cost)
+            if before - cost < 1e-4 * (1.0 + 1e-3 * before):
+                break
+        return fit
+
+    def begin(self) -> Fit:
+        """Return where fits start: motion capture, or without it what windows of sightings give."""
+        x, poses = np.zeros(len(self.kinds)), []
+        for c, car in enumerate(self.cars):
+            if self.truth[c]:
+                keys, yaw = self.keys[c], np.unwrap(car.truth_yaw)
+                place = np.interp(keys, car.truth_time, car.truth)
+                poses.append(np.stack([place.real, place.imag, np.interp(keys, car.truth_time, yaw)], axis=-1))
+            else:
+                poses.append(self.resected(c, np.arange(len(self.places)))[0])
+        free = np.zeros(len(x), dtype=bool)
+        for c in range(len(self.cars)):
+            free[self.own(c).start + np.array(NUISANCE)] = True
+        return Fit(x, tuple(poses), self.scales(x, poses), free)
+
+    def misfit(self, labels: NDArray[np.int64]) -> float:
+        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places."""
+        total = 0.0
+        for c, car in enumerate(self.cars):
+            if not self.truth[c]:
+                total += self.resected(c, labels)[1]
+                continue
+            at, yaw = np.interp(car.time, car.truth_time, car.truth), np.unwrap(car.truth_yaw)
+            yaw, point = np.interp(car.time, car.truth_time, yaw), self.places[labels[car.target]]
+            flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
+            to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
+            total += _misfit(car.ray @ car.mounting.T, to)
+        return total
+
+    def resected(self, c: int, labels: NDArray[np.int64]) -> tuple[Array, float]:
+        """Return poses (M, 3) at the keyframes from the sightings of windows, and their mean misfit.
+
+        With a heading given, the position is linear in the sightings: all headings are tried.
+        """
+        car, path = self.cars[c], self.path(c, np.zeros(len(self.kinds)))
+        keys, target = self.keys[c], labels[car.target]
+        pose, good, total, count = np.full((len(keys), 3), np.nan), [], 0.0, 0
+        for begin in np.arange(keys[0], keys[-1], WINDOW):
+            inside = np.flatnonzero((car.time >= begin) & (car.time < begin + WINDOW))
+            if len(inside) < 20 or len(np.unique(target[inside])) < 2:
+                continue
+            inside = inside[:: max(1, len(inside) // 150)]
+            origin = np.full(len(inside), begin + 0.5 * WINDOW)
+            moved, turned = path.step(origin, car.time[inside])
+            unit = car.ray[inside] @ car.mounting.T
+            lever = np.exp(1j * turned) * complex(*car.lever[:2]) + moved
+            flat = np.exp(1j * turned) * (unit[:, 0] + 1j * unit[:, 1])
+            unit = np.stack([flat.real, flat.imag, unit[:, 2]], axis=-1)
+            S, point = skew(unit), self.places[target[inside]]
+            best = (np.inf, 0.0, 0j)
+            coarse = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+            for step in (0.0, 0.02, 0.004):
+                for heading in coarse if not step else best[1] + step * np.arange(-5, 6):
+                    q = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1]) - lever
+                    to = np.stack([q.real, q.imag, point[:, 2] - car.height - car.lever[2]], axis=-1)
+                    weight = np.ones(len(inside))
+                    for _ in range(2):
+                        b = np.einsum("nij,nj->ni", S, to)
+                        A = S[:, :, :2]
+                        AW = A * weight[:, None, None]
+                        shift = np.linalg.lstsq(np.einsum("nij,nik->jk", AW, A), np.einsum("nij,ni->j", AW, b))[0]
+                        ahead = to - [shift[0], shift[1], 0.0]
+                        far = np.linalg.norm(ahead, axis=-1)
+                        weight = 1.0 / np.maximum(far, 0.1) ** 2
+                    misfit = _misfit(unit, ahead)
+                    if misfit < best[0]:
+                        best = misfit, heading, np.exp(1j * heading) * complex(*shift)
+            total, count = total + best[0], count + 1
+            good.append((begin + 0.5 * WINDOW, best))
+        if not good:
+            raise DataError(f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found")
+        middle = np.array([g[0] for g in good])
+        for k, key in enumerate(keys):
+            _, heading, place = good[int(np.argmin(np.abs(middle - key)))][1]
+            at = middle[int(np.argmin(np.abs(middle - key)))]
+            moved, turned = path.step(np.array([at]), np.array([key]))
+            now = place + np.exp(1j * heading) * moved[0]
+            pose[k] = now.real, now.imag, heading + turned[0]
+        pose[:, 2] = np.unwrap(pose[:, 2])
+        return pose, total / count
+
+
+class System(NamedTuple):
+    """Normal equations of constants."""
+
+    columns: NDArray[np.int64]
+    S: Array  # information
+    g: Array
+    scores: Array  # (stretches, G)
+    back: list[tuple[NDArray[np.int64], Array]]  # per car: its constants, and what the poses follow by
+
+    def covariance(self, prior: Array) -> Array:
+        """Return the covariance of the constants; `prior` are their standard deviations."""
+        inverse = np.linalg.inv(self.S)
+        spread = self.scores.T @ self.scores + np.diag(1.0 / prior[self.columns] ** 2)
+        robust = inverse @ spread @ inverse
+        more = np.sqrt(np.maximum(robust.diagonal() / inverse.diagonal(), 1.0))
+        return np.asarray(inverse * np.outer(more, more))
+
+
+def _flat(parts: tuple[Array, Array, Array]) -> Array:
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def _misfit(unit: Array, to: Array) -> float:
+    cosine = (to * unit).sum(axis=-1) / np.maximum(np.linalg.norm(to, axis=-1), 1e-9)
+    return float(np.minimum(2.0 - 2.0 * cosine, 0.04).mean())
+
+
+def _deviation(rows: Array) -> float:
+    """Return the standard deviation of the components of rows (n, 1) or (n, 2), by the median of their lengths."""
+    return float(np.median(np.linalg.norm(rows, axis=-1))) / (0.6745, 1.1774)[rows.shape[1] - 1] if len(rows) else 0.0
+
+
+def density(time: Array, values: Array) -> float:
+    """Return the density of the white noise of samples, by the differences of neighbours."""
+    if len(time) < 3:
+        return 0.0
+    return (float(np.median(np.abs(np.diff(values)))) / 0.9539) ** 2 * float(np.median(np.diff(time)))
