@@ -260,6 +260,8 @@ class BagLog:
     rows: tuple[TopicRow, ...]  # what there is, by topic
     notes: tuple[str, ...]  # what a user should know
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
+    added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
+    """By car and role: the topic, and s that were added to its stamps."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -290,7 +292,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     samples = _samples(tracks, clocks)
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
-    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)), pixels)
+    shifts = {entry: clocks.shifts.get(entry.source) for entry in chosen}
+    added = {(e.car, e.role): (e.topic, shift.added / NS if shift else 0.0) for e, shift in shifts.items()}
+    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)), pixels, added)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

@@ -4,7 +4,7 @@ States are planar poses at keyframes, ten per second. Odometry carries them to t
 capture, so that wheel scale, gyro bias and time offsets act within a keyframe too. All derivatives are differences:
 a residual depends on the pose of one keyframe, or of two neighbours, so that six evaluations give the derivatives by all
 poses. The poses are eliminated by a banded factor (Schur complement). Sightings and motion capture have the loss of
-Cauchy, whose scale follows from the residuals; odometry has the density of its own noise.
+Geman and McClure, whose scale follows from the residuals; odometry has the density of its own noise.
 
 Standard errors are the larger of those by the information and of those by the spread of the scores of stretches of a
 second ("sandwich"): whole pixels give residuals that are correlated in time.
@@ -27,7 +27,7 @@ from coopenv.estimation.poses import Array, Mask, skew
 
 KEYFRAME = 0.1  # s
 GRID = 0.005  # s, of dead reckoning
-LOSS = 3.0  # standard deviations where the loss of Cauchy bends
+LOSS = 4.0  # standard deviations where the loss of Geman and McClure bends
 STRETCH = 1.0  # s, over which scores are summed
 LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
 """Least standard deviations of a sighting (pixels; rad without pixels) and of motion capture (m, rad)."""
@@ -52,7 +52,6 @@ PER_CAR = (
     *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6) for axis in "xy"),
 )
 """Constants of a car, deviations from the given values: prior standard deviation (rad for deg) and step."""
-MARKER_KNOWN, MARKER_FREE = 0.01, 0.3  # m, prior of a marker's coordinate without and with motion capture
 FRAME = (Kind("truth.frame_yaw", "deg", 0.2, 1e-6), *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6) for axis in "xy"))
 ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 15), 15, 16
 CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 17, 18, 19, slice(20, 23)
@@ -92,7 +91,7 @@ class Batch:
         """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
         self.drive, self.cars, self.places = drive, drive.cars, drive.places
         self.truth = [truth and len(car.truth_time) > 1 for car in self.cars]
-        marker = Kind("", "m", MARKER_FREE if any(self.truth) else MARKER_KNOWN, 1e-6)
+        marker = Kind("", "m", 0.3, 1e-6)
         self.kinds = [kind._replace(name=f"{car.name}.{kind.name}") for car in self.cars for kind in PER_CAR]
         self.kinds += [marker._replace(name=f"marker.{name}.{axis}") for name in drive.landmarks for axis in "xyz"]
         self.kinds += FRAME
@@ -104,7 +103,9 @@ class Batch:
         for c, car in enumerate(self.cars):
             mine = self.known[self.own(c)]
             mine[LENS] = car.lens is not None
-            mine[WHEEL_TIME] = len(car.wheel_time) != len(car.gyro_time) or bool((car.wheel_time != car.gyro_time).any())
+            mine[WHEEL_TIME] = len(car.wheel_time) != len(car.gyro_time) or bool(
+                (car.wheel_time != car.gyro_time).any()
+            )
             mine[TRUTH_TIME] = self.truth[c]
             mine[BODY] = self.truth[c]
         self.known[self.frame :] = any(self.truth)
@@ -112,12 +113,22 @@ class Batch:
         for i in range(len(self.places)):
             self.known[self.marker(i)] = i in seen
         self.keys = [np.arange(car.time.min() - KEYFRAME, car.time.max() + 2 * KEYFRAME, KEYFRAME) for car in self.cars]
+        self.measured = [
+            (density(car.wheel_time, car.wheel.real), density(car.gyro_time, car.gyro)) for car in self.cars
+        ]
         self.density = []  # of the odometry noise of each car, x, y and yaw
-        for car in self.cars:
+        for car, (speed, turn) in zip(self.cars, self.measured, strict=True):
             stated, rate = drive.scenario.noises[car.vehicle], drive.scenario.rates.odometry
-            speed = max(density(car.wheel_time, car.wheel.real), stated.velocity**2 / rate, LEAST_SPEED)
-            turn = max(density(car.gyro_time, car.gyro), stated.angular_velocity**2 / rate, LEAST_TURN)
+            speed = max(speed, stated.velocity**2 / rate, LEAST_SPEED)
+            turn = max(turn, stated.angular_velocity**2 / rate, LEAST_TURN)
             self.density.append(np.array([speed, speed, turn]))
+        self.base = np.zeros(len(self.kinds))  # given values
+        for c, car in enumerate(self.cars):
+            mine = self.base[self.own(c)]
+            mine[LEVER], mine[CAMERA_TIME : TRUTH_TIME + 1] = car.lever, [added for _, added in car.topics]
+            if (lens := car.lens) is not None:
+                mine[LENS] = *lens.focal_length, *lens.principal_point, *lens.distortion
+        self.base[self.markers : self.frame] = self.places.ravel()
         self.start = np.zeros((len(self.cars), 2))  # offsets by which keyframes were assigned
 
     def own(self, c: int) -> slice:
@@ -198,8 +209,8 @@ class Batch:
         found, cost = [], 0.5 * float((odometry**2 / variance).sum())
         for part, scale in ((seen, sigma[0]), (truth[:, :2], sigma[1]), (truth[:, 2:], sigma[2])):
             square = (part**2).sum(axis=-1) / (scale * LOSS) ** 2
-            cost += 0.5 * LOSS**2 * float(np.log1p(square).sum())
-            found.append(np.repeat((1.0 / (1.0 + square) / scale**2)[:, None], part.shape[1], axis=1))
+            cost += 0.5 * LOSS**2 * float((square / (1.0 + square)).sum())
+            found.append(np.repeat(((1.0 + square) ** -2 / scale**2)[:, None], part.shape[1], axis=1))
         rows = [found[0], np.broadcast_to(1.0 / variance, odometry.shape), np.concatenate(found[1:], axis=1)]
         return np.concatenate([part.ravel() for part in rows]), cost
 
@@ -388,7 +399,9 @@ class Batch:
             total, count = total + best[0], count + 1
             good.append((begin + 0.5 * WINDOW, best))
         if not good:
-            raise DataError(f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found")
+            raise DataError(
+                f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found"
+            )
         middle = np.array([g[0] for g in good])
         for k, key in enumerate(keys):
             _, heading, place = good[int(np.argmin(np.abs(middle - key)))][1]

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
 
 NS = 1e-9
+ROLES = ((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,))
+"""Of the topics of camera, wheels and motion capture."""
 LEAST_SIGHTINGS, LEAST_SECONDS = 50, 5.0
 """Sightings of landmarks and duration that a car needs."""
 CLIMB, TILT = 0.05, 0.1
@@ -48,6 +50,8 @@ class CarDrive:
     truth: NDArray[np.complex128]  # m, map
     truth_yaw: Array  # rad
     height: float  # m, of the body's origin
+    topics: tuple[tuple[str, float], ...] = (("", 0.0),) * 3
+    """Topics of camera, wheels and motion capture, and s that were added to their stamps."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,6 @@ class Drive:
     landmarks: tuple[str, ...]  # (L,) names of the static ones
     places: Array  # (L, 3) as given, m
     scenario: Scenario
-    topics: bool  # whether it is a bag, whose topics have stamps
 
 
 def _image(ray: Array, lens: Calibration) -> Array:
@@ -94,7 +97,7 @@ def drive_of_bag(bag: "Bag") -> Drive:
     for name, vehicle in binding.cars.items():
         own = [s for s in bag.log.samples if s.car == name]
         cars.append(_checked(_of_samples(bag, name, vehicle, own, number), bag.where))
-    return Drive(tuple(cars), tuple(m.name for m in marks), places.reshape(-1, 3), scenario, topics=True)
+    return Drive(tuple(cars), tuple(m.name for m in marks), places.reshape(-1, 3), scenario)
 
 
 def _of_samples(bag: "Bag", name: str, vehicle: int, samples: Sequence[Sample], number: dict[int, int]) -> CarDrive:
@@ -129,6 +132,10 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, samples: Sequence[Sample], 
         ray=ray,
         pixel=np.round(_image(ray, lens), 3) if lens is not None else np.full((len(ray), 2), np.nan),
         height=start.position[2] if start is not None and start.position is not None else 0.0,
+        topics=tuple(
+            next((bag.log.added[name, role] for role in roles if (name, role) in bag.log.added), ("", 0.0))
+            for roles in ROLES
+        ),
         **_tracks(wheel, gyro, truth),
     )
 
@@ -155,7 +162,7 @@ def drive_of_recording(recording: "Recording", path: Path) -> Drive:
     static = np.flatnonzero(np.ptp(r.landmarks, axis=0).max(axis=-1, initial=0.0) < 1e-9)
     names = tuple(r.setups[0].target_names[i] for i in static)
     cars = tuple(_checked(car, str(path)) for car in _of_vehicles(r, static, path, L))
-    return Drive(cars, names, r.landmarks[0, static], r.scenario, topics=False)
+    return Drive(cars, names, r.landmarks[0, static], r.scenario)
 
 
 def _of_vehicles(r: "Recording", static: NDArray[np.int64], path: Path, L: int) -> Iterator[CarDrive]:

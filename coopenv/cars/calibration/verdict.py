@@ -13,23 +13,23 @@ from math import log
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
+    FRAME,
     LENS,
     LEVER,
-    NUISANCE,
     PER_CAR,
     ROT,
     SCALE,
     TRUTH_TIME,
+    WHEEL_TIME,
     Batch,
     Fit,
 )
 from coopenv.cars.calibration.drives import Drive
-from coopenv.estimation.poses import Array
+from coopenv.estimation.poses import Array, Mask
 
 TRIED = 7  # hypotheses that are fitted in each round
 MOST = 4  # accepted hypotheses
@@ -37,6 +37,10 @@ LEAST_GAIN = 15.0  # of the cost, beyond the penalty
 SIGNIFICANT = 3.0  # standard errors
 FINEST = {"deg": 0.0035, "m": 0.004, "px": 1.0, "": 0.01, "rad/s": 0.002, "s": 0.008}
 """By unit (rad for deg), the least deviation that counts as wrong."""
+
+
+TIGHT = {"marker": 0.01, "truth.frame": 0.01}
+"""By the begin of a name, the prior (m, rad) in the estimate of all constants together: the map is surveyed."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,8 @@ class Row:
     unit: str
     given: float
     value: float
-    std: float
-    determined: bool
-    wrong: bool
+    error: float  # standard
+    finding: str  # "wrong", "not determined by this drive" or nothing
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,8 @@ class Calibrated:
     given: Fit  # with all constants as given
     fit: Fit  # with the wrong ones corrected
     rows: tuple[Row, ...]
-    verdict: tuple[str, ...]
-    overrides: dict[str, list[float] | float]  # dotted keys of the environment
+    verdict: tuple[str, ...]  # a line per finding
+    noise: dict[str, float]  # measured, by key of an environment
 
 
 def hypotheses(batch: Batch) -> Iterator[tuple[str, NDArray[np.int64]]]:
@@ -121,66 +124,142 @@ def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
     pairs = exchanged(batch)
     given = fit = batch.fit(batch.begin())
     count = sum(len(batch.times(c)) for c in range(len(batch.cars)))
-    accepted: list[tuple[str, NDArray[np.int64]]] = []
     groups = [(name, columns) for name, columns in hypotheses(batch) if batch.known[columns].all()]
-    while len(accepted) < MOST:
-        ranked = sorted(
-            ((gain - penalty(columns, fit, count), name, columns) for gain, name, columns in gains(batch, fit, groups)),
-            key=lambda entry: -entry[0],
-        )
-        tried = []
-        for _, name, columns in ranked[:TRIED]:
-            free = fit.free.copy()
-            free[columns] = True
-            tried.append((name, columns, batch.fit(replace(fit, free=free))))
+    for _ in range(MOST):
+        ranked = sorted(gains(batch, fit, groups, count), key=lambda entry: -entry[0])[:TRIED]
+        tried = [batch.fit(replace(fit, free=fit.free | np.isin(np.arange(len(fit.x)), group))) for _, group in ranked]
         if not tried:
             break
-        sigma = np.min([fit.sigma, *(found.sigma for *_, found in tried)], axis=0)
-        costs = [batch.cost(f.x, f.poses, sigma, f.free) + penalty(columns, fit, count) for _, columns, f in tried]
+        sigma = np.min([found.sigma for found in (fit, *tried)], axis=0)
+        costs = [batch.cost(f.x, f.poses, sigma, f.free) + penalty(f.free & ~fit.free, count) for f in tried]
         best = int(np.argmin(costs))
-        name, columns, found = tried[best]
         if batch.cost(fit.x, fit.poses, sigma, fit.free) - costs[best] < LEAST_GAIN:
             break
-        accepted.append((name, columns))
-        fit = found
-    return _result(batch, given, fit, accepted, pairs)
+        fit = tried[best]
+    error = errors(batch, fit)
+    kept = given.free | wrong(batch, fit, error)
+    for c in range(len(batch.cars)):  # coefficients of a lens are right or wrong together
+        lens = kept[batch.own(c)][LENS]
+        for part in (slice(0, 2), slice(2, 4), slice(4, 9)):
+            lens[part] = lens[part].any()
+    fit = batch.fit(replace(fit, free=kept, x=np.where(kept, fit.x, 0.0)))
+    return _result(batch, given, fit, pairs)
 
 
-def penalty(columns: NDArray[np.int64], fit: Fit, count: int) -> float:
-    """Return by how much constants have to lower the cost."""
-    return 0.5 * log(count) * int((~fit.free[columns]).sum())
+def penalty(more: Mask, count: int) -> float:
+    """Return by how much further constants have to lower the cost of so many residuals."""
+    return 0.5 * log(count) * int(more.sum())
 
 
 def gains(
-    batch: Batch, fit: Fit, groups: Sequence[tuple[str, NDArray[np.int64]]]
-) -> Iterator[tuple[float, str, NDArray[np.int64]]]:
-    """Yield by how much each group would lower the cost if the residuals were linear."""
+    batch: Batch, fit: Fit, groups: Sequence[tuple[str, NDArray[np.int64]]], count: int
+) -> Iterator[tuple[float, NDArray[np.int64]]]:
+    """Yield by how much each group would lower the cost, less its penalty, if the residuals were linear."""
     columns = np.flatnonzero(batch.known)
     system = batch.solved(fit, columns)
-    place = {int(column): n for n, column in enumerate(columns)}
-    base = [place[int(n)] for n in np.flatnonzero(fit.free)]
-    for name, group in groups:
-        more = [place[int(n)] for n in group if not fit.free[n]]
-        if more:
-            both = base + more
+    for _, group in groups:
+        both = np.flatnonzero(fit.free[columns] | np.isin(columns, group))
+        if (more := ~fit.free[group]).any():
             gain = 0.5 * float(system.g[both] @ np.linalg.solve(system.S[np.ix_(both, both)], system.g[both]))
-            yield gain, name, group
+            yield gain - penalty(more, count), group
 
 
-def _result(
-    batch: Batch,
-    given: Fit,
-    fit: Fit,
-    accepted: Sequence[tuple[str, NDArray[np.int64]]],
-    pairs: Sequence[tuple[int, int]],
-) -> Calibrated:
-    own = batch.solved(fit, np.flatnonzero(fit.free))
+def errors(batch: Batch, fit: Fit) -> Array:
+    """Return the standard errors (G,) of the free constants; infinite for others."""
+    system = batch.solved(fit, np.flatnonzero(fit.free))
     error = np.full(len(fit.x), np.inf)
-    error[own.columns] = np.sqrt(own.covariance(batch.prior).diagonal())
+    error[system.columns] = np.sqrt(system.covariance(batch.prior).diagonal())
     for c, car in enumerate(batch.cars):  # a stamp may mean the begin or the end of a sample's period
-        period = np.median(np.diff(car.wheel_time)) / np.sqrt(12.0)
-        error[batch.own(c)][[CAMERA_TIME, TRUTH_TIME]] = np.hypot(error[batch.own(c)][[CAMERA_TIME, TRUTH_TIME]], period)
+        period = float(np.median(np.diff(car.wheel_time))) / np.sqrt(12.0)
+        times = batch.own(c).start + np.array([CAMERA_TIME, WHEEL_TIME, TRUTH_TIME])
+        error[times] = np.hypot(error[times], period)
+    return error
+
+
+def wrong(batch: Batch, fit: Fit, error: Array) -> Mask:
+    """Return which constants are wrong; wheel scale and gyro bias beyond what the environment expects."""
     finest = np.array([FINEST[kind.unit] for kind in batch.kinds])
-    wrong = fit.free & (np.abs(fit.x) > np.maximum(SIGNIFICANT * error, finest))
-    print([(n, fit.x[c], error[c]) for n, c in accepted], pairs)
-    return wrong
+    for c, car in enumerate(batch.cars):
+        noise = batch.drive.scenario.noises[car.vehicle]
+        own = finest[batch.own(c)]
+        own[SCALE] = max(own[SCALE], SIGNIFICANT * noise.odometry_scale)
+        own[BIAS] = max(own[BIAS], SIGNIFICANT * float(np.max(noise.gyro_bias)))
+    return np.asarray(fit.free & (np.abs(fit.x) > np.maximum(SIGNIFICANT * error, finest)))
+
+
+def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]) -> Calibrated:
+    """Return the wrong constants with the others as given, and the others estimated all together."""
+    error = errors(batch, fit)
+    bad, wide = wrong(batch, fit, error), batch.prior
+    free = np.array([kind.name.startswith(tuple(TIGHT)) for kind in batch.kinds]) & ~fit.free
+    batch.prior = np.where(
+        free, [next((v for k, v in TIGHT.items() if kind.name.startswith(k)), 0.0) for kind in batch.kinds], wide
+    )
+    whole = batch.fit(replace(fit, free=batch.known))
+    together = errors(batch, whole)
+    rows = []
+    for n in np.flatnonzero(batch.known):
+        kind, taken = batch.kinds[n], fit.free[n]
+        value, std = (fit.x[n], error[n]) if taken else (whole.x[n], together[n])
+        loose = std > batch.prior[n] / np.sqrt(2.0)  # by the drive alone it exceeds the prior
+        factor = np.degrees(1.0) if kind.unit == "deg" else 1.0
+        base = batch.base[n]
+        rows.append(
+            Row(
+                kind.name,
+                kind.unit,
+                base * factor,
+                (base + value) * factor,
+                std * factor,
+                "wrong" if bad[n] else "not determined by this drive" if loose else "",
+            )
+        )
+    batch.prior = wide
+    return Calibrated(batch, given, fit, tuple(rows), tuple(_lines(batch, rows, pairs)), _noise(batch, fit))
+
+
+PARTS = {
+    "camera orientation": ("camera.roll", "camera.pitch", "camera.yaw"),
+    "camera position": ("camera.x", "camera.y", "camera.z"),
+    "camera focal length": ("camera.fx", "camera.fy"),
+    "camera principal point": ("camera.cx", "camera.cy"),
+    "lens distortion": ("camera.k1", "camera.k2", "camera.p1", "camera.p2", "camera.k3"),
+    "wheel scale": ("wheel.scale",),
+    "gyro bias": ("gyro.bias",),
+    "stamps": ("camera.offset", "wheel.offset", "truth.offset"),
+    "body of motion capture": ("truth.body_yaw", "truth.body_x", "truth.body_y"),
+}
+"""Constants that a line of the verdict names together."""
+
+
+def _lines(batch: Batch, rows: Sequence[Row], pairs: Sequence[tuple[int, int]]) -> Iterator[str]:
+    """Yield the verdict."""
+    names = batch.drive.landmarks
+    for i, j in pairs:
+        yield f"markers {names[i]} and {names[j]} are exchanged"
+    bad = {row.name: row for row in rows if row.finding == "wrong"}
+    groups = [
+        (f"{car.name}: {title}", [f"{car.name}.{part}" for part in parts])
+        for car in batch.cars
+        for title, parts in PARTS.items()
+    ]
+    groups += [(f"marker {name}: position", [f"marker.{name}.{axis}" for axis in "xyz"]) for name in names]
+    groups += [("frame of motion capture", [kind.name for kind in FRAME])]
+    for title, parts in groups:
+        found = [bad[part] for part in parts if part in bad]
+        told = [
+            f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}".strip() for r in found
+        ]
+        if told:
+            yield f"{title} is wrong: {', '.join(told)}"
+
+
+def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
+    """Return the noise that was measured, by key of an environment."""
+    rate = batch.drive.scenario.rates.odometry
+    focal = [1.0 if car.lens is None else car.lens.focal_length[0] for car in batch.cars]
+    return {
+        "noise.bearing.scale": float(np.mean(fit.sigma[:, 0] / focal)),
+        "noise.velocity": float(np.sqrt(np.mean([d[0] for d in batch.measured]) * rate)),
+        "noise.angular_velocity": float(np.sqrt(np.mean([d[1] for d in batch.measured]) * rate)),
+    }
