@@ -124,6 +124,9 @@ class TopicMap(Section):
     """Name of an environment, or TOML file (relative to this file): landmarks, cameras, noise and observer."""
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
+    calibration: str | None = None
+    """File that `coopenv calibrate` has written (relative to this file): its overrides and clock offsets replace those
+    of this file."""
     names: str = "svea"
     """Scheme of topic names, unless `cars.topics` gives others: `authors`, `none`, or a profile as in a deployment
     file, `svea` or a TOML file (relative to this file)."""
@@ -169,7 +172,13 @@ def load_map(path: str | Path) -> TopicMap:
         TopicMapError: it cannot be read, or one line says which field is not what it must be.
     """
     path = Path(path)
-    made = validated(TopicMap, read_toml(path, TopicMapError), path.name, TopicMapError)
+    data = read_toml(path, TopicMapError)
+    if isinstance(name := data.get("calibration"), str):
+        found = read_toml(path.parent / name, TopicMapError)
+        data["overrides"] = {**data.get("overrides", {}), **found.get("overrides", {})}
+        clocks = data.setdefault("clocks", {})
+        clocks["offsets"] = {**clocks.get("offsets", {}), **found.get("clocks", {}).get("offsets", {})}
+    made = validated(TopicMap, data, path.name, TopicMapError)
     try:
         patterns_of(made.names, path.parent)
     except CoopenvError as error:

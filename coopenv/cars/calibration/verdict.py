@@ -13,6 +13,7 @@ from math import log
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from coopenv.cars.calibration.batch import (
     BIAS,
@@ -263,3 +264,38 @@ def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
         "noise.velocity": float(np.sqrt(np.mean([d[0] for d in batch.measured]) * rate)),
         "noise.angular_velocity": float(np.sqrt(np.mean([d[1] for d in batch.measured]) * rate)),
     }
+
+
+def overrides(result: Calibrated) -> dict[str, float | list[float]]:
+    """Return dotted keys of the environment with the calibrated cameras, landmarks and noise."""
+    batch, found = result.batch, dict[str, float | list[float]]()
+    value = batch.base + result.fit.x
+    for c, car in enumerate(batch.cars):
+        key, own = f"vehicles.{car.vehicle}.camera.", value[batch.own(c)]
+        quaternion = Rotation.from_matrix(Rotation.from_rotvec(own[ROT]).as_matrix() @ car.mounting).as_quat()
+        found[key + "orientation"] = quaternion[[3, 0, 1, 2]].tolist()
+        found[key + "position"] = own[LEVER].tolist()
+        if car.lens is not None:
+            fx, fy, cx, cy, *bent = own[LENS].tolist()
+            found |= {key + "focal_length": [fx, fy], key + "principal_point": [cx, cy], key + "distortion": bent}
+    moved = batch.places + result.fit.x[batch.markers : batch.frame].reshape(-1, 3) - batch.drive.places
+    for mark in batch.drive.scenario.landmarks:
+        if mark.name in batch.drive.landmarks and (step := moved[batch.drive.landmarks.index(mark.name)]).any():
+            found[f"landmarks.{mark.name}.position"] = (np.array(mark.position) + step).tolist()
+    return {name: np.round(values, 7).tolist() for name, values in (found | result.noise).items()}
+
+
+def toml_text(result: Calibrated) -> str:
+    """Return overrides, clock offsets and all constants with their standard errors as TOML."""
+    lines = ["# Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks].", "", "[overrides]"]
+    lines += [f'"{key}" = {value}' for key, value in overrides(result).items()]
+    offsets = {}
+    for c, car in enumerate(result.batch.cars):
+        values = (result.batch.base + result.fit.x)[result.batch.own(c)][CAMERA_TIME : TRUTH_TIME + 1]
+        offsets |= {topic: float(value) for (topic, _), value in zip(car.topics, values, strict=True) if topic and value}
+    lines += ["", "[clocks]", "offsets = {" + ", ".join(f' "{key}" = {value:.5f}' for key, value in offsets.items()) + " }"]
+    lines += ["", "[constants]"]
+    for row in result.rows:
+        numbers = f"given = {row.given:.7g}, value = {row.value:.7g}, standard_error = {row.error:.3g}"
+        lines.append(f'"{row.name}" = {{ {numbers}, unit = "{row.unit}", finding = "{row.finding}" }}')
+    return "\n".join(lines) + "\n"
