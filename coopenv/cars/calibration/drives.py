@@ -119,7 +119,6 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, samples: Sequence[Sample], 
                 gyro.append((t, float(value.angular[2])))
         elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
             truth.append((t, complex(*value.position[:2]), _yaw(value.rotation)))
-    start = bag.scenario.vehicles[vehicle].initial_pose
     ray = np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3)
     return CarDrive(
         name=name,
@@ -131,7 +130,7 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, samples: Sequence[Sample], 
         target=np.array([row[1] for row in rows], dtype=np.int64),
         ray=ray,
         pixel=np.round(_image(ray, lens), 3) if lens is not None else np.full((len(ray), 2), np.nan),
-        height=start.position[2] if start is not None and start.position is not None else 0.0,
+        height=_height(bag.scenario, vehicle),
         topics=tuple(
             next((bag.log.added[name, role] for role in roles if (name, role) in bag.log.added), ("", 0.0))
             for roles in ROLES
@@ -147,6 +146,11 @@ def _tracks(wheel: Sequence[Any], gyro: Sequence[Any], truth: Sequence[Any]) -> 
         values = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0) for _ in columns]
         found.update(zip(columns, [NS * values[0], *values[1:]], strict=True))
     return found
+
+
+def _height(scenario: Scenario, vehicle: int) -> float:
+    start = scenario.vehicles[vehicle].initial_pose
+    return start.position[2] if start is not None and start.position is not None else 0.0
 
 
 def _yaw(rotation: Array) -> float:
@@ -198,7 +202,7 @@ def _of_vehicles(r: "Recording", static: NDArray[np.int64], path: Path, L: int) 
             truth_time=r.t[known],
             truth=place[:, 0] + 1j * place[:, 1],
             truth_yaw=np.array([_yaw(R) for R in r.truth.rotation[known, i]]),
-            height=float(r.start_position[i, 2]),
+            height=float(np.median(place[:, 2])) if len(place) else _height(r.scenario, i),
         )
 
 
