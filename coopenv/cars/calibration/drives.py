@@ -25,6 +25,8 @@ ROLES = ((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TR
 """Of the topics of camera, wheels and motion capture."""
 LEAST_SIGHTINGS, LEAST_SECONDS = 50, 5.0
 """Sightings of landmarks and duration that a car needs."""
+STEP, TURNING, SMOOTH = 0.002, 0.2, 0.5
+"""Motion (m) that makes a further sighting of a landmark count, m of it per rad, and s over which it is averaged."""
 CLIMB, TILT = 0.05, 0.1
 """Mean vertical velocity, m/s, and mean rate of roll and pitch, rad/s, above which a vehicle is no car."""
 
@@ -71,10 +73,21 @@ def _image(ray: Array, lens: Calibration) -> Array:
 
 
 def _checked(car: CarDrive, where: str) -> CarDrive:
-    """Return a car without sightings at the rim of its image, where a marker is cut off. Raises DataError: too few."""
+    """Return a car with the sightings that are of use.
+
+    Left out are those at the rim of the image, where a marker is cut off, and of each landmark all but the first within
+    a step of the motion: while a car stands, pixels repeat the same rounding. Raises DataError: too few sightings.
+    """
+    rows = np.arange(len(car.time))
     if car.lens is not None:
-        inside = ((car.pixel > 1.5) & (car.pixel < np.array(car.lens.image_size) - 2.5)).all(axis=-1)
-        car = replace(car, **{name: getattr(car, name)[inside] for name in ("time", "target", "ray", "pixel")})
+        rows = np.flatnonzero(((car.pixel > 1.5) & (car.pixel < np.array(car.lens.image_size) - 2.5)).all(axis=-1))
+    if len(rows) and len(car.wheel_time) > 1 and len(car.gyro_time) > 1:
+        time = np.arange(car.time.min(), car.time.max() + SMOOTH, SMOOTH)
+        speed, turn = np.interp(time, car.wheel_time, _smooth(car.wheel_time, car.wheel.real)), _smooth(car.gyro_time, car.gyro)
+        moving = np.abs(speed) + TURNING * np.abs(np.interp(time, car.gyro_time, turn))
+        step = (np.interp(car.time[rows], time, SMOOTH * np.cumsum(moving)) / STEP).astype(np.int64)
+        rows = rows[np.sort(np.unique(np.stack([car.target[rows], step]), axis=1, return_index=True)[1])]
+    car = replace(car, **{name: getattr(car, name)[rows] for name in ("time", "target", "ray", "pixel")})
     count = len(car.time)
     seconds = float(np.ptp(car.time)) if count else 0.0
     if count < LEAST_SIGHTINGS or seconds < LEAST_SECONDS:
@@ -83,6 +96,11 @@ def _checked(car: CarDrive, where: str) -> CarDrive:
             f"a calibration needs {LEAST_SIGHTINGS} in {LEAST_SECONDS:g} s"
         )
     return car
+
+
+def _smooth(time: Array, values: Array) -> Array:
+    size = max(1, round(SMOOTH / float(np.median(np.diff(time)))))
+    return np.convolve(values, np.ones(size) / size, "same")
 
 
 def drive_of_bag(bag: "Bag") -> Drive:
