@@ -1,0 +1,200 @@
+"""Calibration on drives that are computed here, and the command on logs and on bad input."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.cars.calibration.verdict import Calibrated, calibrate, toml_text
+from coopenv.cars.readings import Calibration, rays
+from coopenv.cli import main
+from coopenv.scenario import load_scenario
+from tests.helpers.commands import refused
+
+LENS = Calibration((316, 208), (213.161906, 213.521038), (154.841998, 114.98398), (-0.352043, 0.137879, 0.0, 0.0, 0.0))
+MOUNTING = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+MARKERS = np.array(
+    [[0.1, 2.5, 0.4], [-1.4, 2.0, 0.08], [1.6, 1.4, 0.25], [2.3, -0.4, 0.08], [0.9, -2.2, 0.4], [-1.2, -1.9, 0.1]]
+)
+LEVER = np.array([0.3218, 0.0, 0.2233])
+SCALE, BIAS = 0.02, 0.006
+
+
+def imaged(ray: np.ndarray, lens: Calibration) -> np.ndarray:
+    k1, k2, *_ = lens.distortion
+    x, y = ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
+    radial = 1.0 + k1 * (x * x + y * y) + k2 * (x * x + y * y) ** 2
+    return np.stack([x * radial, y * radial], axis=-1) * lens.focal_length + np.array(lens.principal_point)
+
+
+@cache
+def measured(seconds: float = 40.0) -> dict[str, Any]:
+    """Return what a car measures that drives figures of eight, by formulas of its own."""
+    rng, dt = np.random.default_rng(3), 0.001
+    t = np.arange(0.0, seconds, dt)
+    speed = 0.3 + 0.1 * np.sin(0.7 * t)
+    rate = 0.45 * np.sin(2.0 * np.pi * t / 30.0) + 0.35
+    yaw = 1.2 + np.cumsum(rate) * dt
+    place = np.cumsum(speed * np.exp(1j * yaw)) * dt - 0.3 - 0.4j
+    found, frames = [], np.arange(500, len(t) - 500, 33)
+    for k in frames:
+        flat = np.exp(-1j * yaw[k]) * (MARKERS[:, 0] + 1j * MARKERS[:, 1] - place[k])
+        ray = (np.stack([flat.real, flat.imag, MARKERS[:, 2]], axis=-1) - LEVER) @ MOUNTING
+        ahead = np.flatnonzero((ray[:, 2] > 0.2) & (np.abs(ray[:, 0]) < 0.75 * ray[:, 2]))
+        pixel = np.rint(imaged(ray[ahead], LENS) + 0.6 * rng.normal(size=(len(ahead), 2)))
+        found += [(t[k], i, *p) for i, p in zip(ahead, pixel.tolist(), strict=True) if 2 < p[0] < 313 and 2 < p[1] < 205]
+    w, g, m = (np.arange(0, len(t), step) for step in (20, 10, 20))
+    noise = 0.0007 * (rng.normal(size=len(m)) + 1j * rng.normal(size=len(m)))
+    return {
+        "seen": np.array(found),
+        "wheel_time": t[w],
+        "wheel": (1.0 + SCALE) * speed[w] + 0.014 * rng.normal(size=len(w)) + 0j,
+        "gyro_time": t[g],
+        "gyro": rate[g] + BIAS + 0.02 * rng.normal(size=len(g)),
+        "truth_time": t[m],
+        "truth": place[m] + noise,
+        "truth_yaw": yaw[m] + 0.001 * rng.normal(size=len(m)),
+    }
+
+
+def drive(
+    lever: np.ndarray = LEVER,
+    turned: float = 0.0,
+    lens: Calibration | None = LENS,
+    markers: np.ndarray = MARKERS,
+    late: float = 0.0,
+    truth_late: float = 0.0,
+) -> Drive:
+    """Return the drive as it looks to a calibration that is given these constants."""
+    tracks = dict(measured())
+    seen = tracks.pop("seen")
+    c, s = np.cos(turned), np.sin(turned)
+    ray, there = rays(seen[:, 2:], lens or LENS)
+    seen, ray = seen[there], ray[there]
+    car = CarDrive(
+        name="car",
+        vehicle=0,
+        mounting=np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ MOUNTING,
+        lever=lever,
+        lens=lens,
+        time=seen[:, 0] + late,
+        target=seen[:, 1].astype(int),
+        ray=ray,
+        pixel=seen[:, 2:],
+        height=0.0,
+        **{**tracks, "truth_time": tracks["truth_time"] + truth_late},
+    )
+    names = tuple(f"M{i}" for i in range(len(markers)))
+    return Drive((car,), names, markers, load_scenario("svea_crossing"))
+
+
+def off(result: Calibrated, name: str, true: float) -> float:
+    """Return by how many standard errors a constant is off."""
+    row = next(row for row in result.rows if row.name == name)
+    return abs(row.value - true) / row.error
+
+
+EXCHANGED = MARKERS[[1, 0, 2, 3, 4, 5]]
+MOVED = MARKERS + np.array([[0, 0, 0]] * 2 + [[0.04, 0, 0]] + [[0, 0, 0]] * 3)
+NO_DISTORTION = Calibration(LENS.image_size, LENS.focal_length, LENS.principal_point, (0.0,) * 5)
+OTHER_FOCUS = Calibration(LENS.image_size, (220.0, 220.4), LENS.principal_point, LENS.distortion)
+ROWS: list[tuple[dict[str, Any], str, dict[str, float]]] = [
+    ({}, "", {"car.wheel.scale": SCALE, "car.gyro.bias": BIAS}),
+    ({"turned": np.radians(2.0)}, "car: camera orientation", {"car.camera.yaw": -2.0}),
+    ({"lever": LEVER - [0, 0, 0.02]}, "car: camera position", {"car.camera.z": 0.2233}),
+    ({"lever": np.array([0.12, 0, 0.15])}, "car: camera position", {"car.camera.x": 0.3218, "car.camera.z": 0.2233}),
+    ({"lens": NO_DISTORTION}, "car: lens distortion", {"car.camera.k1": -0.352043, "car.camera.k2": 0.137879}),
+    ({"lens": OTHER_FOCUS}, "car: camera focal length", {"car.camera.fx": 213.161906, "car.camera.fy": 213.521038}),
+    ({"markers": EXCHANGED}, "markers M0 and M1 are exchanged", {}),
+    ({"markers": MOVED}, "marker M2: position", {"marker.M2.x": 1.6}),
+    ({"late": 0.12}, "car: stamps", {"car.camera.offset": -0.12}),
+]
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize(("given", "named", "true"), ROWS)
+def test_the_wrong_constant_is_named_and_recovered(
+    given: dict[str, Any], named: str, true: dict[str, float], truth: bool
+) -> None:
+    result = calibrate(drive(**given), truth)
+    assert len(result.verdict) == bool(named) and all(line.startswith(named) for line in result.verdict)
+    for name, value in true.items():
+        assert off(result, name, value) < 3.0, name
+
+
+def test_motion_capture_that_is_late_is_named() -> None:
+    result = calibrate(drive(truth_late=0.15))
+    assert [line.split(" is")[0] for line in result.verdict] == ["car: stamps"]
+    assert off(result, "car.truth.offset", -0.15) < 3.0
+
+
+def test_bearings_alone_give_the_mounting_and_no_intrinsics() -> None:
+    given = drive(lever=LEVER - [0, 0, 0.02])
+    car = given.cars[0]
+    blind = replace(car, lens=None, pixel=np.full_like(car.pixel, np.nan))
+    result = calibrate(replace(given, cars=(blind,)))
+    assert off(result, "car.camera.z", 0.2233) < 3.0 and len(result.verdict) == 1
+    assert not any(row.name.endswith((".fx", ".k1")) for row in result.rows)
+
+
+def test_the_file_sets_what_was_wrong() -> None:
+    written = tomllib.loads(toml_text(calibrate(drive(lever=LEVER - [0, 0, 0.02]))))
+    scenario = load_scenario("svea_crossing", {k: v for k, v in written["overrides"].items() if "landmarks" not in k})
+    assert abs(scenario.cameras[0].position[2] - 0.2233) < 1e-3
+    np.testing.assert_allclose(scenario.cameras[0].to_body(), MOUNTING, atol=1e-6)
+    assert written["constants"]["car.camera.z"]["finding"] == "wrong"
+    assert abs(written["overrides"]["noise.velocity"] - 0.014 * np.sqrt(2)) < 0.002
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated drive, as a log."""
+    path = tmp_path_factory.mktemp("calibration") / "drive.mcap"
+    line = ["record", "svea_crossing", "--policy", "route_follower", "--set", "horizon=12", "--no-scene", "--no-replay"]
+    assert main([*line, "--out", str(path)]) == 0
+    return path
+
+
+def test_the_command_reads_a_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(log), "--out", str(log.parent)]) == 0
+    printed = capsys.readouterr().out
+    assert "No constant is wrong." in printed and "vehicle_1.wheel.scale" in printed
+    assert (log.parent / "residuals_vehicle_1.png").stat().st_size > 10_000
+    assert "clocks" in tomllib.loads((log.parent / "calibration.toml").read_text(encoding="utf-8"))
+
+
+MAP = 'environment = "crossing_path"\nnames = "authors"\nmarkers = {{ SL1 = 1 }}\n{}\n[[cars]]\nname = "svea3"\nagent = 8\n'
+BAD: list[tuple[list[str], str]] = [
+    (["nowhere.mcap"], "nowhere.mcap"),
+    (["nowhere.bag"], "nowhere.bag: needs the map of its topics, --map topics.toml"),
+    (["svea_crossing"], "svea_crossing: needs the map of its topics"),
+    (["LOG", "LOG"], "needs the map of its topics"),
+    (["LOG", "--set", "camera.position=[0,0,0]"], "--set: needs the map"),
+    (["nowhere.bag", "--map", "nowhere.toml"], "nowhere.toml: cannot be read"),
+    (["nowhere.bag", "--map", "good.toml"], "no such bag: nowhere.bag"),
+    (["nowhere.bag", "--map", "calibrated.toml"], "nowhere.toml"),
+    (["nowhere.bag", "--map", "number.toml"], "calibration"),
+    (["short.mcap"], "short.mcap: vehicle_1 has"),
+    (["flight.mcap"], "flight.mcap: "),
+    (["nowhere.bag", "--map", "good.toml", "--set", "camera"], "--set camera: expected KEY=VALUE"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "line"), BAD)
+def test_bad_input_is_one_line(arguments: list[str], line: str, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(log.parent)
+    for name, more in {"good": "", "calibrated": 'calibration = "nowhere.toml"', "number": "calibration = 3"}.items():
+        Path(f"{name}.toml").write_text(MAP.format(more), encoding="utf-8")
+    source = {"short.mcap": "svea_crossing", "flight.mcap": "drones"}.get(arguments[0])
+    if source and not Path(arguments[0]).exists():
+        recorded = ["record", source, "--set", "horizon=3", "--no-scene", "--no-replay", "--out", arguments[0]]
+        assert main(recorded) == 0
+    assert line in refused("calibrate", *[str(log) if a == "LOG" else a for a in arguments], "--out", "results")
+    assert not Path("results").exists()
