@@ -47,7 +47,9 @@ def calibrate(
         from coopenv.viz.calibration_figures import residual_figure
         from coopenv.viz.style import save
 
-        files += [save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)]
+        files += [
+            save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)
+        ]
     if as_json:
         options.print_json({"rows": result.rows, "verdict": result.verdict, "noise": result.noise})
         return

@@ -25,7 +25,9 @@ def residual_figure(result: Calibrated, c: int) -> Figure:
             image.quiver(*car.pixel[some].T, *seen[some].T, color=colour, label=label, **arrows)
         length = scale * np.linalg.norm(seen, axis=-1)
         names = batch.drive.landmarks
-        rms = [np.sqrt(np.mean(length[car.target == i] ** 2)) if (car.target == i).any() else 0 for i in range(len(names))]
+        rms = [
+            np.sqrt(np.mean(length[car.target == i] ** 2)) if (car.target == i).any() else 0 for i in range(len(names))
+        ]
         side = -0.2 if label == "as given" else 0.2
         marks.bar(np.arange(len(names)) + side, rms, 0.4, color=colour, label=label)
         order = np.argsort(car.time, kind="stable")
@@ -35,7 +37,9 @@ def residual_figure(result: Calibrated, c: int) -> Figure:
             house.draw_band(truth, car.truth_time, off, house.bins_of(4.5), color=colour, label=label)
     if car.lens is not None:
         width, height = car.lens.image_size
-        image.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title="Residuals in the image, drawn 10 times as long")
+        image.set(
+            xlim=(0, width), ylim=(height, 0), aspect="equal", title="Residuals in the image, drawn 10 times as long"
+        )
         house.tidy(image, x_label="u [px]", y_label="v [px]")
     else:
         image.axis("off")

@@ -1,9 +1,9 @@
 """One batch least squares over the poses of all cars and the constants of their sensors.
 
 States are planar poses at keyframes, ten per second. Odometry carries them to the times of sightings and of motion
-capture, so that wheel scale, gyro bias and time offsets act within a keyframe too. All derivatives are differences:
-a residual depends on the pose of one keyframe, or of two neighbours, so that six evaluations give the derivatives by all
-poses. The poses are eliminated by a banded factor (Schur complement). Sightings and motion capture have the loss of
+capture, so that wheel scale, gyro bias and time offsets act within a keyframe too. All derivatives are differences: a
+residual depends on the pose of one keyframe, or of two neighbours, so that six evaluations give those by all poses.
+The poses are eliminated by a banded factor (Schur complement). Sightings and motion capture have the loss of
 Geman and McClure, whose scale follows from the residuals; odometry has the density of its own noise.
 
 Standard errors are the larger of those by the information and of those by the spread of the scores of stretches of a
@@ -35,7 +35,16 @@ LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of od
 WINDOW = 6.0  # s of sightings from which a first pose is found
 HEADINGS = 72  # that are tried for it
 
-Kind = NamedTuple("Kind", [("name", str), ("unit", str), ("prior", float), ("step", float)])
+
+class Kind(NamedTuple):
+    """A constant: a deviation from its given value."""
+
+    name: str
+    unit: str
+    prior: float  # standard deviation; rad for deg
+    step: float  # of differences
+
+
 PER_CAR = (
     *(Kind(f"camera.{name}", "deg", 0.2, 1e-6) for name in ("roll", "pitch", "yaw")),
     *(Kind(f"camera.{name}", "m", 0.3, 1e-6) for name in "xyz"),
@@ -51,7 +60,7 @@ PER_CAR = (
     Kind("truth.body_yaw", "deg", 0.2, 1e-6),
     *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6) for axis in "xy"),
 )
-"""Constants of a car, deviations from the given values: prior standard deviation (rad for deg) and step."""
+"""Constants of a car."""
 FRAME = (Kind("truth.frame_yaw", "deg", 0.2, 1e-6), *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6) for axis in "xy"))
 ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 15), 15, 16
 CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 17, 18, 19, slice(20, 23)
@@ -103,11 +112,8 @@ class Batch:
         for c, car in enumerate(self.cars):
             mine = self.known[self.own(c)]
             mine[LENS] = car.lens is not None
-            mine[WHEEL_TIME] = len(car.wheel_time) != len(car.gyro_time) or bool(
-                (car.wheel_time != car.gyro_time).any()
-            )
-            mine[TRUTH_TIME] = self.truth[c]
-            mine[BODY] = self.truth[c]
+            mine[WHEEL_TIME] = not np.array_equal(car.wheel_time, car.gyro_time)
+            mine[TRUTH_TIME] = mine[BODY] = self.truth[c]
         self.known[self.frame :] = any(self.truth)
         seen = {int(t) for car in self.cars for t in np.unique(car.target)}
         for i in range(len(self.places)):
@@ -118,7 +124,7 @@ class Batch:
         ]
         self.density = []  # of the odometry noise of each car, x, y and yaw
         for car, (speed, turn) in zip(self.cars, self.measured, strict=True):
-            stated, rate = drive.scenario.noises[car.vehicle], drive.scenario.rates.odometry
+            stated, rate = drive.scenario.noises[car.vehicle], self.rate(car)
             speed = max(speed, stated.velocity**2 / rate, LEAST_SPEED)
             turn = max(turn, stated.angular_velocity**2 / rate, LEAST_TURN)
             self.density.append(np.array([speed, speed, turn]))
@@ -130,6 +136,11 @@ class Batch:
                 mine[LENS] = *lens.focal_length, *lens.principal_point, *lens.distortion
         self.base[self.markers : self.frame] = self.places.ravel()
         self.start = np.zeros((len(self.cars), 2))  # offsets by which keyframes were assigned
+
+    def rate(self, car: CarDrive) -> float:
+        """Return the rate in Hz at which the environment states a car's odometry noise."""
+        stated = self.drive.scenario.noises[car.vehicle].odometry_rate
+        return self.drive.scenario.rates.odometry if isinstance(stated, str) else stated
 
     def own(self, c: int) -> slice:
         """Return where the constants of a car are."""
@@ -150,7 +161,7 @@ class Batch:
         return Path(time, yaw, np.concatenate([[0.0], np.cumsum(0.5 * GRID * (going[1:] + going[:-1]))]))
 
     def residuals(self, c: int, x: Array, pose: Array) -> tuple[Array, Array, Array]:
-        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3) of a car, px or rad, m, rad."""
+        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad."""
         car, own, keys = self.cars[c], x[self.own(c)], self.keys[c]
         path = self.path(c, x)
         place, yaw = pose[:, 0] + 1j * pose[:, 1], pose[:, 2]
@@ -235,38 +246,30 @@ class Batch:
         W, _ = self.weights(c, parts, fit.sigma[c])
         r = _flat(parts)
         car, M = self.cars[c], len(pose)
-        keys = (self.nearest(c, car.time + self.start[c, 0]), np.arange(M - 1))
         late = self.nearest(c, car.truth_time + self.start[c, 1]) if self.truth[c] else np.zeros(0, np.int64)
-        key = np.concatenate([np.repeat(keys[0], 2), np.repeat(keys[1], 3), np.repeat(late, 3)])
-        between = np.zeros(len(r), dtype=bool)
-        between[parts[0].size : parts[0].size + parts[1].size] = True
-        here, after = np.zeros((len(r), 3)), np.zeros((len(r), 3))
+        seen = self.nearest(c, car.time + self.start[c, 0])
+        key = np.concatenate([np.repeat(seen, 2), np.repeat(np.arange(M - 1), 3), np.repeat(late, 3)])
+        after = np.zeros(len(r), dtype=np.int64)  # odometry depends on the next keyframe, too
+        after[parts[0].size : parts[0].size + parts[1].size] = 1
+        entries = []
         for parity in (0, 1):
             for axis in range(3):
                 moved = pose.copy()
                 moved[parity::2, axis] += 1e-6
                 change = (_flat(self.residuals(c, fit.x, moved)) - r) / 1e-6
-                here[:, axis] = np.where(key % 2 == parity, change, here[:, axis])
-                after[:, axis] = np.where(between & (key % 2 != parity), change, after[:, axis])
+                entries.append(
+                    (
+                        3 * (key + after * (key % 2 != parity)) + axis,
+                        np.where((key % 2 == parity) | (after > 0), change, 0.0),
+                    )
+                )
         J = np.zeros((len(r), len(columns)))
         for n, column in enumerate(columns):
             x = fit.x.copy()
             x[column] += self.steps[column]
             J[:, n] = (_flat(self.residuals(c, x, pose)) - r) / self.steps[column]
-        rows = np.arange(len(r))
-        first = np.repeat(rows, 3), (3 * key[:, None] + np.arange(3)).ravel(), here.ravel()
-        second = (
-            np.repeat(rows[between], 3),
-            (3 * key[between, None] + np.arange(3, 6)).ravel(),
-            after[between].ravel(),
-        )
-        row, column, value = (np.concatenate(pair) for pair in zip(first, second, strict=True))
-        return r, W, csr_array((value, (row, column)), shape=(len(r), 3 * M)), J
-
-    def touching(self, c: int, columns: NDArray[np.int64]) -> Mask:
-        """Return which constants have an effect on a car."""
-        other = (columns < self.markers) & ((columns < self.own(c).start) | (columns >= self.own(c).stop))
-        return np.asarray(~other)
+        column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
+        return r, W, csr_array((value, (np.tile(np.arange(len(r)), 6), column)), shape=(len(r), 3 * M)), J
 
     def solved(self, fit: Fit, columns: NDArray[np.int64]) -> "System":
         """Return the normal equations of constants, from which poses are eliminated."""
@@ -274,7 +277,8 @@ class Batch:
         S, g, scores = np.diag(1.0 / self.prior[columns] ** 2), -fit.x[columns] / self.prior[columns] ** 2, []
         back = []
         for c in range(len(self.cars)):
-            mine = np.flatnonzero(self.touching(c, columns))
+            own = (columns >= self.own(c).start) & (columns < self.own(c).stop)
+            mine = np.flatnonzero(own | (columns >= self.markers))
             r, W, P, J = self.linearised(c, fit, columns[mine])
             PW = P.T.multiply(W).tocsr()
             information = (PW @ P).tocsr()
@@ -365,7 +369,7 @@ class Batch:
         """
         car, path = self.cars[c], self.path(c, np.zeros(len(self.kinds)))
         keys, target = self.keys[c], labels[car.target]
-        pose, good, total, count = np.full((len(keys), 3), np.nan), [], 0.0, 0
+        good, total = [], 0.0
         for begin in np.arange(keys[0], keys[-1], WINDOW):
             inside = np.flatnonzero((car.time >= begin) & (car.time < begin + WINDOW))
             if len(inside) < 20 or len(np.unique(target[inside])) < 2:
@@ -396,21 +400,17 @@ class Batch:
                     misfit = _misfit(unit, ahead)
                     if misfit < best[0]:
                         best = misfit, heading, np.exp(1j * heading) * complex(*shift)
-            total, count = total + best[0], count + 1
-            good.append((begin + 0.5 * WINDOW, best))
+            total += best[0]
+            good.append((begin + 0.5 * WINDOW, *best[1:]))
         if not good:
             raise DataError(
                 f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found"
             )
-        middle = np.array([g[0] for g in good])
-        for k, key in enumerate(keys):
-            _, heading, place = good[int(np.argmin(np.abs(middle - key)))][1]
-            at = middle[int(np.argmin(np.abs(middle - key)))]
-            moved, turned = path.step(np.array([at]), np.array([key]))
-            now = place + np.exp(1j * heading) * moved[0]
-            pose[k] = now.real, now.imag, heading + turned[0]
-        pose[:, 2] = np.unwrap(pose[:, 2])
-        return pose, total / count
+        near = np.argmin(np.abs(np.array([at for at, *_ in good]) - keys[:, None]), axis=1)
+        at, heading, place = (np.array([entry[n] for entry in good])[near] for n in range(3))
+        moved, turned = path.step(at.real, keys)
+        now, yaw = place + np.exp(1j * heading) * moved, heading + turned
+        return np.stack([now.real, now.imag, np.unwrap(yaw)], axis=-1), total / len(good)
 
 
 class System(NamedTuple):

@@ -287,13 +287,23 @@ def overrides(result: Calibrated) -> dict[str, float | list[float]]:
 
 def toml_text(result: Calibrated) -> str:
     """Return overrides, clock offsets and all constants with their standard errors as TOML."""
-    lines = ["# Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks].", "", "[overrides]"]
+    lines = [
+        "# Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks].",
+        "",
+        "[overrides]",
+    ]
     lines += [f'"{key}" = {value}' for key, value in overrides(result).items()]
     offsets = {}
     for c, car in enumerate(result.batch.cars):
         values = (result.batch.base + result.fit.x)[result.batch.own(c)][CAMERA_TIME : TRUTH_TIME + 1]
-        offsets |= {topic: float(value) for (topic, _), value in zip(car.topics, values, strict=True) if topic and value}
-    lines += ["", "[clocks]", "offsets = {" + ", ".join(f' "{key}" = {value:.5f}' for key, value in offsets.items()) + " }"]
+        offsets |= {
+            topic: float(value) for (topic, _), value in zip(car.topics, values, strict=True) if topic and value
+        }
+    lines += [
+        "",
+        "[clocks]",
+        "offsets = {" + ", ".join(f' "{key}" = {value:.5f}' for key, value in offsets.items()) + " }",
+    ]
     lines += ["", "[constants]"]
     for row in result.rows:
         numbers = f"given = {row.given:.7g}, value = {row.value:.7g}, standard_error = {row.error:.3g}"

@@ -49,7 +49,9 @@ def measured(seconds: float = 40.0) -> dict[str, Any]:
         ray = (np.stack([flat.real, flat.imag, MARKERS[:, 2]], axis=-1) - LEVER) @ MOUNTING
         ahead = np.flatnonzero((ray[:, 2] > 0.2) & (np.abs(ray[:, 0]) < 0.75 * ray[:, 2]))
         pixel = np.rint(imaged(ray[ahead], LENS) + 0.6 * rng.normal(size=(len(ahead), 2)))
-        found += [(t[k], i, *p) for i, p in zip(ahead, pixel.tolist(), strict=True) if 2 < p[0] < 313 and 2 < p[1] < 205]
+        found += [
+            (t[k], i, *p) for i, p in zip(ahead, pixel.tolist(), strict=True) if 2 < p[0] < 313 and 2 < p[1] < 205
+        ]
     w, g, m = (np.arange(0, len(t), step) for step in (20, 10, 20))
     noise = 0.0007 * (rng.normal(size=len(m)) + 1j * rng.normal(size=len(m)))
     return {
@@ -170,7 +172,10 @@ def test_the_command_reads_a_log(log: Path, capsys: pytest.CaptureFixture[str]) 
     assert "clocks" in tomllib.loads((log.parent / "calibration.toml").read_text(encoding="utf-8"))
 
 
-MAP = 'environment = "crossing_path"\nnames = "authors"\nmarkers = {{ SL1 = 1 }}\n{}\n[[cars]]\nname = "svea3"\nagent = 8\n'
+MAP = (
+    'environment = "crossing_path"\n'
+    'names = "authors"\nmarkers = {{ SL1 = 1 }}\n{}\n[[cars]]\nname = "svea3"\nagent = 8\n'
+)
 BAD: list[tuple[list[str], str]] = [
     (["nowhere.mcap"], "nowhere.mcap"),
     (["nowhere.bag"], "nowhere.bag: needs the map of its topics, --map topics.toml"),
