@@ -90,8 +90,8 @@ LINES_AND_FILES = {
     "backends": (3275, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
-    "cars": (7090, 35),
-    "cli": (2065, 7),
+    "cars": (8070, 39),
+    "cli": (2130, 8),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
@@ -99,7 +99,7 @@ LINES_AND_FILES = {
     "runs": (3060, 13),
     "scenario": (3095, 12),
     "training": (1360, 5),
-    "viz": (4450, 17),
+    "viz": (4500, 18),
     "world": (4312, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -82,7 +82,7 @@ def car_of(
     """
     camera, start = scenario.cameras[vehicle], scenario.vehicles[vehicle].initial_pose
     pixel = np.zeros((len(ray), 2)) if lens is None else np.round(image(ray, lens), 3)
-    place = {"mounting": camera.to_body(), "lever": np.array(camera.position), "pixel": pixel}
+    place: dict[str, Any] = {"mounting": camera.to_body(), "lever": np.array(camera.position), "pixel": pixel}
     measured.setdefault("height", start.position[2] if start is not None and start.position is not None else 0.0)
     car = CarDrive(name=name, vehicle=vehicle, lens=lens, ray=ray, **place, **measured)
     rows = np.arange(len(ray))

@@ -18,10 +18,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
-    FRAME,
     LENS,
     LEVER,
-    PER_CAR,
     ROT,
     SCALE,
     TRUTH_TIME,
@@ -68,29 +66,43 @@ class Calibrated:
     noise: dict[str, float]  # measured, by key of an environment
 
 
-def hypotheses(batch: Batch) -> Iterator[tuple[str, NDArray[np.int64]]]:
-    """Yield the names and constants of what may be wrong."""
-    for c, car in enumerate(batch.cars):
-        own = np.arange(len(batch.kinds))[batch.own(c)]
-        groups = {
-            **{kind.name: own[[n]] for n, kind in enumerate(PER_CAR[:6])},
-            "camera orientation": own[ROT],
-            "camera position": own[LEVER],
-            "camera mounting": own[:6],
-            "camera focal length": own[6:8],
-            "camera principal point": own[8:10],
-            "camera distortion": own[10:15],
-            "camera intrinsics": own[LENS],
-            **{kind.name: own[[n]] for n, kind in enumerate(PER_CAR) if kind.unit == "s"},
-            "camera and truth offset": own[[CAMERA_TIME, TRUTH_TIME]],
-            "truth.body_yaw": own[[20]],
-            "truth body position": own[21:23],
-        }
-        yield from ((f"{car.name}: {name.replace('.', ' ')}", columns) for name, columns in groups.items())
+PARTS = {
+    "camera orientation": ("camera.roll", "camera.pitch", "camera.yaw"),
+    "camera position": ("camera.x", "camera.y", "camera.z"),
+    "focal length": ("camera.fx", "camera.fy"),
+    "principal point": ("camera.cx", "camera.cy"),
+    "lens distortion": ("camera.k1", "camera.k2", "camera.p1", "camera.p2", "camera.k3"),
+    "wheel scale": ("wheel.scale",),
+    "gyro bias": ("gyro.bias",),
+    "stamps": ("camera.offset", "wheel.offset", "truth.offset"),
+    "body of motion capture": ("truth.body_yaw", "truth.body_x", "truth.body_y"),
+}
+"""Constants of a car that are wrong together, and that a line of the verdict names together."""
+ALSO = (
+    *(PARTS["camera orientation"] + PARTS["camera position"], PARTS["focal length"] + PARTS["principal point"]),
+    PARTS["focal length"] + PARTS["principal point"] + PARTS["lens distortion"],
+    ("camera.offset", "truth.offset"),
+)
+"""Further hypotheses."""
+
+
+def parts_of(batch: Batch) -> dict[str, list[int]]:
+    """Return the constants that a line of the verdict names together, by its title."""
+    number = {kind.name: n for n, kind in enumerate(batch.kinds)}
+    found = {f"{car.name}: {title}": [number[f"{car.name}.{name}"] for name in names]
+             for car in batch.cars for title, names in PARTS.items()}  # fmt: skip
     for i, name in enumerate(batch.drive.landmarks):
-        yield f"marker {name}", np.arange(len(batch.kinds))[batch.marker(i)]
-    if any(batch.truth):
-        yield "frame of motion capture", np.arange(batch.frame, len(batch.kinds))
+        found[f"marker {name}: position"] = list(range(batch.marker(i).start, batch.marker(i).stop))
+    return found | {"frame of motion capture": list(range(batch.frame, len(batch.kinds)))}
+
+
+def hypotheses(batch: Batch) -> list[NDArray[np.int64]]:
+    """Return the groups of constants that may be wrong."""
+    number = {kind.name: n for n, kind in enumerate(batch.kinds)}
+    groups = [*parts_of(batch).values()]
+    groups += [[number[f"{car.name}.{name}"] for name in names] for car in batch.cars for names in ALSO]
+    groups += [[n] for n, kind in enumerate(batch.kinds[: batch.markers]) if kind.unit in ("deg", "m", "s")]
+    return [np.array(group) for group in groups if batch.known[group].all()]
 
 
 def exchanged(batch: Batch) -> list[tuple[int, int]]:
@@ -125,7 +137,7 @@ def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
     pairs = exchanged(batch)
     given = fit = batch.fit(batch.begin())
     count = sum(len(batch.times(c)) for c in range(len(batch.cars)))
-    groups = [(name, columns) for name, columns in hypotheses(batch) if batch.known[columns].all()]
+    groups = hypotheses(batch)
     for _ in range(MOST):
         ranked = sorted(gains(batch, fit, groups, count), key=lambda entry: -entry[0])[:TRIED]
         tried = [batch.fit(replace(fit, free=fit.free | np.isin(np.arange(len(fit.x)), group))) for _, group in ranked]
@@ -153,12 +165,12 @@ def penalty(more: Mask, count: int) -> float:
 
 
 def gains(
-    batch: Batch, fit: Fit, groups: Sequence[tuple[str, NDArray[np.int64]]], count: int
+    batch: Batch, fit: Fit, groups: Sequence[NDArray[np.int64]], count: int
 ) -> Iterator[tuple[float, NDArray[np.int64]]]:
     """Yield by how much each group would lower the cost, less its penalty, if the residuals were linear."""
     columns = np.flatnonzero(batch.known)
     system = batch.solved(fit, columns)
-    for _, group in groups:
+    for group in groups:
         both = np.flatnonzero(fit.free[columns] | np.isin(columns, group))
         if (more := ~fit.free[group]).any():
             gain = 0.5 * float(system.g[both] @ np.linalg.solve(system.S[np.ix_(both, both)], system.g[both]))
@@ -190,74 +202,36 @@ def wrong(batch: Batch, fit: Fit, error: Array) -> Mask:
 
 def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]) -> Calibrated:
     """Return the wrong constants with the others as given, and the others estimated all together."""
-    error = errors(batch, fit)
-    bad, wide = wrong(batch, fit, error), batch.prior
-    free = np.array([kind.name.startswith(tuple(TIGHT)) for kind in batch.kinds]) & ~fit.free
-    batch.prior = np.where(
-        free, [next((v for k, v in TIGHT.items() if kind.name.startswith(k)), 0.0) for kind in batch.kinds], wide
-    )
+    error, wide = errors(batch, fit), batch.prior
+    bad = wrong(batch, fit, error)
+    tight = [next((std for begin, std in TIGHT.items() if kind.name.startswith(begin)), np.inf) for kind in batch.kinds]
+    batch.prior = np.where(fit.free, wide, np.minimum(tight, wide))
     whole = batch.fit(replace(fit, free=batch.known))
-    together = errors(batch, whole)
-    rows = []
-    for n in np.flatnonzero(batch.known):
-        kind, taken = batch.kinds[n], fit.free[n]
-        value, std = (fit.x[n], error[n]) if taken else (whole.x[n], together[n])
-        loose = std > batch.prior[n] / np.sqrt(2.0)  # by the drive alone it exceeds the prior
-        factor = np.degrees(1.0) if kind.unit == "deg" else 1.0
-        base = batch.base[n]
-        rows.append(
-            Row(
-                kind.name,
-                kind.unit,
-                base * factor,
-                (base + value) * factor,
-                std * factor,
-                "wrong" if bad[n] else "not determined by this drive" if loose else "",
-            )
-        )
+    x, error = np.where(fit.free, fit.x, whole.x), np.where(fit.free, error, errors(batch, whole))
+    loose = error > batch.prior / np.sqrt(2.0)  # by the drive alone it exceeds the prior
     batch.prior = wide
-    return Calibrated(batch, given, fit, tuple(rows), tuple(_lines(batch, rows, pairs)), _noise(batch, fit))
-
-
-PARTS = {
-    "camera orientation": ("camera.roll", "camera.pitch", "camera.yaw"),
-    "camera position": ("camera.x", "camera.y", "camera.z"),
-    "camera focal length": ("camera.fx", "camera.fy"),
-    "camera principal point": ("camera.cx", "camera.cy"),
-    "lens distortion": ("camera.k1", "camera.k2", "camera.p1", "camera.p2", "camera.k3"),
-    "wheel scale": ("wheel.scale",),
-    "gyro bias": ("gyro.bias",),
-    "stamps": ("camera.offset", "wheel.offset", "truth.offset"),
-    "body of motion capture": ("truth.body_yaw", "truth.body_x", "truth.body_y"),
-}
-"""Constants that a line of the verdict names together."""
-
-
-def _lines(batch: Batch, rows: Sequence[Row], pairs: Sequence[tuple[int, int]]) -> Iterator[str]:
-    """Yield the verdict."""
+    rows = {}
+    for n in np.flatnonzero(batch.known):
+        kind, factor = batch.kinds[n], np.degrees(1.0) if batch.kinds[n].unit == "deg" else 1.0
+        finding = "wrong" if bad[n] else "not determined by this drive" if loose[n] else ""
+        old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
+        rows[int(n)] = Row(kind.name, kind.unit, old, value, std, finding)
     names = batch.drive.landmarks
-    for i, j in pairs:
-        yield f"markers {names[i]} and {names[j]} are exchanged"
-    bad = {row.name: row for row in rows if row.finding == "wrong"}
-    groups = [
-        (f"{car.name}: {title}", [f"{car.name}.{part}" for part in parts])
-        for car in batch.cars
-        for title, parts in PARTS.items()
-    ]
-    groups += [(f"marker {name}: position", [f"marker.{name}.{axis}" for axis in "xyz"]) for name in names]
-    groups += [("frame of motion capture", [kind.name for kind in FRAME])]
-    for title, parts in groups:
-        found = [bad[part] for part in parts if part in bad]
-        told = [
-            f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}".strip() for r in found
-        ]
-        if told:
-            yield f"{title} is wrong: {', '.join(told)}"
+    lines = [f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs]
+    for title, part in parts_of(batch).items():
+        found = [rows[n] for n in part if bad[n]]
+        told = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
+        lines += [f"{title} is wrong: {', '.join(told)}"] if told else []
+    for c, car in enumerate(batch.cars):
+        late = batch.own(c).start + np.array([CAMERA_TIME, TRUTH_TIME])
+        if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
+            lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
+    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), _noise(batch, fit))
 
 
 def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
     """Return the noise that was measured, by key of an environment."""
-    rate = batch.drive.scenario.rates.odometry
+    rate = batch.rate(batch.cars[0])
     focal = [1.0 if car.lens is None else car.lens.focal_length[0] for car in batch.cars]
     return {
         "noise.bearing.scale": float(np.mean(fit.sigma[:, 0] / focal)),
@@ -293,7 +267,7 @@ def toml_text(result: Calibrated) -> str:
         "[overrides]",
     ]
     lines += [f'"{key}" = {value}' for key, value in overrides(result).items()]
-    offsets = {}
+    offsets: dict[str, float] = {}
     for c, car in enumerate(result.batch.cars):
         values = (result.batch.base + result.fit.x)[result.batch.own(c)][CAMERA_TIME : TRUTH_TIME + 1]
         offsets |= {

@@ -113,7 +113,7 @@ ROWS: list[tuple[dict[str, Any], str, dict[str, float]]] = [
     ({"lever": LEVER - [0, 0, 0.02]}, "car: camera position", {"car.camera.z": 0.2233}),
     ({"lever": np.array([0.12, 0, 0.15])}, "car: camera position", {"car.camera.x": 0.3218, "car.camera.z": 0.2233}),
     ({"lens": NO_DISTORTION}, "car: lens distortion", {"car.camera.k1": -0.352043, "car.camera.k2": 0.137879}),
-    ({"lens": OTHER_FOCUS}, "car: camera focal length", {"car.camera.fx": 213.161906, "car.camera.fy": 213.521038}),
+    ({"lens": OTHER_FOCUS}, "car: focal length", {"car.camera.fx": 213.161906, "car.camera.fy": 213.521038}),
     ({"markers": EXCHANGED}, "markers M0 and M1 are exchanged", {}),
     ({"markers": MOVED}, "marker M2: position", {"marker.M2.x": 1.6}),
     ({"late": 0.12}, "car: stamps", {"car.camera.offset": -0.12}),
