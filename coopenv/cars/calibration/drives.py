@@ -88,7 +88,9 @@ def car_of(
     rows = np.arange(len(ray))
     if lens is not None:
         rows = np.flatnonzero(((pixel > 1.5) & (pixel < np.array(lens.image_size) - 2.5)).all(axis=-1))
-    if min(len(rows), len(car.wheel_time) - 1, len(car.gyro_time) - 1) > 0:
+    if min(len(car.wheel_time), len(car.gyro_time)) < 3:
+        raise DataError(f"{where}: {name} has too few velocities or turn rates for a calibration")
+    if len(rows):
         time = np.arange(car.time.min(), car.time.max() + SMOOTH, SMOOTH)
         speed, turn = (
             np.abs(np.interp(time, t, np.convolve(v, np.ones(n) / n, "same")))

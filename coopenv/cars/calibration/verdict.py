@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import (
     BIAS,
     CAMERA_TIME,
@@ -38,6 +39,8 @@ FINEST = {"deg": 0.0035, "m": 0.004, "px": 1.0, "": 0.01, "rad/s": 0.002, "s": 0
 """By unit (rad for deg), the least deviation that counts as wrong."""
 
 
+LARGEST_PIXEL, LARGEST_ANGLE, LARGEST_PLACE = 4.0, 0.02, 0.1
+"""Standard deviations of residuals (pixels; rad without pixels; m of motion capture) above which nothing fits."""
 TIGHT = {"marker": 0.01, "truth.frame": 0.01}
 """By the begin of a name, the prior (m, rad) in the estimate of all constants together: the map is surveyed."""
 
@@ -131,9 +134,16 @@ def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
     """Return constants and verdict of a drive; `truth`: whether motion capture counts.
 
     Raises:
-        DataError: no pose can be found.
+        DataError: the poses of a car are not determined.
     """
-    batch = Batch(drive, truth)
+    try:
+        return _calibrated(Batch(drive, truth))
+    except np.linalg.LinAlgError as error:
+        names = ", ".join(car.name for car in drive.cars)
+        raise DataError(f"{names}: the drive does not determine the poses ({error})") from None
+
+
+def _calibrated(batch: Batch) -> Calibrated:
     pairs = exchanged(batch)
     given = fit = batch.fit(batch.begin())
     count = sum(len(batch.times(c)) for c in range(len(batch.cars)))
@@ -202,8 +212,10 @@ def wrong(batch: Batch, fit: Fit, error: Array) -> Mask:
 
 def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]) -> Calibrated:
     """Return the wrong constants with the others as given, and the others estimated all together."""
+    unexplained = list(_unexplained(batch, fit))
+    fit = given if unexplained else fit
     error, wide = errors(batch, fit), batch.prior
-    bad = wrong(batch, fit, error)
+    bad = wrong(batch, fit, error) & (not unexplained)
     tight = [next((std for begin, std in TIGHT.items() if kind.name.startswith(begin)), np.inf) for kind in batch.kinds]
     batch.prior = np.where(fit.free, wide, np.minimum(tight, wide))
     whole = batch.fit(replace(fit, free=batch.known))
@@ -217,7 +229,7 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         old, value, std = (factor * float(v) for v in (batch.base[n], batch.base[n] + x[n], error[n]))
         rows[int(n)] = Row(kind.name, kind.unit, old, value, std, finding)
     names = batch.drive.landmarks
-    lines = [f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs]
+    lines = [*unexplained, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
     for title, part in parts_of(batch).items():
         found = [rows[n] for n in part if bad[n]]
         told = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
@@ -227,6 +239,15 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
     return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), _noise(batch, fit))
+
+
+def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
+    """Yield a line per car whose residuals no constant explains."""
+    for car, (seen, place, _), truth in zip(batch.cars, fit.sigma, batch.truth, strict=True):
+        unit, most = ("rad", LARGEST_ANGLE) if car.lens is None else ("px", LARGEST_PIXEL)
+        if seen > most or (truth and place > LARGEST_PLACE):
+            off = f"{seen:.3g} {unit}" + (f" and {place:.3g} m of motion capture" if truth else "")
+            yield f"{car.name}: no constant explains the residuals ({off}): check landmarks, markers, frames and clocks"
 
 
 def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
