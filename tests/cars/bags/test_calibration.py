@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.base.errors import DataError
 from coopenv.cars.calibration.drives import CarDrive, Drive
 from coopenv.cars.calibration.verdict import Calibrated, calibrate, toml_text
 from coopenv.cars.readings import Calibration, rays
@@ -202,3 +203,21 @@ def test_bad_input_is_one_line(arguments: list[str], line: str, log: Path, monke
         assert main(short) == 0
     assert line in refused("calibrate", *[str(log) if a == "LOG" else a for a in arguments], "--out", "results")
     assert not Path("results").exists()
+
+
+def test_residuals_that_nothing_explains_are_no_calibration() -> None:
+    given = drive()
+    pixel = np.random.default_rng(0).uniform(5.0, 200.0, given.cars[0].pixel.shape)
+    result = calibrate(replace(given, cars=(replace(given.cars[0], pixel=pixel),)), truth=False)
+    assert [line[:40] for line in result.verdict] == ["car: no constant explains the residuals "]
+    assert not any(row.finding == "wrong" for row in result.rows)
+
+
+def test_one_landmark_is_too_few_without_motion_capture() -> None:
+    given = drive()
+    one = given.cars[0].target == 0
+    rows = {name: getattr(given.cars[0], name)[one] for name in ("time", "target", "ray", "pixel")}
+    alone = replace(given, cars=(replace(given.cars[0], **rows),))
+    with pytest.raises(DataError, match="two static landmarks are never seen within 6 s"):
+        calibrate(alone, truth=False)
+    assert not calibrate(alone).verdict
