@@ -37,9 +37,8 @@ def residual_figure(result: Calibrated, c: int) -> Figure:
             house.draw_band(truth, car.truth_time, off, house.bins_of(4.5), color=colour, label=label)
     if car.lens is not None:
         width, height = car.lens.image_size
-        image.set(
-            xlim=(0, width), ylim=(height, 0), aspect="equal", title="Residuals in the image, drawn 10 times as long"
-        )
+        image.set(xlim=(0, width), ylim=(height, 0), aspect="equal")
+        image.set_title("Residuals of sightings in the image, 10 times as long", **house.TEXT)
         house.tidy(image, x_label="u [px]", y_label="v [px]")
     else:
         image.axis("off")
