@@ -51,7 +51,7 @@ def residual_figure(result: Calibrated, c: int) -> Figure:
     if not len(parts[0][2]):
         truth.axis("off")
         truth.text(0.5, 0.5, "no motion capture", ha="center", transform=truth.transAxes, **house.TEXT)
-    marks.legend(fontsize=house.SMALL, frameon=False)
+    figure.legend(*marks.get_legend_handles_labels(), loc="upper right", fontsize=house.SMALL, frameon=False)
     figure.suptitle(f"Residuals of {car.name}", fontsize=house.NORMAL)
     house.explain(figure, "Lines: medians; bands: 10 to 90 %.")
     figure.tight_layout()
