@@ -21,7 +21,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
-from coopenv.cars.transport.base import SECURE, address_of
+from coopenv.cars.transport.base import SECURE, UNIX, address_of
 
 
 class Tls(Section):
@@ -44,7 +44,7 @@ class Tls(Section):
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 
 WIRES = {
-    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp")),
+    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp", UNIX)),
     "nats": ("nats/127.0.0.1:4222", ("nats", "tcp", "tls")),
     "ros1": ("tcp/127.0.0.1:11311", ("tcp",)),
 }
@@ -80,7 +80,7 @@ class NetworkSettings(Section):
             secure = address_of(endpoint).protocol in SECURE
             if secure and self.tls is None:
                 raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
-            if not secure and self.tls is not None:
+            if not secure and self.tls is not None and address_of(endpoint).protocol != UNIX:
                 raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
         return self
 
@@ -90,7 +90,7 @@ class GateLink(Section):
 
     connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
     """Endpoint, on the car, of its own bridge, router or ROS master for its gate and `coopenv svea health` (default: on
-    the loopback, at its usual port)."""
+    the loopback, at its usual port). With `docker/car-zenoh.json5`: `unixsock-stream//run/coopenv/zenoh.sock`."""
 
 
 MOST_CHANNELS = 18

@@ -150,6 +150,8 @@ def gate(
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
     with closing(open_transport(fleet)) as transport:
         link = attach(transport, CLOCK)
+        if fleet.network.kind == "zenoh":
+            link.guard()
         interrupts.note(f"{car} is in neutral")
         if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -165,22 +167,45 @@ def health(
     off_board: options.OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="s to wait for it.")] = 2.0,
 ) -> None:
-    """Wait for the next status of a car's gate and print it; the exit status is 2 where none comes.
+    """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
 
-    On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
+    The exit status is 2 where no status comes, or where the command gets through: the gate notices it and stops the
+    car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
+    --connect ROUTER --off-board.
     """
+    from coopenv.cars.backend.station import BYPASSED, FOREIGN, neutral_command
+    from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import Role
+    from coopenv.cars.transport.base import LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     topic = fleet.profile.topic_of(car, Role.GATE)
     with closing(open_transport(fleet)) as transport:
         status = next_status(transport, topic, patience)
-    if status is None:
-        raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
-    refused = sum(int(count) for count in status.counts)
-    print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
+        if status is None:
+            raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
+        refused = sum(int(count) for count in status.counts)
+        print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
+        if fleet.network.kind != "zenoh":
+            return
+        foreign = _count(status, FOREIGN)
+        try:
+            with closing(open_transport(load_deployment(deployment, connect if off_board else None))) as outside:
+                outside.publish(*neutral_command(fleet.profile, car), reliable=True)
+                for _ in range(2):  # the first may have been under way
+                    status = next_status(transport, topic, patience) or status
+        except LinkError as error:
+            print(f"{car}: not tried from outside: {error}")
+            return
+    if _count(status, FOREIGN) > foreign:
+        raise CoopenvError(f"{car}: {BYPASSED}")
+    print(f"{car}: a command to its wheels from outside does not get through")
+
+
+def _count(status: Any, reason: str) -> int:
+    return int(dict(zip(status.rejections, status.counts, strict=True)).get(reason, 0))
 
 
 def next_status(transport: "Transport", topic: str, patience: float) -> Any | None:
@@ -242,15 +267,19 @@ def router(
         list[str] | None,
         typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="File of Zenoh (JSON5), e.g. docker/car-zenoh.json5. --listen replaces its endpoints."),
+    ] = None,
 ) -> None:
     """Run a Zenoh router until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.transport.zenoh import open_zenoh
 
-    endpoints = listen or ["tcp/127.0.0.1:7447"]
-    with closing(open_zenoh("router", listen=endpoints)):
+    endpoints = listen or ([] if config else ["tcp/127.0.0.1:7447"])
+    with closing(open_zenoh("router", listen=endpoints, config=config)):
         interrupts.note("the router is gone")
-        print(f"router ready at {', '.join(endpoints)}", flush=True)
+        print(f"router ready at {', '.join(endpoints) or f'the endpoints of {config}'}", flush=True)
         threading.Event().wait()
 
 

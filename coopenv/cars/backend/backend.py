@@ -94,10 +94,10 @@ class Svea:
         cars, others = tuple(self._local), tuple(name for name in fleet if name not in self._local)
         self._odometry = VELOCITY[deployment.sensors.odometry]
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
-        identity = deployment.security.identity
+        identity, zenoh = deployment.security.identity, deployment.network.kind == "zenoh"
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
         self.station = Station(transport, self.intake.topics, verifier, signers)
-        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile)
+        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
         self.monitor = LinkMonitor(deployment.safety.judge)
         self.watchdog = Watchdog(

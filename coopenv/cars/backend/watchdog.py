@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
+from coopenv.cars.backend.station import BYPASSED, FOREIGN, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
@@ -210,7 +210,8 @@ class Watchdog:
             if gate.age > OLD:
                 yield car, f"its gate is silent for {gate.age:.2f} s"
             elif gate.state not in OPEN:
-                yield car, f"its gate is {gate.state}"
+                foreign = self._gates.refused(car).get(FOREIGN)
+                yield car, f"its gate is {gate.state}" + (f": {foreign} {BYPASSED}" if foreign else "")
             elif gate.session != self._gates.session:
                 yield car, "another station has armed its gate"
         missed, beat = self._safety.missed_deadlines, self._beat
