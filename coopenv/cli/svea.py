@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
 svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None)
+HARMED = 1
+"""Exit status of an attack that got through."""
 STOPPED = 3
 """Exit status of a run that was stopped: by the watchdog, a person or another station."""
 
@@ -281,6 +283,53 @@ def router(
         interrupts.note("the router is gone")
         print(f"router ready at {', '.join(endpoints) or f'the endpoints of {config}'}", flush=True)
         threading.Event().wait()
+
+
+@svea.command()
+def attack(
+    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="A fleet at a stand.")],
+    commands: Annotated[int, typer.Option(min=1, help="Messages of all kinds together, at least.")] = 10_000,
+    host: Annotated[
+        list[str] | None, typer.Option(help="Address of a car, whose open ports are looked for. Repeatable.")
+    ] = None,
+    connect: options.Connect = None,
+    seed: options.Seed = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Attack real cars without a question.")] = False,
+) -> None:
+    """Attack a fleet at a stand as a program without keys would: nothing may move a car.
+
+    Lists per kind of attack what was sent, what the gates refused, what got through, and the fastest car. The exit
+    status is 1 where anything got through or a port is open. An armed fleet is refused. Gates are stopped afterwards
+    if anything got through.
+    """
+    from coopenv.cars.attack import Intruder, open_ports, plan, refuse_driven
+    from coopenv.cars.attack import attack as attacked
+    from coopenv.cars.deployment import load_deployment
+    from coopenv.runs.console import Progress, number_table
+
+    fleet, log, out = load_deployment(deployment, connect), options.console(stderr=True), options.console()
+    cars = [car.name for car in fleet.cars if car.landmark is None]
+    with closing(Intruder(fleet, cars, seed)) as intruder:
+        refuse_driven(intruder)
+        print(plan(intruder, fleet, commands), file=sys.stderr)
+        if not (yes or fleet.fakes) and not (sys.stdin.isatty() and typer.confirm("Attack?", err=True)):
+            raise CoopenvError("no attack on real cars without a yes (--yes)")
+        table = number_table(["\nattack"], ("\nsent", "refused\nby gate", "got\nthrough", "fastest\n[m/s]"))
+        sent, bad = 0, list[str]()
+        with Progress(log, "attacks", len(intruder.kinds())) as progress:
+            for found in attacked(intruder, commands):
+                sent += found.sent
+                bad += [found.what] if found.harmful else []
+                cells = found.sent, found.refused, found.through, f"{found.speed:.2f}"
+                table.add_row(found.what, *map(str, cells))
+                progress.advance()
+    out.print(table)
+    ports = [f"{each}: {port}" for each in host or () for port in open_ports(each)]
+    out.print(f"{len(bad)} of {len(table.rows)} kinds got through, of {sent} messages: {'; '.join(bad) or 'none'}.")
+    if host:
+        out.print(f"Open ports: {', '.join(ports) or 'none of those that should be closed'}.")
+    if bad or ports:
+        raise typer.Exit(HARMED)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -163,6 +163,7 @@ class GateState:
     nonce: str = ""
     stamp: int = 0  # ns, by the clock of the car
     rejections: dict[str, int] = field(default_factory=dict)
+    accepted: int = 0  # commands, since its start
     received: float = float("-inf")  # by the monotonic clock, s
 
     @property
@@ -238,7 +239,8 @@ class Gates:
             if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
                 return
-            self._states[car] = GateState(m.state, m.session, m.nonce, stamp, counts, time.monotonic())
+            known = m.state, m.session, m.nonce, stamp, counts, int(m.accepted)
+            self._states[car] = GateState(*known, time.monotonic())
             if m.state == "stopped" and not self._stopping:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)

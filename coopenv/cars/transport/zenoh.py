@@ -31,16 +31,16 @@ class Zenoh:
     """A Zenoh session as a transport."""
 
     def __init__(self, session: Any, module: Any) -> None:
-        self._session, self._zenoh = session, module
+        self.session, self.library = session, module
         self._kept: list[Any] = []  # a declaration ends with its last reference
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Send, see `Transport`."""
-        z = self._zenoh
+        z = self.library
         with suppress(z.ZError):  # the session is closed
-            self._session.put(
+            self.session.put(
                 topic,
                 payload,
                 attachment=attachment or None,
@@ -59,25 +59,25 @@ class Zenoh:
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             callback(Arrival(str(sample.key_expr), sample.payload.to_bytes(), time.time_ns(), attachment))
 
-        self._kept.append(self._session.declare_subscriber(pattern, arrive))
+        self._kept.append(self.session.declare_subscriber(pattern, arrive))
 
     def announce(self, name: str) -> None:
         """Announce, see `Transport`."""
-        self._kept.append(self._session.liveliness().declare_token(name))
+        self._kept.append(self.session.liveliness().declare_token(name))
 
     def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
         """Watch, see `Transport`."""
 
         def change(sample: Any) -> None:
-            callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+            callback(str(sample.key_expr), sample.kind == self.library.SampleKind.PUT)
 
-        self._kept.append(self._session.liveliness().declare_subscriber(pattern, change, history=True))
+        self._kept.append(self.session.liveliness().declare_subscriber(pattern, change, history=True))
 
     def close(self) -> None:
         """End the session."""
         self._kept.clear()
-        if not self._session.is_closed():
-            self._session.close()
+        if not self.session.is_closed():
+            self.session.close()
 
 
 def library() -> Any:
