@@ -238,6 +238,14 @@ class Safety(Section):
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
     judge: Literal["truth", "estimate"] = "truth"
     """Source of the positions for geofence and separation."""
+    max_error: Positive | None = 1.0
+    """Largest distance between a car's estimated position and that of motion capture, while this is known, m. This and
+    the next two stop all cars when they have been exceeded for 0.2 s."""
+    max_std: Positive | None = None
+    """Largest standard deviation of the estimated position, m."""
+    max_nis: Positive | None = 10.0
+    """Largest normalised innovation squared per degree of freedom, the median over the bearings to static landmarks in
+    the last second: below 1 where all is well. Bearings that the observer rejects count."""
     missed_deadlines: int = Field(default=5, ge=1)
     """Late decisions in a row after which all cars are stopped."""
     min_battery: float = Field(default=0.1, ge=0.0, le=1.0)

@@ -179,7 +179,7 @@ def health(
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import Role
-    from coopenv.cars.transport.base import LinkError
+    from coopenv.cars.transport.base import UNIX, LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
@@ -187,7 +187,9 @@ def health(
     with closing(open_transport(fleet)) as transport:
         status = next_status(transport, topic, patience)
         if status is None:
-            raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
+            unset = not off_board and UNIX not in fleet.gate_connect[0]
+            hint = "; with docker/car-zenoh.json5 set [gate] connect" if unset else ""
+            raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}{hint}")
         refused = sum(int(count) for count in status.counts)
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
         if fleet.network.kind != "zenoh":
