@@ -1,12 +1,13 @@
 """`coopenv svea attack`: what a program without a key can send to standing cars, and whether it moves them."""
 
+import math
 import random
 import socket
 import struct
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -50,10 +51,13 @@ class Intruder:
         """Connect as a client; further sessions are opened by the attacks that need them.
 
         Raises:
-            CoopenvError: the network is not Zenoh, or cannot be reached.
+            CoopenvError: there are no cars, or the network is not Zenoh, or cannot be reached.
         """
-        if deployment.network.kind != "zenoh":
-            raise CoopenvError(f"network.kind: {deployment.network.kind} has no access control to attack; zenoh has")
+        file, kind = deployment.file.name, deployment.network.kind
+        if kind != "zenoh":
+            raise CoopenvError(f"{file}: network.kind: {kind} has no access control to attack, zenoh has")
+        if not cars:
+            raise CoopenvError(f"{file}: cars: all are landmarks, none is driven")
         self.profile, self.cars, self._random = deployment.profile, cars, random.Random(seed)
         self._speed = deployment.limits.speed
         self._stack = ExitStack()
@@ -62,8 +66,8 @@ class Intruder:
         self.observer = self._stack.enter_context(closing(self._open("client")))
         verifier = None if deployment.keys is None else load_verifier(deployment.keys)
         self.gates = Gates(self.observer, tuple(cars), deployment.limits, None, verifier, self.profile)
-        self.speeds = dict.fromkeys(cars, 0.0)
-        """Fastest since the attack of a kind has begun, m/s."""
+        self.speeds = dict.fromkeys(cars, math.nan)
+        """Fastest since the attack of a kind has begun, m/s; NaN: no message of the wheels has come."""
         self._seen: dict[str, bytes] = {}
         role = VELOCITY[deployment.sensors.odometry][0]
         for car in cars:
@@ -87,7 +91,7 @@ class Intruder:
         with suppress(CoopenvError):
             value = read(role, decode(arrival.payload, self.profile.topics[role].type))
             if isinstance(value, Twist) and value.linear is not None:
-                self.speeds[car] = max(self.speeds[car], float(np.linalg.norm(value.linear)))
+                self.speeds[car] = float(np.fmax(self.speeds[car], np.linalg.norm(value.linear)))
 
     def session(self, mode: str = "client") -> Any:
         """Return the Zenoh session of a mode, which is opened where there is none."""
@@ -264,10 +268,8 @@ class Outcome:
     """Messages that the gates have counted as refused."""
     through: int = 0
     """Commands that a gate accepted or found at the wheels, and answers to queries."""
-    speed: float = 0.0
-    """Of the fastest car, m/s."""
-    cars: set[str] = field(default_factory=set)
-    """Cars that it got through to."""
+    speed: float = math.nan
+    """Of the fastest car, m/s; NaN: not known."""
 
     @property
     def harmful(self) -> bool:
@@ -296,7 +298,7 @@ def refuse_driven(intruder: Intruder) -> None:
     """Refuse cars that are armed, move, or whose gate is silent. Raises CoopenvError: there is one."""
     until = time.monotonic() + PATIENCE + STOP
     while True:
-        intruder.speeds = dict.fromkeys(intruder.cars, 0.0)
+        intruder.speeds = dict.fromkeys(intruder.cars, math.nan)
         time.sleep(SETTLE)
         found = [why for car in intruder.cars if (why := _driven(intruder, car))]
         if not found:
@@ -339,18 +341,20 @@ def _look(intruder: Intruder, found: Outcome, before: Mapping[str, Any]) -> Outc
         passed = new.pop(FOREIGN, 0) + gate.accepted - before[car].accepted + (gate.state in OPEN)
         found.refused += sum(new.values())
         found.through += passed
-        found.speed = max(found.speed, intruder.speeds[car])
-        if passed or intruder.speeds[car] > MOVES:
-            found.cars.add(car)
+        found.speed = float(np.fmax(found.speed, intruder.speeds[car]))
     return found
 
 
 def open_ports(host: str) -> list[str]:
-    """Return the ports of a car that should be closed and are not, in words."""
+    """Return the ports of a car that should be closed and are not, in words. Raises CoopenvError: no such address."""
+    try:
+        socket.getaddrinfo(host, None)
+    except OSError as error:
+        raise CoopenvError(f"--host {host}: {error.strerror}") from None
     found = []
     for port, what in PORTS.items():
         with suppress(OSError), socket.create_connection((host, port), 0.5):
-            found.append(f"{port} ({what})")
+            found.append(f"{host}: {port} ({what})")
     return found
 
 

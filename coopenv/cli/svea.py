@@ -8,6 +8,7 @@ import threading
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
+from math import isnan
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TYPE_CHECKING, Annotated, Any
@@ -311,6 +312,7 @@ def attack(
 
     fleet, log, out = load_deployment(deployment, connect), options.console(stderr=True), options.console()
     cars = [car.name for car in fleet.cars if car.landmark is None]
+    ports = [port for each in host or () for port in open_ports(each)]
     with closing(Intruder(fleet, cars, seed)) as intruder:
         refuse_driven(intruder)
         print(plan(intruder, fleet, commands), file=sys.stderr)
@@ -322,11 +324,11 @@ def attack(
             for found in attacked(intruder, commands):
                 sent += found.sent
                 bad += [found.what] if found.harmful else []
-                cells = found.sent, found.refused, found.through, f"{found.speed:.2f}"
+                speed = "?" if isnan(found.speed) else f"{found.speed:.2f}"
+                cells = found.sent, found.refused, found.through, speed
                 table.add_row(found.what, *map(str, cells))
                 progress.advance()
     out.print(table)
-    ports = [f"{each}: {port}" for each in host or () for port in open_ports(each)]
     out.print(f"{len(bad)} of {len(table.rows)} kinds got through, of {sent} messages: {'; '.join(bad) or 'none'}.")
     if host:
         out.print(f"Open ports: {', '.join(ports) or 'none of those that should be closed'}.")
