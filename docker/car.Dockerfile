@@ -17,7 +17,7 @@ USER coopenv
 ENV CAR=svea7
 # No port is exposed: the gate connects to the car's own bridge or router, [gate] connect, and not to what network.connect
 # names, which the radio may part it from. With car-zenoh.json5 that is the unix socket in /run/coopenv, to be mounted.
-HEALTHCHECK --interval=5s --timeout=5s --start-period=10s --retries=3 \
+HEALTHCHECK --interval=5s --timeout=10s --start-period=10s --retries=3 \
     CMD coopenv svea health /etc/coopenv/fleet.toml --car "$CAR"
 
 # Neutral goes out before the gate does.

@@ -91,7 +91,7 @@ LINES_AND_FILES = {
     "base": (1400, 9),
     "bench": (4535, 18),
     "cars": (7630, 36),
-    "cli": (2145, 7),
+    "cli": (2150, 7),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),

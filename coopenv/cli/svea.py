@@ -197,7 +197,8 @@ def health(
             return
         foreign = _count(status, FOREIGN)
         try:
-            with closing(open_transport(load_deployment(deployment, connect if off_board else None))) as outside:
+            lab = load_deployment(deployment, connect if off_board else None)
+            with closing(open_transport(lab, timeout=1.0)) as outside:
                 outside.publish(*neutral_command(fleet.profile, car), reliable=True)
                 for _ in range(2):  # the first may have been under way
                     status = next_status(transport, topic, patience) or status
