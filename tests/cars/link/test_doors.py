@@ -93,6 +93,34 @@ def test_queries_and_the_administration_get_no_answer(doors: Doors) -> None:
     kept.undeclare()
 
 
+def test_a_bridge_in_the_router_itself_is_behind_the_same_doors(tmp_path: Path) -> None:
+    """Subscriptions, services and publications within the process of the router, as those of zenoh-bridge-ros2dds."""
+    inside, outside, asked = f"unixsock-stream/{tmp_path}/car.sock", free_endpoint(), list[Any]()
+    wheels, seen = list[tuple[str, bytes]](), list[str]()
+    with ExitStack() as stack:
+        bridge = stack.enter_context(closing(open_zenoh("router", listen=[inside, outside], config=CAR_FILE)))
+        gate, stranger = (stack.enter_context(closing(open_zenoh("client", [place]))) for place in (inside, outside))
+        kept = [
+            bridge.session.declare_subscriber(
+                WHEELS,
+                lambda sample: wheels.append((str(sample.key_expr), sample.payload.to_bytes())),
+                allowed_origin=zenoh.Locality.REMOTE,
+            ),
+            bridge.session.declare_queryable(f"fleet/{CAR}/mavros/cmd/arming", asked.append),
+            stranger.session.declare_subscriber("fleet/**", lambda sample: seen.append(str(sample.key_expr))),
+        ]
+        time.sleep(0.3)
+        for key in SPELLINGS:
+            stranger.publish(key, DRIVE, reliable=True)
+        assert not list(stranger.session.get(f"fleet/{CAR}/mavros/cmd/arming", timeout=0.3))
+        seen.clear()
+        gate.publish(WHEELS, b"of the gate", reliable=True)
+        bridge.publish(f"fleet/{CAR}/mavros/state", b"", reliable=True)
+        wait_until(lambda: wheels and len(seen) == 2)
+        assert wheels == [(WHEELS, b"of the gate")] and not asked and set(seen) == {WHEELS, f"fleet/{CAR}/mavros/state"}
+        kept.clear()
+
+
 def test_an_open_router_is_noticed_and_no_gate_behind_it_is_armed(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with running("router", endpoint), closing(open_zenoh("client", [endpoint])) as transport:
