@@ -15,9 +15,9 @@ RUN useradd --system --uid 1000 --no-create-home coopenv
 USER coopenv
 
 ENV CAR=svea7
-# No port is exposed: with --network host the gate connects to the car's own bridge or router, [gate] connect, by default
-# tcp/127.0.0.1:7447, and not to what network.connect names, which the radio may part it from.
-HEALTHCHECK --interval=5s --timeout=5s --start-period=10s --retries=3 \
+# No port is exposed: the gate connects to the car's own bridge or router, [gate] connect, and not to what network.connect
+# names, which the radio may part it from. With car-zenoh.json5 that is the unix socket in /run/coopenv, to be mounted.
+HEALTHCHECK --interval=5s --timeout=10s --start-period=10s --retries=3 \
     CMD coopenv svea health /etc/coopenv/fleet.toml --car "$CAR"
 
 # Neutral goes out before the gate does.

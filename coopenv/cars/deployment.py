@@ -21,7 +21,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
-from coopenv.cars.transport.base import SECURE, address_of
+from coopenv.cars.transport.base import SECURE, UNIX, address_of
 
 
 class Tls(Section):
@@ -44,7 +44,7 @@ class Tls(Section):
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 
 WIRES = {
-    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp")),
+    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp", UNIX)),
     "nats": ("nats/127.0.0.1:4222", ("nats", "tcp", "tls")),
     "ros1": ("tcp/127.0.0.1:11311", ("tcp",)),
 }
@@ -80,7 +80,7 @@ class NetworkSettings(Section):
             secure = address_of(endpoint).protocol in SECURE
             if secure and self.tls is None:
                 raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
-            if not secure and self.tls is not None:
+            if not secure and self.tls is not None and address_of(endpoint).protocol != UNIX:
                 raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
         return self
 
@@ -90,7 +90,7 @@ class GateLink(Section):
 
     connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
     """Endpoint, on the car, of its own bridge, router or ROS master for its gate and `coopenv svea health` (default: on
-    the loopback, at its usual port)."""
+    the loopback, at its usual port). With `docker/car-zenoh.json5`: `unixsock-stream//run/coopenv/zenoh.sock`."""
 
 
 MOST_CHANNELS = 18
@@ -238,6 +238,14 @@ class Safety(Section):
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
     judge: Literal["truth", "estimate"] = "truth"
     """Source of the positions for geofence and separation."""
+    max_error: Positive | None = 1.0
+    """Largest distance between a car's estimated position and that of motion capture, while this is known, m. This and
+    the next two stop all cars when they have been exceeded for 0.2 s."""
+    max_std: Positive | None = None
+    """Largest standard deviation of the estimated position, m."""
+    max_nis: Positive | None = 10.0
+    """Largest normalised innovation squared per degree of freedom, the median over the bearings to static landmarks in
+    the last second: below 1 where all is well. Bearings that the observer rejects count."""
     missed_deadlines: int = Field(default=5, ge=1)
     """Late decisions in a row after which all cars are stopped."""
     min_battery: float = Field(default=0.1, ge=0.0, le=1.0)

@@ -233,6 +233,21 @@ def test_cars_that_break_a_rule_are_stopped(lab: Any, tmp_path: Path, safety: st
         assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
 
 
+@pytest.mark.parametrize(("safety", "why"), [("", "m from motion capture"), ("max_error = 1e6\n", "its bearings")])
+def test_cars_stand_before_they_drive_on_a_wrong_estimate(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
+    _, hub, made = lab
+    with closing(env_of(cars(write_fleet(tmp_path, safety=PATIENT + safety), hub))) as env:
+        for car in made:
+            send_fault(hub, car, "swapped_signatures@0+6")
+        env.reset(seed=3, options={"arm": True})
+        before = {car: place(made, car) for car in made}
+        infos = drive(env, 60)
+        assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
+        time.sleep(0.8)
+        assert all(np.linalg.norm(place(made, car) - before[car]) < 0.3 for car in made)
+        time.sleep(4.0)  # the fault is over
+
+
 @pytest.mark.parametrize(
     ("first", "safety", "why", "car"),
     [

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend import status
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.status import StatusBoard
-from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog
+from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote, Safety
 from coopenv.cars.gate.core import Gate, GateClock
@@ -22,6 +23,7 @@ from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist
 from coopenv.cars.transport.base import Arrival
+from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
 from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
@@ -68,6 +70,41 @@ def test_places_come_from_what_judges() -> None:
         monitor.place("a", np.array([np.nan, 0.0, 0.0]), BEGIN + 400 * MS)
         monitor.looked = BEGIN + 401 * MS
         assert monitor.lost("a") == pytest.approx(0.4), "not a number is no place"
+
+
+def test_an_estimate_that_is_wrong_for_long_is_doubted() -> None:
+    monitor, none = LinkMonitor("truth"), np.zeros(0)
+    safety = Safety(max_std=0.5)
+    cases = {
+        "1.2 m from motion capture, safety.max_error = 1": (1.2, 0.1, none),
+        "0.6 m uncertain, safety.max_std = 0.5": (float("nan"), 0.6, none),
+        "20 squared standard deviations from its bearings": (float("nan"), 0.1, np.full(8, 20.0)),
+        "": (0.9, 0.4, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
+    }
+    for said, given in cases.items():
+        monitor.begin(BEGIN)
+        for ms in (0, 100, 190, 210):
+            monitor.looked = BEGIN + ms * MS
+            monitor.judge("a", safety, *given)
+            assert bool(monitor.doubt("a")) == (bool(said) and ms > 200)
+        assert said in monitor.doubt("a") and not monitor.doubt("b")
+        monitor.judge("a", Safety(max_error=None, max_nis=None), *given)
+        assert not monitor.doubt("a")
+
+
+def test_the_innovation_of_bearings_counts_in_standard_deviations() -> None:
+    rng = np.random.default_rng(0)
+    lever, landmarks = np.array([0.3, 0.0, 0.2]), rng.uniform(-4.0, 4.0, (6, 3)) + np.array([0.0, 8.0, 0.0])
+    P, found, wrong = np.diag([4e-4] * 3 + [9e-4] * 3), [], []
+    for _ in range(400):
+        R, p = exp_so3(rng.normal(size=3)), rng.normal(size=3)
+        rays = (landmarks - p) @ R - lever
+        bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True) + rng.normal(0.0, BEARING_STD, (6, 3))
+        theta, place = rng.normal(0.0, 0.02, 3), R.T @ p + rng.normal(0.0, 0.03, 3)  # errors of (2 lambda, p)
+        sent = VehicleBroadcast(0, R @ exp_so3(theta), R @ exp_so3(theta) @ place, P, None)
+        found.append(bearing_nis(sent, landmarks, lever, bearings))
+        wrong.append(bearing_nis(sent, landmarks, lever, bearings[::-1]))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.1) and np.median(wrong) > 50.0
 
 
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
