@@ -7,7 +7,8 @@ FROM python:3.11-slim
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 
 COPY . /src
-RUN pip install --constraint /src/constraints.txt '/src[svea]' && rm -rf /src
+RUN pip install --upgrade 'pip>=25.1' && pip install --no-deps /src \
+    && pip install --constraint /src/constraints.txt --group /src/pyproject.toml:gate && rm -rf /src
 
 # Keys and deployment are mounted here, readable for the user that runs the container and nobody else.
 VOLUME /etc/coopenv

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -239,3 +241,18 @@ def test_it_loads_neither_the_simulation_nor_numpy() -> None:
     )
     loaded = {name.partition(".")[0] for name in result.stdout.split()}
     assert not {"numpy", "warp", "scipy", "matplotlib", "rosbags", "gymnasium"} & loaded
+
+
+@pytest.mark.parametrize("command", ["gate", "health"])
+def test_a_car_needs_only_the_packages_of_its_group(command: str) -> None:
+    root = Path(__file__).resolve().parents[4]
+    with (root / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)
+    needed, small = project["project"]["dependencies"], project["dependency-groups"]["gate"]
+    absent = sorted({re.split("[<>]", each)[0].removesuffix("-lang") for each in {*needed} - {*small}})
+    assert "scipy" in absent and "warp" in absent
+    code = f"import sys; sys.modules |= dict.fromkeys({absent}); from coopenv.cli import main; sys.exit(main())"
+    nowhere = ["--car", "svea7", "--connect", "tcp/127.0.0.1:1"]
+    words = ["svea", command, str(root / "examples/fleet/overtaking.toml"), *nowhere]
+    ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2 and "tcp/127.0.0.1:1: no Zenoh there" in ended.stderr, ended.stderr
