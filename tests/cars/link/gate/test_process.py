@@ -251,8 +251,16 @@ def test_a_car_needs_only_the_packages_of_its_group(command: str) -> None:
     needed, small = project["project"]["dependencies"], project["dependency-groups"]["gate"]
     absent = sorted({re.split("[<>]", each)[0].removesuffix("-lang") for each in {*needed} - {*small}})
     assert "scipy" in absent and "warp" in absent
-    code = f"import sys; sys.modules |= dict.fromkeys({absent}); from coopenv.cli import main; sys.exit(main())"
-    nowhere = ["--car", "svea7", "--connect", "tcp/127.0.0.1:1"]
-    words = ["svea", command, str(root / "examples/fleet/overtaking.toml"), *nowhere]
+    code = f"import sys; sys.argv[0] = 'coopenv'; sys.modules |= dict.fromkeys({absent})"
+    code += "; from coopenv.cli import main; sys.exit(main(sys.argv[1:]))"
+    words = [
+        "svea",
+        command,
+        str(root / "examples/fleet/overtaking.toml"),
+        "--car",
+        CAR,
+        "--connect",
+        "tcp/127.0.0.1:1",
+    ]
     ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2 and "tcp/127.0.0.1:1: no Zenoh there" in ended.stderr, ended.stderr
