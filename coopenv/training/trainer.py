@@ -189,6 +189,11 @@ class NormalisedEnv(VecEnvWrapper):
         """Standard deviations by which observations are divided, (D,)."""
         return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
 
+    def looked_at(self, observations: np.ndarray) -> None:
+        """Add raw observations, (rows, D), to the statistics for normalisation and to the range that was seen."""
+        self.statistics.update(observations)
+        self._seen.append(observations)
+
     def seen(self, columns: slice) -> tuple[float, float]:
         """Return between which values nearly all of some entries of the last observations lay."""
         low, high = np.percentile(np.concatenate(self._seen)[:, columns], (0.1, 99.9))
@@ -207,8 +212,7 @@ class NormalisedEnv(VecEnvWrapper):
         """Step, and update the statistics of the observations of vehicles under way."""
         observations, rewards, dones, infos = self.venv.step_wait()
         if self.venv.acted.any():
-            self.statistics.update(observations[self.venv.acted])
-            self._seen.append(observations[self.venv.acted])
+            self.looked_at(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
         return self.normalise(observations), rewards * self._reward_scale, dones, infos
@@ -334,13 +338,14 @@ class Trainer:
             for place, (each, count) in enumerate(self._scenarios)
         ]
         raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))
-        self.env.statistics.update(raw)
+        self.env.looked_at(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
         values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
         optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
         shuffle = torch.Generator().manual_seed(seed)
         for epoch in range(clone.epochs):
+            optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
             report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
             for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
                 latent_policy, latent_value = policy.mlp_extractor(observations[rows])
@@ -399,7 +404,9 @@ class Trainer:
 
     def _spent(self) -> float:
         steps, seconds = self.plan.settings.budget
-        return min(1.0, self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf))
+        if steps is not None:
+            return min(1.0, self.model.num_timesteps / steps) if steps else 1.0
+        return min(1.0, self.seconds / (seconds or math.inf))
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""
