@@ -196,7 +196,8 @@ class NormalisedEnv(VecEnvWrapper):
 
     def seen(self, columns: slice) -> tuple[float, float]:
         """Return between which values nearly all of some entries of the last observations lay."""
-        low, high = np.percentile(np.concatenate(self._seen)[:, columns], (0.1, 99.9))
+        known = self._seen or [self.statistics.mean + 3.0 * self.std * np.array([[-1.0], [1.0]])]  # none: just resumed
+        low, high = np.percentile(np.concatenate(known)[:, columns], (0.1, 99.9))
         return round(float(low), 4), round(float(high), 4)
 
     def reset(self) -> np.ndarray:
