@@ -27,6 +27,7 @@ class Place:
 
     position: Array  # (3,) m, in the coordinates of the scenario's file
     time: int  # ns, when that was known
+    velocity: Array  # (3,) m/s, the mean over `VELOCITY_TIME`
 
 
 def bearing_nis(sent: VehicleBroadcast, landmarks: Array, lever: Array, bearings: Array) -> Array:
@@ -56,6 +57,7 @@ BEARING_STD = 0.01  # rad, with calibration
 NIS_TIME = 1_000_000_000  # ns over which the median is taken
 FEWEST = 8  # bearings of which it is taken
 LASTING = 0.2  # s
+VELOCITY_TIME = 200_000_000  # ns
 
 
 class LinkMonitor:
@@ -77,6 +79,7 @@ class LinkMonitor:
         self.looked = self._begun = now
         """When messages were looked at last."""
         self._nis: dict[str, deque[tuple[int, float]]] = {}
+        self._recent: dict[str, deque[Place]] = {}
         self._doubts: dict[str, tuple[str, int]] = {}  # why an estimate is wrong, and since when, ns
 
     def put(self, sample: Sample) -> None:
@@ -91,7 +94,14 @@ class LinkMonitor:
     def place(self, car: str, position: Array, time: int) -> None:
         """Set the position of a car, m, and the time at which it was known, ns."""
         if np.isfinite(position).all():
-            self.places = {**self.places, car: Place(position, time)}
+            recent = self._recent.setdefault(car, deque())
+            while len(recent) > 1 and recent[1].time <= time - VELOCITY_TIME:
+                recent.popleft()
+            lasted, velocity = time - recent[0].time if recent else 0, np.zeros(3)
+            if lasted > VELOCITY_TIME // 2:  # noise counts for too much before
+                velocity = (position - recent[0].position) / (lasted * 1e-9)
+            recent.append(Place(position, time, velocity))
+            self.places = {**self.places, car: recent[-1]}
 
     def judge(self, car: str, safety: Safety, error: float, std: float, nis: Array) -> None:
         """Compare an estimate with the limits.
@@ -310,13 +320,25 @@ class Watchdog:
                 rules = {"fence": safety.geofence and car in cars, "separation": apart}
                 by = " and ".join(name for name, judged in rules.items() if judged)
                 yield car, f"its place {unknown}: {by} cannot be judged"
-        places = {car: monitor.places[car].position for car in watched if car in monitor.places}
+        places = {car: monitor.places[car].position[:2] for car in watched if car in monitor.places}
+        ways = {car: self._way_to_stand(monitor.places[car]) for car in places}
         for car in cars:
             if safety.geofence and car in places:
-                x, y = float(places[car][0]), float(places[car][1])
+                (x, y), way = places[car], ways[car]
                 if not inside(safety.geofence, x, y):
                     yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
+                elif not inside(safety.geofence, x + way[0], y + way[1]):
+                    yield car, f"at ({x:.2f}, {y:.2f}) m it needs {np.linalg.norm(way):.2f} m to stand in the geofence"
         for car, other in combinations(places, 2) if apart else ():
-            distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
-            if distance < safety.separation and (car in cars or other in cars):
-                yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"
+            between, nearing = places[car] - places[other], ways[other] - ways[car]
+            now = float(np.linalg.norm(between))  # both stop at once: straight on, in equal shares of their ways
+            share = np.clip(between @ nearing / max(float(nearing @ nearing), 1e-9), 0.0, 1.0)
+            least = float(np.linalg.norm(between - share * nearing))
+            if least < safety.separation and (car in cars or other in cars):
+                near = "" if now < safety.separation else f", and {least:.2f} m where they come to a stand"
+                yield car, f"{now:.2f} m from {other}{near}, {safety.separation:g} m is the least"
+
+    def _way_to_stand(self, place: Place) -> Array:
+        """Return the vector (2,), m, along which a car rolls until it stands, if it is stopped."""
+        speed = float(np.linalg.norm(place.velocity[:2]))
+        return place.velocity[:2] * (self._safety.stopping(speed)[1] / max(speed, 1e-9))

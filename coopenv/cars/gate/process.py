@@ -1,9 +1,12 @@
 """The gate on the network: messages come in by callbacks, the car's command goes out 20 times a second."""
 
+import os
 import secrets
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -120,9 +123,20 @@ class GateConnection:
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
+def tell_systemd(state: str) -> None:
+    """Tell systemd, where it has started this process, that it lives (`WATCHDOG=1`) or is ready (`READY=1`)."""
+    if place := os.environ.get("NOTIFY_SOCKET"):
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.sendto(state.encode(), "\0" + place[1:] if place.startswith("@") else place)
+
+
 def run(link: GateConnection) -> None:
-    """Tick until an exception, such as that of a signal, ends it; the car then gets neutral before that goes on."""
+    """Tick until an exception, such as that of a signal, ends it; the car then gets neutral before that goes on.
+
+    systemd restarts a process that no longer ticks: `WatchdogSec`.
+    """
     due = time.monotonic_ns()
+    tell_systemd("READY=1")
     try:
         while True:
             wait = (due - time.monotonic_ns()) / 1e9
@@ -130,6 +144,7 @@ def run(link: GateConnection) -> None:
                 link.publish_status()
             elif wait <= 0.0 or time.monotonic_ns() >= due:
                 link.tick()
+                tell_systemd("WATCHDOG=1")
                 missed = max(time.monotonic_ns() - due, 0) // PERIOD
                 due += (missed + 1) * PERIOD
     finally:

@@ -138,6 +138,30 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
 
 
+@pytest.mark.parametrize(
+    ("starts", "velocities", "found"),
+    [
+        ({"a": -0.5, "b": 1.0}, {"a": 0.6}, []),  # 0.36 m to a stand
+        ({"a": 0.5, "b": -0.5}, {"a": 0.6}, ["a: at (0.68, 0.00) m it needs 0.36 m to stand in the geofence"]),
+        ({"a": 0.9, "b": -0.5}, {"a": -0.1}, []),  # to the inside
+        ({"a": -0.5, "b": 0.9}, {"a": 0.6, "b": -0.6}, ["a: 1.04 m from b, and 0.32 m where they come to a stand, "]),
+        ({"a": -0.5, "b": 0.3}, {"a": 0.6, "b": 0.6}, []),  # one behind the other
+    ],
+)
+def test_cars_stop_in_time_to_stand_inside_the_fence_and_apart(starts: Any, velocities: Any, found: list[str]) -> None:
+    monitor = LinkMonitor("truth")
+    monitor.begin(BEGIN)
+    for k in range(31):
+        for car, x in starts.items():
+            monitor.place(car, np.array([x + velocities.get(car, 0.0) * 0.01 * k, 0.0, 0.0]), BEGIN + 10 * k * MS)
+    monitor.looked = BEGIN + 310 * MS
+    safety, station = Safety(geofence=CORNERS, separation=0.35), Station(Hub().connect(), (), None, {})
+    watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
+    watchdog.close()
+    told = [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()]
+    assert len(told) == len(found) and all(a.startswith(b) for a, b in zip(told, found, strict=True)), told
+
+
 class Yard:
     """Gates of two cars in this process, and the station's side of them."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -96,6 +97,21 @@ def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
     assert set(station.since(begun)) == {NEUTRAL}
     station.sequence += 10
     station.drive()
+
+
+def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(10.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        process = start_gate(endpoint, tmp_path)
+        assert [systemd.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
+        process.send_signal(signal.SIGSTOP)
+        systemd.settimeout(1.0)
+        with pytest.raises(TimeoutError):
+            for _ in range(50):  # those under way
+                systemd.recv(64)
+        end(process)
 
 
 @pytest.mark.parametrize("duration", [0.2, 2.0])
