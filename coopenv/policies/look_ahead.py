@@ -119,8 +119,7 @@ class LookAhead(RouteFollower):
         left[due] = HOLD
         left -= 1
         heading = self.read(observations, "route_heading")[:, 0]
-        offset = self._first[plan]
-        along = self.pursue(self.direction(observations))
+        offset, along = self._first[plan], self.pursue(self.direction(observations))
         steering = np.where(offset == 0.0, along, self.pursue(offset - heading))
         return np.minimum(self.speed(observations), self._pace[plan] * self.cruise), steering
 
@@ -226,8 +225,7 @@ class LookAhead(RouteFollower):
         points, distance = self.route_points(observations)
         heading = -self.read(observations, "route_heading")[:, 0]
         leg = np.diff(points[:, 1:], axis=1)
-        ahead = np.arctan2(leg[..., 1], leg[..., 0])
-        return np.column_stack([heading, ahead]), distance[:-1]
+        return np.column_stack([heading, np.arctan2(leg[..., 1], leg[..., 0])]), distance[:-1]
 
 
 def _square(line: np.ndarray) -> np.ndarray:

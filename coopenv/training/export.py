@@ -110,10 +110,10 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         },
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
-    alone = plan.settings.clone if plan.settings.steps == 0 else None
+    begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {environment.title}",
-        "description": f"{f'Clone of {alone.agent}' if alone else 'PPO'}, one policy for all vehicles{arm}, seed {plan.seed}.",
+        "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
         "kind": "learned",
         "entry": ENTRY,
         "environments": [environment.name],

@@ -134,12 +134,6 @@ class Settings(Section):
     evaluation: EvaluationSettings = EvaluationSettings()
     clone: Clone | None = None
 
-    @model_validator(mode="after")
-    def _check_steps(self) -> "Settings":
-        if self.steps == 0 and self.clone is None:
-            raise ValueError("steps: 0 is for a clone alone, and there is no clone")
-        return self
-
     @property
     def budget(self) -> tuple[int | None, float | None]:
         """Steps and seconds at which to end; one of them is None."""

@@ -168,7 +168,7 @@ class NormalisedEnv(VecEnvWrapper):
         super().__init__(venv, observation_space=spaces.Box(-clip, clip, shape=shape, dtype=np.float32))
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._reward_scale = clip, reward_scale
-        self._seen: deque[np.ndarray] = deque(maxlen=SEEN)
+        self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
 
     def start(self) -> None:
@@ -189,14 +189,11 @@ class NormalisedEnv(VecEnvWrapper):
         """Standard deviations by which observations are divided, (D,)."""
         return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
 
-    def looked_at(self, observations: np.ndarray) -> None:
-        """Add raw observations, (rows, D), to the statistics for normalisation and to the range that was seen."""
-        self.statistics.update(observations)
-        self._seen.append(observations)
-
     def seen(self, columns: slice) -> tuple[float, float]:
         """Return between which values nearly all of some entries of the last observations lay."""
-        known = self._seen or [self.statistics.mean + 3.0 * self.std * np.array([[-1.0], [1.0]])]  # none: just resumed
+        known = self.looked_at or [
+            self.statistics.mean + 3.0 * self.std * np.array([[-1.0], [1.0]])
+        ]  # none: just resumed
         low, high = np.percentile(np.concatenate(known)[:, columns], (0.1, 99.9))
         return round(float(low), 4), round(float(high), 4)
 
@@ -213,7 +210,8 @@ class NormalisedEnv(VecEnvWrapper):
         """Step, and update the statistics of the observations of vehicles under way."""
         observations, rewards, dones, infos = self.venv.step_wait()
         if self.venv.acted.any():
-            self.looked_at(observations[self.venv.acted])
+            self.statistics.update(observations[self.venv.acted])
+            self.looked_at.append(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
         return self.normalise(observations), rewards * self._reward_scale, dones, infos
@@ -326,20 +324,13 @@ class Trainer:
         """
         policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
-        watched = [
-            watch(
-                each,
-                max(1, clone.episodes * count // all_worlds),
-                clone,
-                ppo.gamma,
-                seed + APART * place,
-                threads,
-                report,
-            )
-            for place, (each, count) in enumerate(self._scenarios)
-        ]
+        watched = []
+        for place, (each, count) in enumerate(self._scenarios):
+            worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
+            watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report))
         raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))
-        self.env.looked_at(raw)
+        self.env.statistics.update(raw)
+        self.env.looked_at.append(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
         values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
@@ -405,9 +396,8 @@ class Trainer:
 
     def _spent(self) -> float:
         steps, seconds = self.plan.settings.budget
-        if steps is not None:
-            return min(1.0, self.model.num_timesteps / steps) if steps else 1.0
-        return min(1.0, self.seconds / (seconds or math.inf))
+        share = self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf)
+        return 1.0 if steps == 0 else min(1.0, share)
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""

@@ -138,7 +138,6 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("[ppo]\nvehicles = 1\ndecisions = 1", r"train\.toml: ppo\.decisions: one decision of one vehicle"),
         ("[ppo]\nhidden = []", r"train\.toml: ppo\.hidden: .*at least 1"),
         ("[clone]\nepisodes = 3", r"train\.toml: clone\.agent: Field required"),
-        ("steps = 0", r"train\.toml: steps: 0 is for a clone alone, and there is no clone"),
         ("steps = 10\nminutes = 1", r"train\.toml: steps and minutes: give one of them"),
         ("scenario = 3", r"train\.toml: scenario: expected a table"),
         ("[environments.facade]\narms = 3", r"train\.toml: environments\.facade\.arms: expected tables by name"),
