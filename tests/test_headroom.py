@@ -107,6 +107,17 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
     assert unseen[1] > 0.8 * unseen[0]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["lighthouse"])
+def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str) -> None:
+    agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
+    selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
+    assert learned["e95_m"][0] <= 1.15 * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
+    assert learned["arrival_rate"][0] >= 0.97 and learned["collision_rate"][0] < 0.01
+    unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
+    assert unseen[2] > 0.8 * unseen[0]
+
+
 LEAST = {"facade": 0.95, "behind_truck": 0.95, "open_square": 0.75}
 """Share of arrivals in each kind of worlds; a vehicle that lies is not among them."""
 
