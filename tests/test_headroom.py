@@ -69,7 +69,7 @@ def test_no_deadlock_where_all_receive_each_other(environment: str, agent: str) 
     assert rates["arrival_rate"] >= least and rates["collision_rate"] <= 0.99 - least, rates
 
 
-HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3, "take_turns": 1}
+HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3, "take_turns": 1, "liar_among_us": 2}
 """How many vehicles, the first ones, can help the others."""
 
 
