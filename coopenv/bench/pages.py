@@ -85,9 +85,11 @@ def is_measured(name: str) -> bool:
 
 
 def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
-    """Return overrides of the scenario by the name of the setting: without bearings to cars, without messages."""
+    """Return overrides of the scenario by the name of the setting: without bearings to cars, messages, or lies."""
     hidden = {f"vehicles.{i}.marker": (0.0, 0.0, 9.0) for i in range(len(scenario.vehicles))}  # m; above all images
-    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}}
+    lies = [i for i, faults in enumerate(scenario.all_faults) if faults.lie.kind != "none"]
+    honest = {"no lies": {f"vehicles.{i}.faults.lie.kind": "none" for i in lies}} if lies else {}
+    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}, **honest}
 
 
 def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, Mapping[str, Any]]]:

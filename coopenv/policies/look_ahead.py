@@ -183,8 +183,9 @@ class LookAhead(RouteFollower):
             apart = (others + driven)[:, None] - place[:, :, None]
             distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
             cost = cost + STEP * CLOSE * np.maximum(keep - distance, 0.0)
-        later = covariance.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
-        cost = cost + self.price * (FAR + missing) / top * np.maximum(later.std - self.tolerated, 0.0)
+        rest = FAR + missing
+        later = covariance.driven(rest * np.cos(now.heading), rest * np.sin(now.heading), 0.0, 0.0)
+        cost = cost + self.price * rest / top * np.maximum(later.std - self.tolerated, 0.0)
         for each in followers:
             later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
             cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
