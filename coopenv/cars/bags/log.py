@@ -1,10 +1,12 @@
 """Everything that is read of one or several bags: samples of all cars on one clock, and a table of what there is.
 
 Every message has two times: its stamp, by the clock of who sent it, and when it was received, by the clock of who
-recorded it. A *source* is whose clock makes the stamps: a car, or motion capture, which is one source for all bodies.
+recorded it. A *source* is whose clock makes the stamps: a car, or motion capture, which is one source for all bodies,
+or a topic whose delay is far from those of the other topics of its car.
 
-- Within a file, a source's clock is behind the recorder's by the smallest (received - stamp) over the file, the least
-  time that a message was on its way included. By no more than the tolerance, stamps stay what they are.
+- Within a file, a source's clock is behind the recorder's by the least (received - stamp) of its topics, the least
+  time of transport included; wrong stamps are dropped. By no more than the tolerance, stamps stay what they are.
+- Topics of a car that measure the same motion are brought together by it, see `clocks.py`.
 - Files of different recorders are brought together by what they have in common. A source that stands in both, motion
   capture above all, is behind one recorder by d1 and behind the other by d2, so that the clocks of the recorders differ
   by d1 - d2. Files without anything in common with the others are merged by their stamps.
@@ -15,12 +17,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.cars.backend.binding import Binding
+from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
@@ -28,8 +32,10 @@ from coopenv.cars.profile import Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
 
+NS = 1_000_000_000
+
 Delays = Mapping[str, int]
-"""ns by which each source of a file is behind its recorder: the smallest (received - stamp)."""
+"""ns by which each source of a file is behind its recorder."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,10 @@ class Clocks:
 
     shifts: Mapping[str, Shift]  # by source
     recorders: tuple[int, ...]  # ns to add to the times of reception of each file
+
+    def is_known(self, source: str) -> bool:
+        """Return whether the offset of a source is known."""
+        return source in self.shifts and self.shifts[source].offset is not None
 
 
 def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, int]) -> Clocks:
@@ -100,7 +110,7 @@ def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], 
     cameras = binding.scenario.cameras
     calibrations = {name: Calibration.of(cameras[vehicle]) for name, vehicle in binding.cars.items()}
     calibrations |= _published(files, chosen)
-    known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
+    known = frozenset(binding.targets)
     frames = {Role.TRUTH: given.frames.truth or given.frames.map}
 
     def read_value(entry: Chosen, message: Any) -> Value:
@@ -108,8 +118,6 @@ def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], 
         value = read(entry.role, message, calibration, distorted=given.distorted, known=known)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
-        if isinstance(value, Twist) and entry.role is Role.WHEEL and entry.car in turning:
-            return Twist(value.linear, None)  # the IMU knows better
         return value
 
     return read_value
@@ -143,9 +151,6 @@ def in_frame(pose: CarPose, frame: MapFrame) -> CarPose:
     return CarPose(R @ pose.position + np.array(frame.position), rotation, covariance)
 
 
-WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its topic before it is left out
-
-
 @dataclass
 class Track:
     """The messages of one topic in one file, and why some were left out."""
@@ -155,19 +160,32 @@ class Track:
     entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
-    def delays(self) -> list[int]:
-        """Return by how many ns its messages were received after their stamps."""
-        return [entry.received - entry.stamp for entry in self.entries if entry.stamp]
+    outlying: int = 0  # messages that were dropped for their stamps
+    delay: Delay | None = None  # None: no message with a stamp
+    source: str = ""  # whose clock makes the stamps
 
-    def leave_out_wild(self) -> None:
-        """Drop messages whose stamps are far ahead of those of the others."""
-        if not (delays := self.delays()):
-            return
-        least = float(np.median(delays)) - WILD
-        kept = [entry for entry in self.entries if not entry.stamp or entry.received - entry.stamp >= least]
-        if left_out := len(self.entries) - len(kept):
-            self.refused["its stamp is far in the future"] += left_out
-            self.entries = kept
+    def drop_outlying(self) -> None:
+        """Drop messages with wrong stamps, and measure the delay of the others."""
+        stamps, received = (np.array([getattr(e, name) for e in self.entries], np.int64) for name in TIMES)
+        given = stamps != 0
+        wrong = np.zeros(len(given), bool)
+        if given.any():
+            wrong[given] = outlying(stamps[given], received[given])
+            self.delay = delay_of(stamps[given & ~wrong], received[given & ~wrong])
+        self.outlying = int(wrong.sum())
+        self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
+
+    def remove_drift(self, drift: float) -> None:
+        """Let the clock of the stamps run as fast as the recorder's; `drift` as in `Delay`."""
+        if (delay := self.delay) is not None:
+            gained = [round(drift * (entry.received - delay.middle)) for entry in self.entries]
+            self.entries = [
+                replace(e, stamp=e.stamp + g) if e.stamp else e for e, g in zip(self.entries, gained, strict=True)
+            ]
+
+
+TIMES = ("stamp", "received")
+APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
 def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, stamped: bool) -> list[Track]:
@@ -186,18 +204,39 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.leave_out_wild()
+        track.drop_outlying()
     return list(tracks.values())
 
 
-def delays_of(tracks: Sequence[Track], files: int) -> list[Delays]:
-    """Return by how many ns each source is behind the recorder, for each of so many files."""
+def delays_of(tracks: Sequence[Track], files: int, stated: Collection[str] = ()) -> list[Delays]:
+    """Return by how many ns each source is behind the recorder, for each of so many files; set the tracks' sources.
+
+    Topics whose offset is `stated` are sources of their own.
+    """
     found: list[dict[str, int]] = [{} for _ in range(files)]
-    for track in tracks:
-        if delays := track.delays():
-            least, source = found[track.file], track.chosen.source
-            least[source] = min(*delays, least.get(source, delays[0]))
+    for file, source in {(track.file, track.chosen.source) for track in tracks}:
+        own = [track for track in tracks if (track.file, track.chosen.source) == (file, source)]
+        delays = sorted(track.delay.offset for track in own if track.delay is not None)
+        usual = delays[(len(delays) - 1) // 2] if delays else 0
+        for track in own:
+            offset = usual if track.delay is None else track.delay.offset
+            apart = track.chosen.topic in stated or (abs(offset - usual) > APART and source not in stated)
+            track.source = track.chosen.topic if apart else source
+            if track.delay is not None:
+                found[file][track.source] = min(offset, found[file].get(track.source, offset))
     return [*found]
+
+
+def drifts_of(tracks: Sequence[Track], tolerance: float) -> dict[tuple[int, str], float]:
+    """Return drifts of the sources of each file, those alone that change an offset by more than a tolerance, ns."""
+    found = {}
+    for key in {(track.file, track.source) for track in tracks}:
+        own = [track for track in tracks if (track.file, track.source) == key and track.delay is not None]
+        drift = float(np.median([track.delay.drift for track in own if track.delay])) if own else 0.0
+        span = max((track.entries[-1].received - track.entries[0].received for track in own), default=0)
+        if abs(drift) * span / 2 > tolerance:
+            found[key] = drift
+    return found
 
 
 @dataclass(frozen=True)
@@ -213,7 +252,11 @@ class TopicRow:
     used: int | None = None  # messages
     gap: float | None = None  # s, the longest between two
     gaps: int | None = None  # pauses of more than three times the usual period
-    offset: float | None = None  # s by which its clock is behind the recorder's
+    offset: float | None = None  # s by which its stamps are behind the recorder's clock, transport included
+    outlying: int | None = None  # messages that were dropped for their stamps
+    lead: float | None = None  # s by which its stamps are early, by what it measures
+    lead_error: float | None = None  # s, standard error
+    reference: str | None = None  # what they are early against
 
 
 def rows_of(
@@ -221,6 +264,8 @@ def rows_of(
     chosen: Collection[Chosen] = (),
     samples: Sequence[Sample] = (),
     clocks: Clocks | None = None,
+    tracks: Sequence[Track] = (),
+    leads: Leads = MappingProxyType({}),
 ) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
     read_as = {entry.topic: entry for entry in chosen}
@@ -238,10 +283,17 @@ def rows_of(
             rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
         stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
-        shift = clocks.shifts.get(entry.source)
-        offset = None if shift is None or shift.offset is None else shift.offset * 1e-9
-        rate, gap, gaps = regularity(stamps)
-        rows.append(TopicRow(name, kind, count, rate, entry.car, entry.role.value, len(stamps), gap, gaps, offset))
+        own = [track for track in tracks if track.chosen is entry]
+        delays = [t.delay.offset + clocks.recorders[t.file] for t in own if t.delay and clocks.is_known(t.source)]
+        offset = min(delays) / NS if delays else None
+        lead = leads.get(name)
+        rows.append(
+            TopicRow(
+                *(name, kind, count, *regularity(stamps)[:1], entry.car, entry.role.value, len(stamps)),
+                *(*regularity(stamps)[1:], offset, sum(track.outlying for track in own)),
+                *((None,) * 3 if lead is None else (lead.seconds, lead.error, lead.reference)),
+            )
+        )
     return tuple(rows)
 
 
@@ -251,9 +303,6 @@ def regularity(stamps: np.ndarray) -> tuple[float | None, float | None, int | No
     if not len(steps) or steps.sum() <= 0.0:
         return None, None, None
     return float(len(steps) / steps.sum()), float(steps.max()), int((steps > 3.0 * np.median(steps)).sum())
-
-
-NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -287,9 +336,26 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
-    clocks = reconcile(delays_of(tracks, len(files)), tolerance, stated)
-    samples = _samples(tracks, clocks)
-    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)))
+    delays = delays_of(tracks, len(files), stated)
+    drifts = drifts_of(tracks, tolerance)
+    for track in tracks:
+        track.remove_drift(drifts.get((track.file, track.source), 0.0))
+    clocks = reconcile(delays, tolerance, stated)
+    samples = _samples(tracks, clocks, {})
+    leads = leads_of(samples, chosen, binding) if stamped else {}
+    fixed = {track.chosen.topic for track in tracks if track.source in stated}
+    moves = moves_of(leads, {e.topic: e.source for e in chosen}, tolerance / NS, fixed)
+    samples = _samples(tracks, clocks, moves) if moves else samples
+    turning = {entry.car for entry in chosen if entry.role is Role.IMU}
+    samples = tuple(_without_turn(sample) if sample.car in turning else sample for sample in samples)
+    notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, leads, moves, fixed))
+    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes)
+
+
+def _without_turn(sample: Sample) -> Sample:
+    """Return a sample of wheels without the turn rate, which the IMU measures better; another one unchanged."""
+    wheels = sample.role is Role.WHEEL and isinstance(sample.value, Twist)
+    return replace(sample, value=Twist(sample.value.linear, None)) if wheels else sample  # type: ignore[union-attr]
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -303,29 +369,59 @@ def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
     raise DataError(f"{where}: topic {entry.topic} of {entry.car}: none of {total} messages is of use: {reason}")
 
 
-def _samples(tracks: Sequence[Track], clocks: Clocks) -> tuple[Sample, ...]:
-    """Return the samples in the order of their stamps; one that several files have is there once."""
+def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
+    """Return the samples in the order of their stamps; one that several files have is there once.
+
+    Args:
+        tracks: the messages.
+        clocks: what is added to the stamps of each source.
+        moves: what is added to those of each topic besides, ns.
+    """
     found: dict[tuple[str, int], Sample] = {}
     for track in tracks:
-        added, recorder = clocks.shifts.get(track.chosen.source), clocks.recorders[track.file]
+        added, recorder = clocks.shifts.get(track.source), clocks.recorders[track.file]
+        moved = moves.get(track.chosen.topic, 0)
         for entry in track.entries:
-            time = entry.stamp + added.added if entry.stamp and added else entry.received + recorder
+            time = entry.stamp + added.added + moved if entry.stamp and added else entry.received + recorder
             found.setdefault((track.chosen.topic, time), replace(entry, stamp=time, received=time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
-def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap) -> Iterator[str]:
+def _notes(
+    tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Mapping[tuple[int, str], float]
+) -> Iterator[str]:
     """Yield what was left out, moved, or used unchanged."""
     for track in tracks:
+        total = track.refused.total() + len(track.entries) + track.outlying
+        if track.outlying:
+            yield f"topic {track.chosen.topic}: {track.outlying} of {total} messages left out: wrong stamps"
         if track.refused:
             [(reason, _)], count = track.refused.most_common(1), track.refused.total()
-            total = count + len(track.entries)
             yield f"topic {track.chosen.topic}: {count} of {total} messages left out: {reason}"
     for source, shift in sorted(clocks.shifts.items()):
         if shift.offset is None:
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
         elif shift.added and source not in given.clocks.offsets:
             yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
+    for (_, source), drift in sorted(drifts.items()):
+        yield f"clock of {source}: drifts by {1e6 * drift:+.0f} us per s, which was removed"
     for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
             yield f"topic {track.chosen.topic}: messages without stamps count when they were received"
+
+
+def _lead_notes(
+    tracks: Sequence[Track], clocks: Clocks, leads: Leads, moves: Mapping[str, int], fixed: Collection[str]
+) -> Iterator[str]:
+    """Yield which topics were moved by what they measure, or would have been, and the key that states it."""
+    seen = set()
+    for track in tracks:
+        topic, shift = track.chosen.topic, clocks.shifts.get(track.source)
+        lead, added = leads.get(topic), (0 if shift is None else shift.added)
+        if topic in seen or (lead is None and topic not in moves):
+            continue
+        seen.add(topic)
+        words = f"{track.chosen.car} {track.chosen.role}" if lead is None else f"{track.chosen.car}: {lead}"
+        if topic in moves:
+            key = f'clocks.offsets = {{ "{topic}" = {(added + moves[topic]) / NS:.4f} }} keeps this'
+            yield f"{words}; stamps of {topic} were moved by {moves[topic] / NS:+.3f} s; {key}"

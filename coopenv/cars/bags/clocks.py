@@ -1,0 +1,443 @@
+"""Offsets of clocks in a bag: by times of reception, robust against wrong stamps, and by what topics measure.
+
+- By reception: the delay (received - stamp) of a topic is the offset of its clock and the time of transport. Its level
+  is a low quantile over windows; a robust line through the windows gives offset and drift.
+- By content: topics of a car measure the same motion. The turn and the distance over intervals by gyro, wheels and
+  motion capture, and the bearings of landmarks from the poses of motion capture, or from dead reckoning without it,
+  agree best at one offset between their stamps. It contains no time of transport.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import percentile_filter
+from scipy.stats import theilslopes
+
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.bags.topic_map import TRUTH, Chosen
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist
+from coopenv.estimation.poses import Array
+from coopenv.scenario.base import rotation_of
+
+Times = NDArray[np.int64]
+
+OUTLYING = 50_000_000
+"""ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
+NEAR = 101  # messages around one that give its usual delay
+WINDOWS = 20
+LEAST = 10  # messages of a window
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of a topic's messages, (received - stamp), as a line; ns."""
+
+    offset: int  # in the middle of the file
+    drift: float  # per time of reception
+    middle: int
+
+
+def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
+    """Return which stamps (n,) are wrong: ahead of those around them, or behind them and out of order."""
+    delays = (received - stamps).astype(np.float64)
+    usual = percentile_filter(delays, 20, size=min(NEAR, 2 * (len(delays) // 2) + 1), mode="nearest")
+    spread = float(np.median(np.abs(delays - np.median(usual)))) if len(delays) else 0.0
+    most = max(OUTLYING, 5.0 * min(spread, 20.0 * OUTLYING))
+    wrong: NDArray[np.bool_] = delays < usual - most
+    reached = np.maximum.accumulate(np.where(wrong, np.iinfo(np.int64).min, stamps))
+    return wrong | ((stamps < reached) & (delays > usual + most))
+
+
+def delay_of(stamps: Times, received: Times) -> Delay:
+    """Return the delay of a topic by its messages (n,), n > 0, none of them outlying."""
+    delays, middle = received - stamps, int(received[0] + received[-1]) // 2
+    parts = np.array_split(np.arange(len(delays)), max(1, min(WINDOWS, len(delays) // LEAST)))
+    low = np.array([np.sort(delays[part])[len(part) // 20] for part in parts])
+    at = np.array([float(np.median(received[part] - middle)) for part in parts])
+    if len(parts) < LEAST:
+        return Delay(int(low.min()), 0.0, middle)
+    slope, _, least, most = theilslopes((low - low[0]).astype(np.float64), at)
+    drift = float(slope) if least * most > 0.0 else 0.0
+    return Delay(round(float(np.quantile(low - low[0] - drift * at, 0.2))) + int(low[0]), drift, middle)
+
+
+HOLE = 0.25  # s between two messages over which nothing is compared
+INTERVAL = 0.4  # s over which turns and distances are compared
+SEARCHED, STEP = 1.0, 0.02
+"""s to both sides in which an offset is looked for, and the step of the search."""
+BLOCK = 2.0  # s within which errors are taken as dependent
+SURE = 4.0  # standard errors above which an offset counts
+FLOOR = 0.001  # s, least standard error: rates of topics and interpolation
+UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may remain at the right one
+CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
+FEWEST, MOST = 50, 20_000  # elements compared
+
+
+@dataclass(frozen=True)
+class Lead:
+    """Offset between the stamps of two topics by what they measure."""
+
+    seconds: float  # by which the stamps of the first are early
+    error: float  # its standard error
+    first: str = ""  # role of the first
+    reference: str = ""  # and of the second
+
+    def __str__(self) -> str:
+        """Return the offset in ms, with its standard error in brackets."""
+        ahead = "leads" if self.seconds > 0.0 else "lags behind"
+        return f"{self.first} {ahead} {self.reference} by {written(abs(self.seconds), self.error)} ms"
+
+
+def written(seconds: float, error: float) -> str:
+    """Return a time in ms, with its standard error in brackets."""
+    return f"{1e3 * seconds:.0f}({max(1.0, 1e3 * error):.0f})"
+
+
+Leads = Mapping[str, Lead]
+"""By topic."""
+
+
+class Signal:
+    """A cumulated signal of time: heading, distance or pose; there is none within holes."""
+
+    def __init__(self, times: Array, values: Array) -> None:
+        """Take increasing times (n,), s, and values (n,) or (n, k)."""
+        self.times, self.values = times, values.reshape(len(times), -1)
+        ends = np.flatnonzero(np.diff(times) > HOLE)
+        self._from, self._to = times[ends], times[ends + 1]
+
+    @classmethod
+    def of_rates(cls, times: Array, rates: Array) -> "Signal":
+        """Return the integral of rates (n,) that are held until the next one."""
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * rates[:-1])]))
+
+    def at(self, times: Array) -> Array:
+        """Return the values (m, k) at times (m,); NaN beyond the ends and in holes."""
+        return self.over(times, times, level=True)
+
+    def over(self, begin: Array, end: Array, *, level: bool = False) -> Array:
+        """Return the changes (m, k) between times (m,), NaN across holes; `level`: the values at the end."""
+        first, last = (
+            np.stack([np.interp(t, self.times, v, np.nan, np.nan) for v in self.values.T], axis=-1)
+            for t in (begin, end)
+        )
+        change: Array = last if level else last - first
+        change[np.searchsorted(self._from, end) > np.searchsorted(self._to, begin, side="right")] = np.nan
+        return change
+
+
+Residual = Callable[[float], tuple[Array, Array]]
+"""Returns at an offset in s a difference (n,), and what explains it up to factors (n, p); NaN where there is none."""
+
+
+def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> tuple[Array, Array]:
+    """Return what N (n, p) leaves of e (n,), 0 where there is none, and weights (n,), 0 or 1, without outliers.
+
+    Args:
+        e: a difference.
+        N: what explains it up to factors.
+        w: weights (None: they are found).
+        scaled: whether the first factor must be positive.
+    """
+    there = np.isfinite(e) & np.isfinite(N).all(axis=-1)
+    e, N = np.where(there, e, 0.0), np.where(there[:, None], N, 0.0)
+    weights = there.astype(np.float64) if w is None else there * w
+    for _ in range(3 if w is None else 1):
+        factors = np.linalg.lstsq(N * weights[:, None], e * weights, rcond=None)[0]
+        if scaled and factors[0] < 0.0:
+            factors = np.array([0.0, (e * weights).sum() / max(1.0, weights.sum())])
+        rest = np.where(there, e - N @ factors, 0.0)
+        if w is None and there.any():
+            weights = there * (np.abs(rest) <= CUT * np.quantile(np.abs(rest[there]), 0.9) + 1e-9)
+    return rest, weights
+
+
+def lead_by(residual: Residual, times: Array, *, scaled: bool = False) -> Lead | None:
+    """Return the offset at which a residual is smallest; None: too few elements, or no clear minimum.
+
+    Args:
+        residual: as a function of the offset.
+        times: (n,) of its elements, s.
+        scaled: whether the first factor of what explains it must be positive.
+    """
+
+    def cost(offset: float) -> float:
+        rest, w = fit(*residual(offset), scaled=scaled)
+        return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
+
+    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
+    costs = np.array([cost(offset) for offset in tried])
+    best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
+    if best in (0, len(tried) - 1) or len(known) < len(tried) / 2 or costs[best] > UNEXPLAINED * known.max():
+        return None
+    offset, h = float(tried[best]), STEP / 4
+    for _ in range(5):
+        rest, w = fit(*residual(offset))
+        slope = (fit(*residual(offset + h), w)[0] - fit(*residual(offset - h), w)[0]) / (2 * h)
+        information = float((w * slope**2).sum())
+        if information <= 0.0:
+            return None
+        offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
+    blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
+    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, FLOOR)))
+
+
+def lead_of_motion(signal: Signal, reference: Signal) -> Lead | None:
+    """Return by how much the stamps of turns or distances are early, by another source of the same."""
+    span = reference.times[-1] - reference.times[0]
+    begin = np.arange(reference.times[0], reference.times[-1] - INTERVAL, max(STEP, span / MOST))
+    end, one = begin + INTERVAL, np.ones((len(begin), 1))
+    change = reference.over(begin, end)[:, 0]
+
+    def residual(offset: float) -> tuple[Array, Array]:
+        return change, np.concatenate([signal.over(begin - offset, end - offset), one], axis=-1)
+
+    return lead_by(residual, begin, scaled=True) if len(begin) >= FEWEST else None
+
+
+def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
+    """Return by how much the stamps of bearings are early, by the known path of the car.
+
+    Args:
+        times: (n,) of the bearings, s.
+        azimuths: (n,) in the body frame, rad.
+        targets: (n, 2) positions, map.
+        camera: (2,) position in the body frame.
+        path: x, y and heading.
+    """
+
+    def residual(offset: float) -> tuple[Array, Array]:
+        return _turned(path.at(times + offset), azimuths, targets, camera), np.ones((len(times), 1))
+
+    return lead_by(residual, times) if len(times) >= FEWEST else None
+
+
+def _turned(pose: Array, azimuths: Array, targets: Array, camera: Array) -> Array:
+    """Return by how much bearings (n,) are turned against those from poses (n, 3), rad."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x = targets[:, 0] - pose[:, 0] - c * camera[0] + s * camera[1]
+    y = targets[:, 1] - pose[:, 1] - s * camera[0] - c * camera[1]
+    wrapped: Array = np.angle(np.exp(1j * (np.arctan2(y, x) - pose[:, 2] - azimuths)))
+    return wrapped
+
+
+WINDOW = 3.0  # s of dead reckoning from a pose that is fitted
+TURNS = np.linspace(-np.pi, np.pi, 48, endpoint=False)  # headings from which a fit begins
+GRID = 0.01  # s, step of dead reckoning
+
+
+class Reckoning:
+    """Bearings of one camera against dead reckoning, in windows whose first poses are fitted."""
+
+    def __init__(self, times: Array, azimuths: Array, targets: Array, camera: Array) -> None:
+        """Take bearings as `lead_of_bearings` does; about MOST / 8 of them are used."""
+        some = slice(None, None, max(1, len(times) * 8 // MOST))
+        self.times, self._azimuths, self._targets, self._camera = times[some], azimuths[some], targets[some], camera
+        self._window = ((self.times - times[0]) / WINDOW).astype(int)
+        self._begin = times[0] + WINDOW * np.arange(self._window[-1] + 1)
+        self._poses: Array | None = None
+
+    def lead(self, speed: Signal, turn: Signal, shift: Callable[[float], tuple[float, float]]) -> Lead | None:
+        """Return by how much bearings lag behind distances and headings.
+
+        Args:
+            speed: cumulated distances.
+            turn: cumulated turns.
+            shift: what an offset adds to the stamps of distances and of turns, s.
+        """
+
+        def residual(offset: float) -> tuple[Array, Array]:
+            return self._residual(speed, turn, *shift(offset)), np.ones((len(self.times), 1))
+
+        if len(self.times) < FEWEST:
+            return None
+        self._poses = self._start(*self._moved(speed, turn, *shift(0.0)))
+        return lead_by(residual, self.times)
+
+    def _moved(self, speed: Signal, turn: Signal, later: float, turned: float) -> tuple[Array, Array]:
+        """Return poses (n, 3) of bearings in the frames of their windows' begins, and whether they are known, 0 or 1."""
+        t = np.arange(self.times[0], self.times[-1] + GRID, GRID)
+        s, heading = speed.at(t - later)[:, 0], turn.at(t - turned)[:, 0]
+        middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(s)
+        known = np.isfinite(step) & np.isfinite(middle)
+        steps = np.where(known, step * np.exp(1j * np.where(known, middle, 0.0)), 0.0)
+        place, unknown = np.concatenate([[0.0], np.cumsum(steps)]), np.concatenate([[0], np.cumsum(~known)])
+
+        def at(times: Array) -> tuple[Array, Array, Array]:
+            return tuple(np.interp(times, t, v) for v in (place.real, place.imag, unknown))  # type: ignore[return-value]
+
+        (x, y, lost), (x0, y0, lost0) = at(self.times), (v[self._window] for v in at(self._begin))
+        h0 = turn.at(self._begin - turned)[self._window, 0]
+        h = turn.at(self.times - turned)[:, 0]
+        moved = (x - x0 + 1j * (y - y0)) * np.exp(-1j * h0)
+        there = (lost - lost0 == 0.0) & np.isfinite(h - h0)
+        return np.column_stack([moved.real, moved.imag, h - h0]), there.astype(np.float64)
+
+    def _sums(self, rows: Array) -> Array:
+        """Return the sums of rows (n, ...) by window."""
+        found = np.zeros((len(self._begin), *rows.shape[1:]))
+        np.add.at(found, self._window, rows)
+        return found
+
+    def _start(self, moved: Array, there: Array) -> Array:
+        """Return (windows, 3) poses by which lines of sight from a heading meet the targets best."""
+        best, least = np.zeros((len(self._begin), 3)), np.full(len(self._begin), np.inf)
+        c, s = np.cos(moved[:, 2]), np.sin(moved[:, 2])
+        lens = moved[:, :2] + np.column_stack(
+            [c * self._camera[0] - s * self._camera[1], s * self._camera[0] + c * self._camera[1]]
+        )
+        lens, moved = np.nan_to_num(lens), np.nan_to_num(moved)
+        for turn in TURNS:
+            sight = turn + moved[:, 2] + self._azimuths
+            n = np.column_stack([-np.sin(sight), np.cos(sight)])
+            rotated = (lens[:, 0] + 1j * lens[:, 1]) * np.exp(1j * turn)
+            offset = self._targets - np.column_stack([rotated.real, rotated.imag])
+            A = self._sums(there[:, None, None] * n[:, :, None] * n[:, None, :]) + 1e-9 * np.eye(2)
+            b = self._sums((there * (n * offset).sum(axis=1))[:, None] * n)
+            place = np.linalg.solve(A, b[..., None])[..., 0]
+            away = offset - place[self._window]
+            ahead = (away * np.column_stack([np.cos(sight), np.sin(sight)])).sum(axis=1)
+            cost = self._sums(there * np.arctan2(np.abs((n * away).sum(axis=1)), ahead) ** 2)
+            better = cost < least
+            best[better] = np.column_stack([place, np.full(len(place), turn)])[better]
+            least = np.minimum(least, cost)
+        return best
+
+    def _residual(self, speed: Signal, turn: Signal, later: float, turned: float) -> Array:
+        """Return by how much bearings are turned after a fit of the poses; NaN where dead reckoning is not known."""
+        assert self._poses is not None
+        moved, there = self._moved(speed, turn, later, turned)
+        moved, poses = np.nan_to_num(moved), self._poses.copy()
+        for last in (False, False, False, True):
+            first = poses[self._window]
+            c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
+            shift = np.column_stack([c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]])
+            pose = np.column_stack([first[:, :2] + shift, first[:, 2] + moved[:, 2]])
+            e = _turned(pose, self._azimuths, self._targets, self._camera)
+            if last or not there.any():
+                break
+            w = there * (np.abs(e) <= CUT * np.quantile(np.abs(e[there > 0.0]), 0.9) + 1e-9)
+            away = self._targets - pose[:, :2]
+            squared = (away**2).sum(axis=1)
+            n = np.column_stack([away[:, 1], -away[:, 0]]) / squared[:, None]  # of the azimuth by the position
+            by_turn = n[:, 1] * shift[:, 0] - n[:, 0] * shift[:, 1] - 1.0
+            J = np.column_stack([n, by_turn])
+            A = self._sums(w[:, None, None] * J[:, :, None] * J[:, None, :]) + 1e-6 * np.eye(3)
+            poses -= np.linalg.solve(A, self._sums((w * e)[:, None] * J)[..., None])[..., 0]
+        found: Array = np.where(there > 0.0, e, np.nan)
+        return found
+
+
+CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
+
+
+def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> dict[str, Lead]:
+    """Return by how much the stamps of the topics of vehicles are early by what they measure.
+
+    The reference is motion capture, or the camera where there is none; topics whose motion does not tell are left out.
+    """
+    found: dict[str, Lead] = {}
+    start = samples[0].stamp if samples else 0
+    for car, vehicle in binding.cars.items():
+        topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
+        values = {role: _of(samples, car, role, start) for role in topics}
+        moved = {role: _cumulated(*values[role]) for role in topics if role in ODOMETRY}
+        truth = _path(*values[Role.TRUTH]) if Role.TRUTH in topics else None
+        camera = next(role for role in CAMERAS if role in topics)
+        seen = _azimuths(*values[camera], binding, vehicle)
+        place = np.array(binding.scenario.cameras[vehicle].position[:2])
+        leads: dict[Role, Lead | None] = {}
+        if truth is not None:
+            for role, signals in moved.items():
+                each = [lead_of_motion(s, r) for s, r in zip(signals, truth[:2], strict=True) if s is not None]
+                leads[role] = min((lead for lead in each if lead), key=lambda lead: lead.error, default=None)
+            leads[camera] = lead_of_bearings(*seen, place, truth[2])
+        reference = camera.value if truth is None else TRUTH
+        found |= {topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
+    return found
+
+
+ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
+
+
+def _of(samples: Sequence[Sample], car: str, role: Role, start: int) -> tuple[Array, list[Any]]:
+    """Return times (n,) since a start, s, and values of the samples of a topic."""
+    own = [sample for sample in samples if (sample.car, sample.role) == (car, role)]
+    return np.array([(sample.stamp - start) * 1e-9 for sample in own]), [sample.value for sample in own]
+
+
+def _cumulated(times: Array, values: Sequence[Twist]) -> tuple[Signal | None, Signal | None]:
+    """Return cumulated distances and turns of a topic; None: it does not measure them."""
+    found = []
+    for name, axis in (("linear", 0), ("angular", 2)):
+        rates = np.array([np.nan if (v := getattr(value, name)) is None else v[axis] for value in values])
+        given = np.isfinite(rates)
+        measured = given.sum() > 1 and np.ptp(rates[given]) > 0.0
+        found.append(Signal.of_rates(times[given], rates[given]) if measured else None)
+    return found[0], found[1]
+
+
+def _path(times: Array, values: Sequence[CarPose]) -> tuple[Signal, Signal, Signal] | None:
+    """Return distance, heading and path (x, y, heading) by motion capture; None: there is none."""
+    known = [(t, v.position, v.rotation) for t, v in zip(times, values, strict=True) if v.rotation is not None]
+    if len(known) < FEWEST:
+        return None
+    t, p, R = (np.array(part) for part in zip(*known, strict=True))
+    heading = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+    middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(p, axis=0)
+    forward = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
+    distance = np.concatenate([[0.0], np.cumsum(forward)])
+    return Signal(t, distance), Signal(t, heading), Signal(t, np.column_stack([p[:, :2], heading]))
+
+
+def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
+    """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
+    places = {
+        number: np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker)
+        for number, target in binding.targets.items()
+        if target not in binding.leaders.values() and target < len(binding.scenario.landmarks)
+        for m in [binding.scenario.landmarks[target]]
+    }
+    to_body = binding.scenario.cameras[vehicle].to_body()
+    rows = [
+        (time, *(to_body @ ray)[:2], *places[marker][:2])
+        for time, frame in zip(times, values, strict=True)
+        for marker, ray in zip(frame.markers, frame.bearings, strict=True)
+        if marker in places
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return table[:, 0], np.arctan2(table[:, 2], table[:, 1]), table[:, 3:]
+
+
+def moves_of(
+    leads: Mapping[str, Lead], sources: Mapping[str, str], tolerance: float, fixed: Collection[str]
+) -> dict[str, int]:
+    """Return what is added to the stamps of topics, ns, so that those of a reference agree.
+
+    Most topics keep their stamps: where more of them agree with each other than with their reference, that is moved.
+
+    Args:
+        leads: what topics measure.
+        sources: the source of each topic, by the map.
+        tolerance: s up to which stamps agree.
+        fixed: topics whose offset is stated.
+    """
+    found: dict[str, float] = {}
+    for reference in {TRUTH}:
+        own = {topic: lead for topic, lead in leads.items() if lead.reference == reference}
+        moved = [topic for topic, source in sources.items() if source == reference]
+        offsets = [0.0, *(lead.seconds for lead in own.values())]
+        near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
+        common = float(np.median(max(near, key=len)))
+        if abs(common) <= tolerance or any(topic in fixed for topic in moved):
+            common = 0.0
+        found |= dict.fromkeys(moved, -common) if common else {}
+        for topic, lead in own.items():
+            rest = lead.seconds - common
+            if abs(rest) > max(tolerance, SURE * lead.error) and topic not in fixed:
+                found[topic] = rest
+    return {topic: round(seconds * 1e9) for topic, seconds in found.items()}
