@@ -86,6 +86,10 @@ class Lead:
     first: str = ""  # role of the first
     reference: str = ""  # and of the second
 
+    def exceeds(self, tolerance: float) -> bool:
+        """Return whether it is larger than a tolerance, s, and than its error allows."""
+        return abs(self.seconds) > max(tolerance, SURE * self.error)
+
     def __str__(self) -> str:
         """Return the offset in ms, with its standard error in brackets."""
         ahead = "leads" if self.seconds > 0.0 else "lags behind"
@@ -414,30 +418,32 @@ def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehi
 
 
 def moves_of(
-    leads: Mapping[str, Lead], sources: Mapping[str, str], tolerance: float, fixed: Collection[str]
+    leads: Leads, sources: Mapping[str, str], tolerance: float, fixed: Collection[str], usual: Collection[str]
 ) -> dict[str, int]:
     """Return what is added to the stamps of topics, ns, so that those of a reference agree.
 
-    Most topics keep their stamps: where more of them agree with each other than with their reference, that is moved.
+    Where more of the topics with usual delays agree with each other than with the reference, the reference is moved.
 
     Args:
         leads: what topics measure.
         sources: the source of each topic, by the map.
         tolerance: s up to which stamps agree.
         fixed: topics whose offset is stated.
+        usual: topics whose stamps agree with times of reception.
     """
     found: dict[str, float] = {}
     for reference in {TRUTH}:
         own = {topic: lead for topic, lead in leads.items() if lead.reference == reference}
         moved = [topic for topic, source in sources.items() if source == reference]
-        offsets = [0.0, *(lead.seconds for lead in own.values())]
+        agreed = [lead.seconds for topic, lead in own.items() if topic in usual]
+        offsets = [*([0.0] if any(topic in usual for topic in moved) else []), *sorted(agreed, key=abs)]
         near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
-        common = float(np.median(max(near, key=len)))
+        common = float(np.median(max(near, key=len, default=[0.0])))
         if abs(common) <= tolerance or any(topic in fixed for topic in moved):
             common = 0.0
         found |= dict.fromkeys(moved, -common) if common else {}
         for topic, lead in own.items():
-            rest = lead.seconds - common
-            if abs(rest) > max(tolerance, SURE * lead.error) and topic not in fixed:
-                found[topic] = rest
+            rest = replace(lead, seconds=lead.seconds - common)
+            if rest.exceeds(tolerance) and topic not in fixed:
+                found[topic] = rest.seconds
     return {topic: round(seconds * 1e9) for topic, seconds in found.items()}

@@ -175,6 +175,13 @@ class Track:
         self.outlying = int(wrong.sum())
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
 
+    def is_usual(self, clocks: Clocks, tolerance: float) -> bool:
+        """Return whether its stamps agree with times of reception after those of its source were moved."""
+        delay, shift = self.delay, clocks.shifts.get(self.source)
+        if delay is None or shift is None or shift.offset is None:
+            return False
+        return abs(delay.offset + clocks.recorders[self.file] - shift.added) <= tolerance
+
     def remove_drift(self, drift: float) -> None:
         """Let the clock of the stamps run as fast as the recorder's; `drift` as in `Delay`."""
         if (delay := self.delay) is not None:
@@ -208,10 +215,11 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
     return list(tracks.values())
 
 
-def delays_of(tracks: Sequence[Track], files: int, stated: Collection[str] = ()) -> list[Delays]:
+def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Collection[str] = ()) -> list[Delays]:
     """Return by how many ns each source is behind the recorder, for each of so many files; set the tracks' sources.
 
-    Topics whose offset is `stated` are sources of their own.
+    A topic that is ahead of the recorder by more than the tolerance, ns, does not count where others are not. Topics
+    whose offset is `stated` are sources of their own.
     """
     found: list[dict[str, int]] = [{} for _ in range(files)]
     for file, source in {(track.file, track.chosen.source) for track in tracks}:
@@ -219,11 +227,12 @@ def delays_of(tracks: Sequence[Track], files: int, stated: Collection[str] = ())
         delays = sorted(track.delay.offset for track in own if track.delay is not None)
         usual = delays[(len(delays) - 1) // 2] if delays else 0
         for track in own:
-            offset = usual if track.delay is None else track.delay.offset
-            apart = track.chosen.topic in stated or (abs(offset - usual) > APART and source not in stated)
-            track.source = track.chosen.topic if apart else source
-            if track.delay is not None:
-                found[file][track.source] = min(offset, found[file].get(track.source, offset))
+            apart = track.delay is not None and abs(track.delay.offset - usual) > APART and source not in stated
+            track.source = track.chosen.topic if apart or track.chosen.topic in stated else source
+        for name in {track.source for track in own}:
+            known = [track.delay.offset for track in own if track.source == name and track.delay is not None]
+            if known:
+                found[file][name] = min([delay for delay in known if delay >= -tolerance] or known)
     return [*found]
 
 
@@ -336,7 +345,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
-    delays = delays_of(tracks, len(files), stated)
+    delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
     drifts = drifts_of(tracks, tolerance)
     for track in tracks:
         track.remove_drift(drifts.get((track.file, track.source), 0.0))
@@ -344,11 +353,12 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     samples = _samples(tracks, clocks, {})
     leads = leads_of(samples, chosen, binding) if stamped else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
-    moves = moves_of(leads, {e.topic: e.source for e in chosen}, tolerance / NS, fixed)
+    usual = {track.chosen.topic for track in tracks if track.is_usual(clocks, given.clocks.tolerance * NS)}
+    moves = moves_of(leads, {e.topic: e.source for e in chosen}, tolerance / NS, fixed, usual)
     samples = _samples(tracks, clocks, moves) if moves else samples
     turning = {entry.car for entry in chosen if entry.role is Role.IMU}
     samples = tuple(_without_turn(sample) if sample.car in turning else sample for sample in samples)
-    notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, leads, moves, fixed))
+    notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves))
     return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes)
 
 
@@ -411,17 +421,23 @@ def _notes(
 
 
 def _lead_notes(
-    tracks: Sequence[Track], clocks: Clocks, leads: Leads, moves: Mapping[str, int], fixed: Collection[str]
+    tracks: Sequence[Track], clocks: Clocks, given: TopicMap, leads: Leads, moves: Mapping[str, int]
 ) -> Iterator[str]:
-    """Yield which topics were moved by what they measure, or would have been, and the key that states it."""
+    """Yield which topics were moved by what they measure, or were not, and the key that states it."""
     seen = set()
     for track in tracks:
-        topic, shift = track.chosen.topic, clocks.shifts.get(track.source)
-        lead, added = leads.get(topic), (0 if shift is None else shift.added)
-        if topic in seen or (lead is None and topic not in moves):
-            continue
-        seen.add(topic)
-        words = f"{track.chosen.car} {track.chosen.role}" if lead is None else f"{track.chosen.car}: {lead}"
-        if topic in moves:
-            key = f'clocks.offsets = {{ "{topic}" = {(added + moves[topic]) / NS:.4f} }} keeps this'
-            yield f"{words}; stamps of {topic} were moved by {moves[topic] / NS:+.3f} s; {key}"
+        topic, shift, source = track.chosen.topic, clocks.shifts.get(track.source), track.chosen.source
+        lead, added = leads.get(topic), 0 if shift is None else shift.added
+        common = lead is None and topic in moves
+        name, words = (source, f"clock of {source}: not that of most topics") if common else (topic, "")
+        if lead is not None:
+            words = f"{track.chosen.car}: {lead}"
+            if topic not in moves and (moves or not lead.exceeds(given.clocks.tolerance)):
+                continue
+        if words and name not in seen:
+            seen.add(name)
+            moved = moves.get(topic, 0) / NS
+            total = added / NS + (moved if topic in moves or lead is None else lead.seconds)
+            key = f'clocks.offsets = {{ "{name}" = {total:.4f} }}'
+            done = f"stamps were moved by {moved:+.3f} s, as with" if topic in moves else "stamps are unchanged; see"
+            yield f"{words}; {done} {key}"
