@@ -7,7 +7,7 @@
   agree best at one offset between their stamps. It contains no time of transport.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,7 +49,8 @@ def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
     most = max(OUTLYING, 5.0 * min(spread, 20.0 * OUTLYING))
     wrong: NDArray[np.bool_] = delays < usual - most
     reached = np.maximum.accumulate(np.where(wrong, np.iinfo(np.int64).min, stamps))
-    return wrong | ((stamps < reached) & (delays > usual + most))
+    wrong |= (stamps < reached) & (delays > usual + most)
+    return wrong
 
 
 def delay_of(stamps: Times, received: Times) -> Delay:
@@ -75,6 +76,7 @@ FLOOR = 0.001  # s, least standard error: rates of topics and interpolation
 UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may remain at the right one
 CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
 FEWEST, MOST = 50, 20_000  # elements compared
+ABSURD = 0.1  # rad between bearings and poses, with which no camera or map is right
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class Signal:
 
     @classmethod
     def of_rates(cls, times: Array, rates: Array) -> "Signal":
-        """Return the integral of rates (n,) that are held until the next one."""
-        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * rates[:-1])]))
+        """Return the integral of rates (n,)."""
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)]))
 
     def at(self, times: Array) -> Array:
         """Return the values (m, k) at times (m,); NaN beyond the ends and in holes."""
@@ -160,32 +162,38 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
     return rest, weights
 
 
-def lead_by(residual: Residual, times: Array, *, scaled: bool = False) -> Lead | None:
+def lead_by(
+    residual: Residual, times: Array, most: float = np.inf, *, scaled: bool = False, step: float = STEP
+) -> Lead | None:
     """Return the offset at which a residual is smallest; None: too few elements, or no clear minimum.
 
     Args:
         residual: as a function of the offset.
         times: (n,) of its elements, s.
+        most: root mean square at the offset above which something else is wrong.
         scaled: whether the first factor of what explains it must be positive.
+        step: of the search, s.
     """
 
     def cost(offset: float) -> float:
         rest, w = fit(*residual(offset), scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
+    tried = np.arange(-SEARCHED, SEARCHED + step / 2, step)
     costs = np.array([cost(offset) for offset in tried])
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
     if best in (0, len(tried) - 1) or len(known) < len(tried) / 2 or costs[best] > UNEXPLAINED * known.max():
         return None
-    offset, h = float(tried[best]), STEP / 4
+    if costs[best] > most**2:
+        return None
+    offset, h = float(tried[best]), step / 4
     for _ in range(5):
         rest, w = fit(*residual(offset))
         slope = (fit(*residual(offset + h), w)[0] - fit(*residual(offset - h), w)[0]) / (2 * h)
         information = float((w * slope**2).sum())
         if information <= 0.0:
             return None
-        offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
+        offset -= float(np.clip((w * slope * rest).sum() / information, -step, step))
     blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
     return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, FLOOR)))
 
@@ -217,7 +225,7 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
     def residual(offset: float) -> tuple[Array, Array]:
         return _turned(path.at(times + offset), azimuths, targets, camera), np.ones((len(times), 1))
 
-    return lead_by(residual, times) if len(times) >= FEWEST else None
+    return lead_by(residual, times, ABSURD) if len(times) >= FEWEST else None
 
 
 def _turned(pose: Array, azimuths: Array, targets: Array, camera: Array) -> Array:
@@ -238,12 +246,13 @@ class Reckoning:
     """Bearings of one camera against dead reckoning, in windows whose first poses are fitted."""
 
     def __init__(self, times: Array, azimuths: Array, targets: Array, camera: Array) -> None:
-        """Take bearings as `lead_of_bearings` does; about MOST / 8 of them are used."""
-        some = slice(None, None, max(1, len(times) * 8 // MOST))
+        """Take bearings as `lead_of_bearings` does; about MOST / 16 of them are used."""
+        some = slice(None, None, max(1, len(times) * 16 // MOST))
         self.times, self._azimuths, self._targets, self._camera = times[some], azimuths[some], targets[some], camera
         self._window = ((self.times - times[0]) / WINDOW).astype(int)
         self._begin = times[0] + WINDOW * np.arange(self._window[-1] + 1)
-        self._poses: Array | None = None
+        self._poses = np.zeros((len(self._begin), 3))
+        self._lost = np.zeros(len(self._begin), bool)  # windows whose first pose is not known
 
     def lead(self, speed: Signal, turn: Signal, shift: Callable[[float], tuple[float, float]]) -> Lead | None:
         """Return by how much bearings lag behind distances and headings.
@@ -254,16 +263,25 @@ class Reckoning:
             shift: what an offset adds to the stamps of distances and of turns, s.
         """
 
-        def residual(offset: float) -> tuple[Array, Array]:
-            return self._residual(speed, turn, *shift(offset)), np.ones((len(self.times), 1))
-
-        if len(self.times) < FEWEST:
-            return None
+        self._lost[:] = False
         self._poses = self._start(*self._moved(speed, turn, *shift(0.0)))
-        return lead_by(residual, self.times)
+        e = self._residual(speed, turn, *shift(0.0), keep=True)
+        squared = np.sqrt(self._sums(np.nan_to_num(e) ** 2) / np.maximum(1.0, self._sums(np.isfinite(e) * 1.0)))
+        self._lost = squared > 2.0 * ABSURD
+        longer, biased = (
+            Signal(speed.times, 1.01 * speed.values),
+            Signal(turn.times, turn.values + 0.01 * turn.times[:, None]),
+        )
+        by_errors = [self._residual(*signals, *shift(0.0)) - e for signals in ((longer, turn), (speed, biased))]
+        explained = np.column_stack([np.ones(len(e)), *by_errors])
+
+        def residual(offset: float) -> tuple[Array, Array]:
+            return self._residual(speed, turn, *shift(offset)), explained
+
+        return lead_by(residual, self.times, 0.3 * ABSURD, step=2.0 * STEP)
 
     def _moved(self, speed: Signal, turn: Signal, later: float, turned: float) -> tuple[Array, Array]:
-        """Return poses (n, 3) of bearings in the frames of their windows' begins, and whether they are known, 0 or 1."""
+        """Return poses (n, 3) of bearings in the frames of their windows' begins, and which are known (n,), 0 or 1."""
         t = np.arange(self.times[0], self.times[-1] + GRID, GRID)
         s, heading = speed.at(t - later)[:, 0], turn.at(t - turned)[:, 0]
         middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(s)
@@ -272,7 +290,7 @@ class Reckoning:
         place, unknown = np.concatenate([[0.0], np.cumsum(steps)]), np.concatenate([[0], np.cumsum(~known)])
 
         def at(times: Array) -> tuple[Array, Array, Array]:
-            return tuple(np.interp(times, t, v) for v in (place.real, place.imag, unknown))  # type: ignore[return-value]
+            return tuple(np.interp(times, t, v) for v in (place.real, place.imag, unknown))
 
         (x, y, lost), (x0, y0, lost0) = at(self.times), (v[self._window] for v in at(self._begin))
         h0 = turn.at(self._begin - turned)[self._window, 0]
@@ -311,12 +329,15 @@ class Reckoning:
             least = np.minimum(least, cost)
         return best
 
-    def _residual(self, speed: Signal, turn: Signal, later: float, turned: float) -> Array:
-        """Return by how much bearings are turned after a fit of the poses; NaN where dead reckoning is not known."""
-        assert self._poses is not None
+    def _residual(self, speed: Signal, turn: Signal, later: float, turned: float, *, keep: bool = False) -> Array:
+        """Return by how much bearings are turned after a fit of the poses; NaN where dead reckoning is not known.
+
+        With `keep`, the fit takes longer and the poses stay.
+        """
         moved, there = self._moved(speed, turn, later, turned)
         moved, poses = np.nan_to_num(moved), self._poses.copy()
-        for last in (False, False, False, True):
+        there = there * ~self._lost[self._window]
+        for last in (*([False] * (15 if keep else 3)), True):
             first = poses[self._window]
             c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
             shift = np.column_stack([c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]])
@@ -332,6 +353,7 @@ class Reckoning:
             J = np.column_stack([n, by_turn])
             A = self._sums(w[:, None, None] * J[:, :, None] * J[:, None, :]) + 1e-6 * np.eye(3)
             poses -= np.linalg.solve(A, self._sums((w * e)[:, None] * J)[..., None])[..., 0]
+        self._poses = poses if keep else self._poses
         found: Array = np.where(there > 0.0, e, np.nan)
         return found
 
@@ -360,12 +382,35 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
                 each = [lead_of_motion(s, r) for s, r in zip(signals, truth[:2], strict=True) if s is not None]
                 leads[role] = min((lead for lead in each if lead), key=lambda lead: lead.error, default=None)
             leads[camera] = lead_of_bearings(*seen, place, truth[2])
+        else:
+            leads |= _reckoned(Reckoning(*seen, place), moved) if len(seen[0]) >= FEWEST else {}
         reference = camera.value if truth is None else TRUTH
         found |= {topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
     return found
 
 
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
+
+
+def _reckoned(
+    bearings: Reckoning, moved: Mapping[Role, tuple[Signal | None, Signal | None]]
+) -> dict[Role, Lead | None]:
+    """Return by how much distances and turns are early against bearings, by the role that measures them."""
+    distances = {role: signals[0] for role, signals in moved.items() if signals[0] is not None}
+    turns = {role: signals[1] for role, signals in reversed(list(moved.items())) if signals[1] is not None}
+    if not distances or not turns:
+        return {}
+    (first, distance), (second, turn) = next(iter(distances.items())), next(iter(turns.items()))
+    both = bearings.lead(distance, turn, lambda offset: (offset, offset))
+    if first is second:
+        return {first: both}
+    by, by_turn = [both.seconds if both else 0.0] * 2
+    for _ in range(2):
+        lead_of_turns = bearings.lead(distance, turn, lambda offset, by=by: (by, offset))  # type: ignore[misc]
+        by_turn = lead_of_turns.seconds if lead_of_turns else by_turn
+        lead = bearings.lead(distance, turn, lambda offset, by_turn=by_turn: (offset, by_turn))  # type: ignore[misc]
+        by = lead.seconds if lead else by
+    return {first: lead, second: lead_of_turns}
 
 
 def _of(samples: Sequence[Sample], car: str, role: Role, start: int) -> tuple[Array, list[Any]]:
@@ -418,32 +463,37 @@ def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehi
 
 
 def moves_of(
-    leads: Leads, sources: Mapping[str, str], tolerance: float, fixed: Collection[str], usual: Collection[str]
+    leads: Leads, topics: Sequence[Chosen], tolerance: float, fixed: Set[str], delays: Mapping[str, float]
 ) -> dict[str, int]:
-    """Return what is added to the stamps of topics, ns, so that those of a reference agree.
+    """Return what is added to the stamps of topics, ns, so that they agree with motion capture.
 
-    Where more of the topics with usual delays agree with each other than with the reference, the reference is moved.
+    Where more of the topics with usual delays agree with each other than with motion capture, that is moved. A topic
+    whose motion does not tell goes with one of its car that has the same delay. Offsets from a camera move nothing:
+    dead reckoning has errors of its own.
 
     Args:
         leads: what topics measure.
-        sources: the source of each topic, by the map.
+        topics: all of them.
         tolerance: s up to which stamps agree.
         fixed: topics whose offset is stated.
-        usual: topics whose stamps agree with times of reception.
+        delays: s by which topics are behind their source by times of reception.
     """
-    found: dict[str, float] = {}
-    for reference in {TRUTH}:
-        own = {topic: lead for topic, lead in leads.items() if lead.reference == reference}
-        moved = [topic for topic, source in sources.items() if source == reference]
-        agreed = [lead.seconds for topic, lead in own.items() if topic in usual]
-        offsets = [*([0.0] if any(topic in usual for topic in moved) else []), *sorted(agreed, key=abs)]
-        near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
-        common = float(np.median(max(near, key=len, default=[0.0])))
-        if abs(common) <= tolerance or any(topic in fixed for topic in moved):
-            common = 0.0
-        found |= dict.fromkeys(moved, -common) if common else {}
-        for topic, lead in own.items():
-            rest = replace(lead, seconds=lead.seconds - common)
-            if rest.exceeds(tolerance) and topic not in fixed:
-                found[topic] = rest.seconds
-    return {topic: round(seconds * 1e9) for topic, seconds in found.items()}
+    usual = {topic for topic, delay in delays.items() if abs(delay) <= tolerance}
+    cars = {entry.topic: entry.car for entry in topics}
+    own = {topic: lead for topic, lead in leads.items() if lead.reference == TRUTH and lead.error <= 2.0 * tolerance}
+    moved = [entry.topic for entry in topics if entry.source == TRUTH]
+    agreed = sorted((lead.seconds for topic, lead in own.items() if topic in usual), key=abs)
+    offsets = [*([0.0] if usual.intersection(moved) else []), *agreed]
+    near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
+    common = float(np.median(max(near, key=len, default=[0.0])))
+    if abs(common) <= tolerance or fixed.intersection(moved):
+        common = 0.0
+    found = dict.fromkeys(moved, -common) if common else {}
+    for topic, lead in own.items():
+        rest = replace(lead, seconds=lead.seconds - common)
+        found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
+    for topic in delays.keys() - own.keys() - found.keys():
+        same = [t for t in found.keys() & own.keys() if cars[t] == cars[topic]]
+        if same and abs(delays[same[0]] - delays[topic]) <= tolerance:
+            found[topic] = found[same[0]]
+    return {topic: round(seconds * 1e9) for topic, seconds in found.items() if topic not in fixed}

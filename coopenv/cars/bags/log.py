@@ -26,7 +26,7 @@ from coopenv.base.errors import CoopenvError, DataError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
+from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
@@ -175,12 +175,12 @@ class Track:
         self.outlying = int(wrong.sum())
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
 
-    def is_usual(self, clocks: Clocks, tolerance: float) -> bool:
-        """Return whether its stamps agree with times of reception after those of its source were moved."""
+    def behind(self, clocks: Clocks) -> float | None:
+        """Return by how many s it is behind after stamps of its source were moved; None: not known."""
         delay, shift = self.delay, clocks.shifts.get(self.source)
         if delay is None or shift is None or shift.offset is None:
-            return False
-        return abs(delay.offset + clocks.recorders[self.file] - shift.added) <= tolerance
+            return None
+        return (delay.offset + clocks.recorders[self.file] - shift.added) / NS
 
     def remove_drift(self, drift: float) -> None:
         """Let the clock of the stamps run as fast as the recorder's; `drift` as in `Delay`."""
@@ -353,8 +353,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     samples = _samples(tracks, clocks, {})
     leads = leads_of(samples, chosen, binding) if stamped else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
-    usual = {track.chosen.topic for track in tracks if track.is_usual(clocks, given.clocks.tolerance * NS)}
-    moves = moves_of(leads, {e.topic: e.source for e in chosen}, tolerance / NS, fixed, usual)
+    behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
+    moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
     samples = _samples(tracks, clocks, moves) if moves else samples
     turning = {entry.car for entry in chosen if entry.role is Role.IMU}
     samples = tuple(_without_turn(sample) if sample.car in turning else sample for sample in samples)
@@ -424,20 +424,18 @@ def _lead_notes(
     tracks: Sequence[Track], clocks: Clocks, given: TopicMap, leads: Leads, moves: Mapping[str, int]
 ) -> Iterator[str]:
     """Yield which topics were moved by what they measure, or were not, and the key that states it."""
-    seen = set()
+    seen: set[str] = set()
     for track in tracks:
-        topic, shift, source = track.chosen.topic, clocks.shifts.get(track.source), track.chosen.source
-        lead, added = leads.get(topic), 0 if shift is None else shift.added
-        common = lead is None and topic in moves
-        name, words = (source, f"clock of {source}: not that of most topics") if common else (topic, "")
-        if lead is not None:
-            words = f"{track.chosen.car}: {lead}"
-            if topic not in moves and (moves or not lead.exceeds(given.clocks.tolerance)):
-                continue
-        if words and name not in seen:
-            seen.add(name)
-            moved = moves.get(topic, 0) / NS
-            total = added / NS + (moved if topic in moves or lead is None else lead.seconds)
-            key = f'clocks.offsets = {{ "{name}" = {total:.4f} }}'
-            done = f"stamps were moved by {moved:+.3f} s, as with" if topic in moves else "stamps are unchanged; see"
-            yield f"{words}; {done} {key}"
+        topic, shift, tolerance = track.chosen.topic, clocks.shifts.get(track.source), given.clocks.tolerance
+        lead, added, moved = leads.get(topic), 0 if shift is None else shift.added, moves.get(topic)
+        name = TRUTH if track.chosen.source == TRUTH else topic
+        if name in seen or (moved is None and (lead is None or moves or not lead.exceeds(tolerance))):
+            continue
+        seen.add(name)
+        if moved is None and lead is not None and lead.error <= tolerance / 2:
+            key = f'clocks.offsets = {{ "{name}" = {added / NS + lead.seconds:.4f} }} would move it'
+            yield f"{track.chosen.car}: {lead}; stamps are unchanged, {key}"
+        elif moved is not None:
+            why = f"{track.chosen.car}: {lead}" if lead else f"{name}: its clock is not that of most topics"
+            key = f'clocks.offsets = {{ "{name}" = {(added + moved) / NS:.4f} }}'
+            yield f"{why}; stamps were moved by {moved / NS:+.3f} s, as with {key}"
