@@ -72,7 +72,8 @@ SEARCHED, STEP = 1.0, 0.02
 """s to both sides in which an offset is looked for, and the step of the search."""
 BLOCK = 2.0  # s within which errors are taken as dependent
 SURE = 4.0  # standard errors above which an offset counts
-FLOOR = 0.001  # s, least standard error: rates of topics and interpolation
+FLOOR, PARALLAX = 0.001, 0.015
+"""s, least standard errors: of interpolation, and of turns by bearings, to which the translation adds."""
 UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may remain at the right one
 CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
 FEWEST, MOST = 50, 20_000  # elements compared
@@ -162,9 +163,7 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
     return rest, weights
 
 
-def lead_by(
-    residual: Residual, times: Array, most: float = np.inf, *, scaled: bool = False, step: float = STEP
-) -> Lead | None:
+def lead_by(residual: Residual, times: Array, most: float = np.inf, *, scaled: bool = False) -> Lead | None:
     """Return the offset at which a residual is smallest; None: too few elements, or no clear minimum.
 
     Args:
@@ -172,33 +171,34 @@ def lead_by(
         times: (n,) of its elements, s.
         most: root mean square at the offset above which something else is wrong.
         scaled: whether the first factor of what explains it must be positive.
-        step: of the search, s.
     """
 
     def cost(offset: float) -> float:
         rest, w = fit(*residual(offset), scaled=scaled)
         return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
 
-    tried = np.arange(-SEARCHED, SEARCHED + step / 2, step)
+    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
     costs = np.array([cost(offset) for offset in tried])
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
-    if best in (0, len(tried) - 1) or len(known) < len(tried) / 2 or costs[best] > UNEXPLAINED * known.max():
+    if (
+        best in (0, len(tried) - 1)
+        or len(known) < len(tried) / 2
+        or costs[best] > min(UNEXPLAINED * known.max(), most**2)
+    ):
         return None
-    if costs[best] > most**2:
-        return None
-    offset, h = float(tried[best]), step / 4
+    offset, h = float(tried[best]), STEP / 4
     for _ in range(5):
         rest, w = fit(*residual(offset))
         slope = (fit(*residual(offset + h), w)[0] - fit(*residual(offset - h), w)[0]) / (2 * h)
         information = float((w * slope**2).sum())
         if information <= 0.0:
             return None
-        offset -= float(np.clip((w * slope * rest).sum() / information, -step, step))
+        offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
-    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, FLOOR)))
+    return Lead(offset, float(np.sqrt((blocks**2).sum()) / information))
 
 
-def lead_of_motion(signal: Signal, reference: Signal) -> Lead | None:
+def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
     """Return by how much the stamps of turns or distances are early, by another source of the same."""
     span = reference.times[-1] - reference.times[0]
     begin = np.arange(reference.times[0], reference.times[-1] - INTERVAL, max(STEP, span / MOST))
@@ -208,7 +208,8 @@ def lead_of_motion(signal: Signal, reference: Signal) -> Lead | None:
     def residual(offset: float) -> tuple[Array, Array]:
         return change, np.concatenate([signal.over(begin - offset, end - offset), one], axis=-1)
 
-    return lead_by(residual, begin, scaled=True) if len(begin) >= FEWEST else None
+    lead = lead_by(residual, begin, scaled=True) if len(begin) >= FEWEST else None
+    return replace(lead, error=float(np.hypot(lead.error, least))) if lead else None
 
 
 def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
@@ -237,125 +238,21 @@ def _turned(pose: Array, azimuths: Array, targets: Array, camera: Array) -> Arra
     return wrapped
 
 
-WINDOW = 3.0  # s of dead reckoning from a pose that is fitted
-TURNS = np.linspace(-np.pi, np.pi, 48, endpoint=False)  # headings from which a fit begins
-GRID = 0.01  # s, step of dead reckoning
+def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
+    """Return the heading (n,) by the bearings of standing landmarks, as `lead_of_bearings` has them.
 
-
-class Reckoning:
-    """Bearings of one camera against dead reckoning, in windows whose first poses are fitted."""
-
-    def __init__(self, times: Array, azimuths: Array, targets: Array, camera: Array) -> None:
-        """Take bearings as `lead_of_bearings` does; about MOST / 16 of them are used."""
-        some = slice(None, None, max(1, len(times) * 16 // MOST))
-        self.times, self._azimuths, self._targets, self._camera = times[some], azimuths[some], targets[some], camera
-        self._window = ((self.times - times[0]) / WINDOW).astype(int)
-        self._begin = times[0] + WINDOW * np.arange(self._window[-1] + 1)
-        self._poses = np.zeros((len(self._begin), 3))
-        self._lost = np.zeros(len(self._begin), bool)  # windows whose first pose is not known
-
-    def lead(self, speed: Signal, turn: Signal, shift: Callable[[float], tuple[float, float]]) -> Lead | None:
-        """Return by how much bearings lag behind distances and headings.
-
-        Args:
-            speed: cumulated distances.
-            turn: cumulated turns.
-            shift: what an offset adds to the stamps of distances and of turns, s.
-        """
-
-        self._lost[:] = False
-        self._poses = self._start(*self._moved(speed, turn, *shift(0.0)))
-        e = self._residual(speed, turn, *shift(0.0), keep=True)
-        squared = np.sqrt(self._sums(np.nan_to_num(e) ** 2) / np.maximum(1.0, self._sums(np.isfinite(e) * 1.0)))
-        self._lost = squared > 2.0 * ABSURD
-        longer, biased = (
-            Signal(speed.times, 1.01 * speed.values),
-            Signal(turn.times, turn.values + 0.01 * turn.times[:, None]),
-        )
-        by_errors = [self._residual(*signals, *shift(0.0)) - e for signals in ((longer, turn), (speed, biased))]
-        explained = np.column_stack([np.ones(len(e)), *by_errors])
-
-        def residual(offset: float) -> tuple[Array, Array]:
-            return self._residual(speed, turn, *shift(offset)), explained
-
-        return lead_by(residual, self.times, 0.3 * ABSURD, step=2.0 * STEP)
-
-    def _moved(self, speed: Signal, turn: Signal, later: float, turned: float) -> tuple[Array, Array]:
-        """Return poses (n, 3) of bearings in the frames of their windows' begins, and which are known (n,), 0 or 1."""
-        t = np.arange(self.times[0], self.times[-1] + GRID, GRID)
-        s, heading = speed.at(t - later)[:, 0], turn.at(t - turned)[:, 0]
-        middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(s)
-        known = np.isfinite(step) & np.isfinite(middle)
-        steps = np.where(known, step * np.exp(1j * np.where(known, middle, 0.0)), 0.0)
-        place, unknown = np.concatenate([[0.0], np.cumsum(steps)]), np.concatenate([[0], np.cumsum(~known)])
-
-        def at(times: Array) -> tuple[Array, Array, Array]:
-            return tuple(np.interp(times, t, v) for v in (place.real, place.imag, unknown))
-
-        (x, y, lost), (x0, y0, lost0) = at(self.times), (v[self._window] for v in at(self._begin))
-        h0 = turn.at(self._begin - turned)[self._window, 0]
-        h = turn.at(self.times - turned)[:, 0]
-        moved = (x - x0 + 1j * (y - y0)) * np.exp(-1j * h0)
-        there = (lost - lost0 == 0.0) & np.isfinite(h - h0)
-        return np.column_stack([moved.real, moved.imag, h - h0]), there.astype(np.float64)
-
-    def _sums(self, rows: Array) -> Array:
-        """Return the sums of rows (n, ...) by window."""
-        found = np.zeros((len(self._begin), *rows.shape[1:]))
-        np.add.at(found, self._window, rows)
-        return found
-
-    def _start(self, moved: Array, there: Array) -> Array:
-        """Return (windows, 3) poses by which lines of sight from a heading meet the targets best."""
-        best, least = np.zeros((len(self._begin), 3)), np.full(len(self._begin), np.inf)
-        c, s = np.cos(moved[:, 2]), np.sin(moved[:, 2])
-        lens = moved[:, :2] + np.column_stack(
-            [c * self._camera[0] - s * self._camera[1], s * self._camera[0] + c * self._camera[1]]
-        )
-        lens, moved = np.nan_to_num(lens), np.nan_to_num(moved)
-        for turn in TURNS:
-            sight = turn + moved[:, 2] + self._azimuths
-            n = np.column_stack([-np.sin(sight), np.cos(sight)])
-            rotated = (lens[:, 0] + 1j * lens[:, 1]) * np.exp(1j * turn)
-            offset = self._targets - np.column_stack([rotated.real, rotated.imag])
-            A = self._sums(there[:, None, None] * n[:, :, None] * n[:, None, :]) + 1e-9 * np.eye(2)
-            b = self._sums((there * (n * offset).sum(axis=1))[:, None] * n)
-            place = np.linalg.solve(A, b[..., None])[..., 0]
-            away = offset - place[self._window]
-            ahead = (away * np.column_stack([np.cos(sight), np.sin(sight)])).sum(axis=1)
-            cost = self._sums(there * np.arctan2(np.abs((n * away).sum(axis=1)), ahead) ** 2)
-            better = cost < least
-            best[better] = np.column_stack([place, np.full(len(place), turn)])[better]
-            least = np.minimum(least, cost)
-        return best
-
-    def _residual(self, speed: Signal, turn: Signal, later: float, turned: float, *, keep: bool = False) -> Array:
-        """Return by how much bearings are turned after a fit of the poses; NaN where dead reckoning is not known.
-
-        With `keep`, the fit takes longer and the poses stay.
-        """
-        moved, there = self._moved(speed, turn, later, turned)
-        moved, poses = np.nan_to_num(moved), self._poses.copy()
-        there = there * ~self._lost[self._window]
-        for last in (*([False] * (15 if keep else 3)), True):
-            first = poses[self._window]
-            c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
-            shift = np.column_stack([c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]])
-            pose = np.column_stack([first[:, :2] + shift, first[:, 2] + moved[:, 2]])
-            e = _turned(pose, self._azimuths, self._targets, self._camera)
-            if last or not there.any():
-                break
-            w = there * (np.abs(e) <= CUT * np.quantile(np.abs(e[there > 0.0]), 0.9) + 1e-9)
-            away = self._targets - pose[:, :2]
-            squared = (away**2).sum(axis=1)
-            n = np.column_stack([away[:, 1], -away[:, 0]]) / squared[:, None]  # of the azimuth by the position
-            by_turn = n[:, 1] * shift[:, 0] - n[:, 0] * shift[:, 1] - 1.0
-            J = np.column_stack([n, by_turn])
-            A = self._sums(w[:, None, None] * J[:, :, None] * J[:, None, :]) + 1e-6 * np.eye(3)
-            poses -= np.linalg.solve(A, self._sums((w * e)[:, None] * J)[..., None])[..., 0]
-        self._poses = poses if keep else self._poses
-        found: Array = np.where(there > 0.0, e, np.nan)
-        return found
+    Between two frames it changes by the median change of their azimuths; translation adds a little to that.
+    """
+    frames, at = np.unique(times, return_inverse=True)
+    _, number = np.unique(places, axis=0, return_inverse=True)
+    seen = np.full((len(frames), number.max(initial=0) + 1), np.nan)
+    seen[at, number.ravel()] = azimuths
+    steps = np.angle(np.exp(1j * np.diff(seen, axis=0)))
+    common = np.isfinite(steps).any(axis=1)
+    turned = np.zeros(len(steps))
+    turned[common] = -np.nanmedian(steps[common], axis=1)
+    kept = np.concatenate([[True], common])
+    return Signal(frames[kept], np.concatenate([[0.0], np.cumsum(turned)])[kept]) if common.any() else None
 
 
 CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
@@ -383,34 +280,15 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
                 leads[role] = min((lead for lead in each if lead), key=lambda lead: lead.error, default=None)
             leads[camera] = lead_of_bearings(*seen, place, truth[2])
         else:
-            leads |= _reckoned(Reckoning(*seen, place), moved) if len(seen[0]) >= FEWEST else {}
-        reference = camera.value if truth is None else TRUTH
+            turned = turn_of(*seen)
+            known = {role: turn for role, (_, turn) in moved.items() if turn is not None}
+            leads |= {role: lead_of_motion(turn, turned, PARALLAX) for role, turn in known.items()} if turned else {}
+        reference = f"the camera of {car}" if truth is None else TRUTH
         found |= {topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
     return found
 
 
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
-
-
-def _reckoned(
-    bearings: Reckoning, moved: Mapping[Role, tuple[Signal | None, Signal | None]]
-) -> dict[Role, Lead | None]:
-    """Return by how much distances and turns are early against bearings, by the role that measures them."""
-    distances = {role: signals[0] for role, signals in moved.items() if signals[0] is not None}
-    turns = {role: signals[1] for role, signals in reversed(list(moved.items())) if signals[1] is not None}
-    if not distances or not turns:
-        return {}
-    (first, distance), (second, turn) = next(iter(distances.items())), next(iter(turns.items()))
-    both = bearings.lead(distance, turn, lambda offset: (offset, offset))
-    if first is second:
-        return {first: both}
-    by, by_turn = [both.seconds if both else 0.0] * 2
-    for _ in range(2):
-        lead_of_turns = bearings.lead(distance, turn, lambda offset, by=by: (by, offset))  # type: ignore[misc]
-        by_turn = lead_of_turns.seconds if lead_of_turns else by_turn
-        lead = bearings.lead(distance, turn, lambda offset, by_turn=by_turn: (offset, by_turn))  # type: ignore[misc]
-        by = lead.seconds if lead else by
-    return {first: lead, second: lead_of_turns}
 
 
 def _of(samples: Sequence[Sample], car: str, role: Role, start: int) -> tuple[Array, list[Any]]:
@@ -465,11 +343,10 @@ def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehi
 def moves_of(
     leads: Leads, topics: Sequence[Chosen], tolerance: float, fixed: Set[str], delays: Mapping[str, float]
 ) -> dict[str, int]:
-    """Return what is added to the stamps of topics, ns, so that they agree with motion capture.
+    """Return what is added to the stamps of topics, ns, so that they agree with their reference.
 
-    Where more of the topics with usual delays agree with each other than with motion capture, that is moved. A topic
-    whose motion does not tell goes with one of its car that has the same delay. Offsets from a camera move nothing:
-    dead reckoning has errors of its own.
+    Where more of the topics with usual delays agree with each other than with the reference, that is moved. A topic
+    whose motion does not tell goes with one of its car that has the same delay.
 
     Args:
         leads: what topics measure.
@@ -478,20 +355,23 @@ def moves_of(
         fixed: topics whose offset is stated.
         delays: s by which topics are behind their source by times of reception.
     """
+    found: dict[str, float] = {}
     usual = {topic for topic, delay in delays.items() if abs(delay) <= tolerance}
     cars = {entry.topic: entry.car for entry in topics}
-    own = {topic: lead for topic, lead in leads.items() if lead.reference == TRUTH and lead.error <= 2.0 * tolerance}
-    moved = [entry.topic for entry in topics if entry.source == TRUTH]
-    agreed = sorted((lead.seconds for topic, lead in own.items() if topic in usual), key=abs)
-    offsets = [*([0.0] if usual.intersection(moved) else []), *agreed]
-    near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
-    common = float(np.median(max(near, key=len, default=[0.0])))
-    if abs(common) <= tolerance or fixed.intersection(moved):
-        common = 0.0
-    found = dict.fromkeys(moved, -common) if common else {}
-    for topic, lead in own.items():
-        rest = replace(lead, seconds=lead.seconds - common)
-        found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
+    own = {topic: lead for topic, lead in leads.items() if lead.error <= 2.0 * tolerance}
+    for reference in {lead.reference for lead in own.values()}:
+        moved = [entry.topic for entry in topics if reference == entry.clock]
+        group = {topic: lead for topic, lead in own.items() if lead.reference == reference}
+        agreed = sorted((lead.seconds for topic, lead in group.items() if topic in usual), key=abs)
+        offsets = [*([0.0] if usual & set(moved) else []), *agreed]
+        near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
+        common = float(np.median(max(near, key=len, default=[0.0])))
+        if abs(common) <= tolerance or fixed & set(moved):
+            common = 0.0
+        found |= dict.fromkeys(moved, -common) if common else {}
+        for topic, lead in group.items():
+            rest = replace(lead, seconds=lead.seconds - common)
+            found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
     for topic in delays.keys() - own.keys() - found.keys():
         same = [t for t in found.keys() & own.keys() if cars[t] == cars[topic]]
         if same and abs(delays[same[0]] - delays[topic]) <= tolerance:

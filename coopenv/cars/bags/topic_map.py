@@ -205,6 +205,11 @@ class Chosen:
         """Whose clock makes its stamps."""
         return TRUTH if self.role is Role.TRUTH else self.car
 
+    @property
+    def clock(self) -> str:
+        """Name of its clock as a reference of others."""
+        return f"the camera of {self.car}" if self.role in (Role.DETECTIONS, Role.BEARINGS) else self.source
+
 
 def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chosen]:
     """Return the topics that are read.
