@@ -39,17 +39,18 @@ class Delay:
     offset: int  # in the middle of the file
     drift: float  # per time of reception
     middle: int
+    jump: int = 0  # largest change of its level that is no drift; 0: none
 
 
 def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
     """Return which stamps (n,) are wrong: ahead of those around them, or behind them and out of order."""
     delays = (received - stamps).astype(np.float64)
-    usual = percentile_filter(delays, 20, size=min(NEAR, 2 * (len(delays) // 2) + 1), mode="nearest")
+    usual = percentile_filter(delays, 20, size=min(NEAR, 2 * (len(delays) // 2) + 1), mode="mirror")
     spread = float(np.median(np.abs(delays - np.median(usual)))) if len(delays) else 0.0
     most = max(OUTLYING, 5.0 * min(spread, 20.0 * OUTLYING))
     wrong: NDArray[np.bool_] = delays < usual - most
     reached = np.maximum.accumulate(np.where(wrong, np.iinfo(np.int64).min, stamps))
-    wrong |= (stamps < reached) & (delays > usual + most)
+    wrong |= (stamps < reached) & (delays > usual + 2.0 * most)
     return wrong
 
 
@@ -61,9 +62,13 @@ def delay_of(stamps: Times, received: Times) -> Delay:
     at = np.array([float(np.median(received[part] - middle)) for part in parts])
     if len(parts) < LEAST:
         return Delay(int(low.min()), 0.0, middle)
-    slope, _, least, most = theilslopes((low - low[0]).astype(np.float64), at)
+    level = (low - low[0]).astype(np.float64)
+    slope, _, least, most = theilslopes(level, at)
     drift = float(slope) if least * most > 0.0 else 0.0
-    return Delay(round(float(np.quantile(low - low[0] - drift * at, 0.2))) + int(low[0]), drift, middle)
+    apart = np.abs(level - drift * at - np.median(level - drift * at)) > OUTLYING
+    if apart.mean() > 0.2:
+        return Delay(int(low.min()), 0.0, middle, int(np.ptp(low)))
+    return Delay(round(float(np.quantile(level - drift * at, 0.2))) + int(low[0]), drift, middle)
 
 
 HOLE = 0.25  # s between two messages over which nothing is compared

@@ -182,13 +182,17 @@ class Track:
             return None
         return (delay.offset + clocks.recorders[self.file] - shift.added) / NS
 
-    def remove_drift(self, drift: float) -> None:
-        """Let the clock of the stamps run as fast as the recorder's; `drift` as in `Delay`."""
-        if (delay := self.delay) is not None:
-            gained = [round(drift * (entry.received - delay.middle)) for entry in self.entries]
-            self.entries = [
-                replace(e, stamp=e.stamp + g) if e.stamp else e for e, g in zip(self.entries, gained, strict=True)
-            ]
+    def remove_drift(self, tolerance: float) -> float:
+        """Remove the drift of its clock if that changes the offset by more than a tolerance, ns; return it, or 0."""
+        if (delay := self.delay) is None:
+            return 0.0
+        if abs(delay.drift) * (self.entries[-1].received - self.entries[0].received) <= 2.0 * tolerance:
+            return 0.0
+        gained = [round(delay.drift * (entry.received - delay.middle)) for entry in self.entries]
+        self.entries = [
+            replace(e, stamp=e.stamp + g) if e.stamp else e for e, g in zip(self.entries, gained, strict=True)
+        ]
+        return delay.drift
 
 
 TIMES = ("stamp", "received")
@@ -234,18 +238,6 @@ def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Col
             if known:
                 found[file][name] = min([delay for delay in known if delay >= -tolerance] or known)
     return [*found]
-
-
-def drifts_of(tracks: Sequence[Track], tolerance: float) -> dict[tuple[int, str], float]:
-    """Return drifts of the sources of each file, those alone that change an offset by more than a tolerance, ns."""
-    found = {}
-    for key in {(track.file, track.source) for track in tracks}:
-        own = [track for track in tracks if (track.file, track.source) == key and track.delay is not None]
-        drift = float(np.median([track.delay.drift for track in own if track.delay])) if own else 0.0
-        span = max((track.entries[-1].received - track.entries[0].received for track in own), default=0)
-        if abs(drift) * span / 2 > tolerance:
-            found[key] = drift
-    return found
 
 
 @dataclass(frozen=True)
@@ -346,9 +338,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
     delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
-    drifts = drifts_of(tracks, tolerance)
-    for track in tracks:
-        track.remove_drift(drifts.get((track.file, track.source), 0.0))
+    drifts = {track.chosen.topic: drift for track in tracks if (drift := track.remove_drift(tolerance))}
     clocks = reconcile(delays, tolerance, stated)
     samples = _samples(tracks, clocks, {})
     leads = leads_of(samples, chosen, binding) if stamped else {}
@@ -397,12 +387,13 @@ def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) 
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
-def _notes(
-    tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Mapping[tuple[int, str], float]
-) -> Iterator[str]:
+def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Mapping[str, float]) -> Iterator[str]:
     """Yield what was left out, moved, or used unchanged."""
     for track in tracks:
         total = track.refused.total() + len(track.entries) + track.outlying
+        if track.delay is not None and track.delay.jump:
+            jump = f"its clock jumps by {track.delay.jump / NS:.2g} s"
+            yield f'topic {track.chosen.topic}: {jump}; clocks.mode = "received" needs no stamps'
         if track.outlying:
             yield f"topic {track.chosen.topic}: {track.outlying} of {total} messages left out: wrong stamps"
         if track.refused:
@@ -413,8 +404,8 @@ def _notes(
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
         elif shift.added and source not in given.clocks.offsets:
             yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
-    for (_, source), drift in sorted(drifts.items()):
-        yield f"clock of {source}: drifts by {1e6 * drift:+.0f} us per s, which was removed"
+    for topic, drift in drifts.items():
+        yield f"topic {topic}: its clock drifts by {1e6 * drift:+.0f} us per s, which was removed"
     for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
             yield f"topic {track.chosen.topic}: messages without stamps count when they were received"
