@@ -9,7 +9,7 @@
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ Times = NDArray[np.int64]
 OUTLYING = 50_000_000
 """ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
 NEAR = 101  # messages around one that give its usual delay
-WINDOWS = 20
-LEAST = 10  # messages of a window
+WINDOWS, LEAST = 20, 10  # number of windows, and of messages in one
 
 
 @dataclass(frozen=True)
@@ -127,15 +126,10 @@ class Signal:
         """Return the integral of rates (n,)."""
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)]))
 
-    def at(self, times: Array) -> Array:
-        """Return the values (m, k) at times (m,); NaN beyond the ends and in holes."""
-        return self.over(times, times, level=True)
-
     def over(self, begin: Array, end: Array, *, level: bool = False) -> Array:
-        """Return the changes (m, k) between times (m,), NaN across holes; `level`: the values at the end."""
+        """Return the changes (m, k) between times (m,), NaN across holes; `level`: the values at the ends."""
         first, last = (
-            np.stack([np.interp(t, self.times, v, np.nan, np.nan) for v in self.values.T], axis=-1)
-            for t in (begin, end)
+            np.array([np.interp(t, self.times, v, np.nan, np.nan) for v in self.values.T]).T for t in (begin, end)
         )
         change: Array = last if level else last - first
         change[np.searchsorted(self._from, end) > np.searchsorted(self._to, begin, side="right")] = np.nan
@@ -147,13 +141,9 @@ Residual = Callable[[float], tuple[Array, Array]]
 
 
 def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> tuple[Array, Array]:
-    """Return what N (n, p) leaves of e (n,), 0 where there is none, and weights (n,), 0 or 1, without outliers.
+    """Return what N (n, p) does not explain of e (n,), and weights (n,), 0 or 1, without outliers unless given.
 
-    Args:
-        e: a difference.
-        N: what explains it up to factors.
-        w: weights (None: they are found).
-        scaled: whether the first factor must be positive.
+    With `scaled`, the first factor is not negative.
     """
     there = np.isfinite(e) & np.isfinite(N).all(axis=-1)
     e, N = np.where(there, e, 0.0), np.where(there[:, None], N, 0.0)
@@ -169,13 +159,9 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
 
 
 def lead_by(residual: Residual, times: Array, most: float = np.inf, *, scaled: bool = False) -> Lead | None:
-    """Return the offset at which a residual is smallest; None: too few elements, or no clear minimum.
+    """Return the offset at which a residual, of elements at times (n,), is smallest; None: no clear minimum.
 
-    Args:
-        residual: as a function of the offset.
-        times: (n,) of its elements, s.
-        most: root mean square at the offset above which something else is wrong.
-        scaled: whether the first factor of what explains it must be positive.
+    There is none either if its root mean square is above `most`. `scaled` is as in `fit`.
     """
 
     def cost(offset: float) -> float:
@@ -185,11 +171,9 @@ def lead_by(residual: Residual, times: Array, most: float = np.inf, *, scaled: b
     tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
     costs = np.array([cost(offset) for offset in tried])
     best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
-    if (
-        best in (0, len(tried) - 1)
-        or len(known) < len(tried) / 2
-        or costs[best] > min(UNEXPLAINED * known.max(), most**2)
-    ):
+    if best in (0, len(tried) - 1) or len(known) < len(tried) / 2:
+        return None
+    if costs[best] > min(UNEXPLAINED * known.max(), most**2):
         return None
     offset, h = float(tried[best]), STEP / 4
     for _ in range(5):
@@ -218,29 +202,19 @@ def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> L
 
 
 def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
-    """Return by how much the stamps of bearings are early, by the known path of the car.
+    """Return by how much the stamps of bearings are early, by the known path (x, y, heading) of the car.
 
-    Args:
-        times: (n,) of the bearings, s.
-        azimuths: (n,) in the body frame, rad.
-        targets: (n, 2) positions, map.
-        camera: (2,) position in the body frame.
-        path: x, y and heading.
+    They are (n,) times, s, azimuths in the body frame and (n, 2) targets in the map; the camera is at (2,) in the body.
     """
 
     def residual(offset: float) -> tuple[Array, Array]:
-        return _turned(path.at(times + offset), azimuths, targets, camera), np.ones((len(times), 1))
+        x, y, heading = path.over(times + offset, times + offset, level=True).T
+        away = targets - np.column_stack([x, y])
+        ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
+        return np.angle(ahead * np.exp(-1j * azimuths)), np.ones((len(times), 1))
 
-    return lead_by(residual, times, ABSURD) if len(times) >= FEWEST else None
-
-
-def _turned(pose: Array, azimuths: Array, targets: Array, camera: Array) -> Array:
-    """Return by how much bearings (n,) are turned against those from poses (n, 3), rad."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x = targets[:, 0] - pose[:, 0] - c * camera[0] + s * camera[1]
-    y = targets[:, 1] - pose[:, 1] - s * camera[0] - c * camera[1]
-    wrapped: Array = np.angle(np.exp(1j * (np.arctan2(y, x) - pose[:, 2] - azimuths)))
-    return wrapped
+    lead = lead_by(residual, times, ABSURD) if len(times) >= FEWEST else None
+    return replace(lead, error=float(np.hypot(lead.error, FLOOR))) if lead else None
 
 
 def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
@@ -272,7 +246,11 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
     start = samples[0].stamp if samples else 0
     for car, vehicle in binding.cars.items():
         topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
-        values = {role: _of(samples, car, role, start) for role in topics}
+        values = {}
+        for role in topics:
+            own = [sample for sample in samples if (sample.car, sample.role) == (car, role)]
+            stamps = np.array([(sample.stamp - start) * 1e-9 for sample in own])
+            values[role] = stamps, [cast(Any, sample.value) for sample in own]
         moved = {role: _cumulated(*values[role]) for role in topics if role in ODOMETRY}
         truth = _path(*values[Role.TRUTH]) if Role.TRUTH in topics else None
         camera = next(role for role in CAMERAS if role in topics)
@@ -294,12 +272,6 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
 
 
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
-
-
-def _of(samples: Sequence[Sample], car: str, role: Role, start: int) -> tuple[Array, list[Any]]:
-    """Return times (n,) since a start, s, and values of the samples of a topic."""
-    own = [sample for sample in samples if (sample.car, sample.role) == (car, role)]
-    return np.array([(sample.stamp - start) * 1e-9 for sample in own]), [sample.value for sample in own]
 
 
 def _cumulated(times: Array, values: Sequence[Twist]) -> tuple[Signal | None, Signal | None]:

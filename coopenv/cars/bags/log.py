@@ -17,12 +17,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
@@ -52,10 +51,6 @@ class Clocks:
 
     shifts: Mapping[str, Shift]  # by source
     recorders: tuple[int, ...]  # ns to add to the times of reception of each file
-
-    def is_known(self, source: str) -> bool:
-        """Return whether the offset of a source is known."""
-        return source in self.shifts and self.shifts[source].offset is not None
 
 
 def reconcile(files: Sequence[Delays], tolerance: float, stated: Mapping[str, int]) -> Clocks:
@@ -110,7 +105,7 @@ def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], 
     cameras = binding.scenario.cameras
     calibrations = {name: Calibration.of(cameras[vehicle]) for name, vehicle in binding.cars.items()}
     calibrations |= _published(files, chosen)
-    known = frozenset(binding.targets)
+    known, turning = frozenset(binding.targets), {entry.car for entry in chosen if entry.role is Role.IMU}
     frames = {Role.TRUTH: given.frames.truth or given.frames.map}
 
     def read_value(entry: Chosen, message: Any) -> Value:
@@ -118,6 +113,8 @@ def value_reader(given: TopicMap, binding: Binding, chosen: Collection[Chosen], 
         value = read(entry.role, message, calibration, distorted=given.distorted, known=known)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
+        if isinstance(value, Twist) and entry.role is Role.WHEEL and entry.car in turning:
+            return Twist(value.linear, None)  # the IMU knows better
         return value
 
     return read_value
@@ -166,7 +163,9 @@ class Track:
 
     def drop_outlying(self) -> None:
         """Drop messages with wrong stamps, and measure the delay of the others."""
-        stamps, received = (np.array([getattr(e, name) for e in self.entries], np.int64) for name in TIMES)
+        stamps, received = (
+            np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
+        )
         given = stamps != 0
         wrong = np.zeros(len(given), bool)
         if given.any():
@@ -195,7 +194,6 @@ class Track:
         return delay.drift
 
 
-TIMES = ("stamp", "received")
 APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
@@ -266,7 +264,7 @@ def rows_of(
     samples: Sequence[Sample] = (),
     clocks: Clocks | None = None,
     tracks: Sequence[Track] = (),
-    leads: Leads = MappingProxyType({}),
+    leads: Leads | None = None,
 ) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
     read_as = {entry.topic: entry for entry in chosen}
@@ -285,16 +283,11 @@ def rows_of(
             continue
         stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
         own = [track for track in tracks if track.chosen is entry]
-        delays = [t.delay.offset + clocks.recorders[t.file] for t in own if t.delay and clocks.is_known(t.source)]
-        offset = min(delays) / NS if delays else None
-        lead = leads.get(name)
-        rows.append(
-            TopicRow(
-                *(name, kind, count, *regularity(stamps)[:1], entry.car, entry.role.value, len(stamps)),
-                *(*regularity(stamps)[1:], offset, sum(track.outlying for track in own)),
-                *((None,) * 3 if lead is None else (lead.seconds, lead.error, lead.reference)),
-            )
-        )
+        delays = [behind + clocks.shifts[t.source].added / NS for t in own if (behind := t.behind(clocks)) is not None]
+        (rate, gap, gaps), lead, bad = regularity(stamps), (leads or {}).get(name), sum(track.outlying for track in own)
+        read = (entry.car, entry.role.value, len(stamps), gap, gaps, min(delays, default=None), bad)
+        by_content = () if lead is None else (lead.seconds, lead.error, lead.reference)
+        rows.append(TopicRow(name, kind, count, rate, *read, *by_content))
     return tuple(rows)
 
 
@@ -333,6 +326,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         chosen = select(given, topics, where)
         value, stamped = value_reader(given, binding, chosen, files), given.clocks.mode != "received"
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
+    if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:
+        known = listed(sorted(entry.topic for entry in chosen))
+        raise DataError(f"{given.path.name}: clocks.offsets: {odd[0]} is none of the topics that are read: {known}")
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
@@ -346,16 +342,8 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
     samples = _samples(tracks, clocks, moves) if moves else samples
-    turning = {entry.car for entry in chosen if entry.role is Role.IMU}
-    samples = tuple(_without_turn(sample) if sample.car in turning else sample for sample in samples)
     notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves))
     return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes)
-
-
-def _without_turn(sample: Sample) -> Sample:
-    """Return a sample of wheels without the turn rate, which the IMU measures better; another one unchanged."""
-    wheels = sample.role is Role.WHEEL and isinstance(sample.value, Twist)
-    return replace(sample, value=Twist(sample.value.linear, None)) if wheels else sample  # type: ignore[union-attr]
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -370,12 +358,9 @@ def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
 
 
 def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
-    """Return the samples in the order of their stamps; one that several files have is there once.
+    """Return the samples in the order of their stamps, to which `moves` are added by topic, ns.
 
-    Args:
-        tracks: the messages.
-        clocks: what is added to the stamps of each source.
-        moves: what is added to those of each topic besides, ns.
+    One that several files have is there once.
     """
     found: dict[tuple[str, int], Sample] = {}
     for track in tracks:
@@ -417,16 +402,13 @@ def _lead_notes(
     """Yield which topics were moved by what they measure, or were not, and the key that states it."""
     seen: set[str] = set()
     for track in tracks:
-        topic, shift, tolerance = track.chosen.topic, clocks.shifts.get(track.source), given.clocks.tolerance
+        topic, shift = track.chosen.topic, clocks.shifts.get(track.source)
         lead, added, moved = leads.get(topic), 0 if shift is None else shift.added, moves.get(topic)
         name = TRUTH if track.chosen.source == TRUTH else topic
-        if name in seen or (moved is None and (lead is None or moves or not lead.exceeds(tolerance))):
-            continue
+        why = f"{track.chosen.car}: {lead}" if lead else f"{name}: its clock is not that of most topics"
+        key = f'clocks.offsets = {{ "{name}" ='
+        if moved is not None and name not in seen:
+            yield f"{why}; stamps were moved by {moved / NS:+.3f} s, as with {key} {(added + moved) / NS:.4f} }}"
+        elif lead is not None and not moves and lead.exceeds(given.clocks.tolerance):
+            yield f"{why}; stamps are unchanged, unlike with {key} {added / NS + lead.seconds:.4f} }}"
         seen.add(name)
-        if moved is None and lead is not None and lead.error <= tolerance / 2:
-            key = f'clocks.offsets = {{ "{name}" = {added / NS + lead.seconds:.4f} }} would move it'
-            yield f"{track.chosen.car}: {lead}; stamps are unchanged, {key}"
-        elif moved is not None:
-            why = f"{track.chosen.car}: {lead}" if lead else f"{name}: its clock is not that of most topics"
-            key = f'clocks.offsets = {{ "{name}" = {(added + moved) / NS:.4f} }}'
-            yield f"{why}; stamps were moved by {moved / NS:+.3f} s, as with {key}"
