@@ -322,8 +322,8 @@ def moves_of(
 ) -> dict[str, int]:
     """Return what is added to the stamps of topics, ns, so that they agree with their reference.
 
-    Where more of the topics with usual delays agree with each other than with the reference, that is moved. A topic
-    whose motion does not tell goes with one of its car that has the same delay.
+    Where more of the topics with usual delays agree with each other than with the reference, that is moved. Odometry
+    whose motion does not tell goes with other odometry of its car that has the same delay.
 
     Args:
         leads: what topics measure.
@@ -334,7 +334,7 @@ def moves_of(
     """
     found: dict[str, float] = {}
     usual = {topic for topic, delay in delays.items() if abs(delay) <= tolerance}
-    cars = {entry.topic: entry.car for entry in topics}
+    cars = {entry.topic: entry.car for entry in topics if entry.role in ODOMETRY}
     own = {topic: lead for topic, lead in leads.items() if lead.error <= 2.0 * tolerance}
     for reference in {lead.reference for lead in own.values()}:
         moved = [entry.topic for entry in topics if reference == entry.clock]
@@ -349,8 +349,8 @@ def moves_of(
         for topic, lead in group.items():
             rest = replace(lead, seconds=lead.seconds - common)
             found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
-    for topic in delays.keys() - own.keys() - found.keys():
-        same = [t for t in found.keys() & own.keys() if cars[t] == cars[topic]]
+    for topic in (delays.keys() & cars.keys()) - own.keys():
+        same = [t for t in found.keys() & own.keys() if cars.get(t) == cars[topic]]
         if same and abs(delays[same[0]] - delays[topic]) <= tolerance:
             found[topic] = found[same[0]]
     return {topic: round(seconds * 1e9) for topic, seconds in found.items() if topic not in fixed}
