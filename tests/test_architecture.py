@@ -90,7 +90,7 @@ LINES_AND_FILES = {
     "backends": (3275, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
-    "cars": (7090, 35),
+    "cars": (7540, 36),
     "cli": (2065, 7),
     "estimation": (1720, 8),
     "evaluation": (500, 3),

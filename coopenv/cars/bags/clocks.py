@@ -2,9 +2,8 @@
 
 - By reception: the delay (received - stamp) of a topic is the offset of its clock and the time of transport. Its level
   is a low quantile over windows; a robust line through the windows gives offset and drift.
-- By content: topics of a car measure the same motion. The turn and the distance over intervals by gyro, wheels and
-  motion capture, and the bearings of landmarks from the poses of motion capture, or from dead reckoning without it,
-  agree best at one offset between their stamps. It contains no time of transport.
+- By content: topics of a car measure the same motion. Turns and distances by gyro, wheels and motion capture, and the
+  bearings of landmarks, agree best at one offset between their stamps. It contains no time of transport.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -36,7 +35,7 @@ class Delay:
     """Delay of a topic's messages, (received - stamp), as a line; ns."""
 
     offset: int  # in the middle of the file
-    drift: float  # per time of reception
+    drift: float  # per ns of reception
     middle: int
     jump: int = 0  # largest change of its level that is no drift; 0: none
 
@@ -108,8 +107,7 @@ def written(seconds: float, error: float) -> str:
     return f"{1e3 * seconds:.0f}({max(1.0, 1e3 * error):.0f})"
 
 
-Leads = Mapping[str, Lead]
-"""By topic."""
+Leads = Mapping[str, Lead]  # by topic
 
 
 class Signal:
@@ -158,11 +156,13 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
     return rest, weights
 
 
-def lead_by(residual: Residual, times: Array, most: float = np.inf, *, scaled: bool = False) -> Lead | None:
+def lead_by(residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False) -> Lead | None:
     """Return the offset at which a residual, of elements at times (n,), is smallest; None: no clear minimum.
 
-    There is none either if its root mean square is above `most`. `scaled` is as in `fit`.
+    There is none either if its root mean square is above `most`. `least` is added to the error, `scaled` as in `fit`.
     """
+    if len(times) < FEWEST:
+        return None
 
     def cost(offset: float) -> float:
         rest, w = fit(*residual(offset), scaled=scaled)
@@ -184,7 +184,7 @@ def lead_by(residual: Residual, times: Array, most: float = np.inf, *, scaled: b
             return None
         offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
-    return Lead(offset, float(np.sqrt((blocks**2).sum()) / information))
+    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, least)))
 
 
 def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
@@ -197,8 +197,7 @@ def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> L
     def residual(offset: float) -> tuple[Array, Array]:
         return change, np.concatenate([signal.over(begin - offset, end - offset), one], axis=-1)
 
-    lead = lead_by(residual, begin, scaled=True) if len(begin) >= FEWEST else None
-    return replace(lead, error=float(np.hypot(lead.error, least))) if lead else None
+    return lead_by(residual, begin, np.inf, least, scaled=True)
 
 
 def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
@@ -213,8 +212,7 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
         ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
         return np.angle(ahead * np.exp(-1j * azimuths)), np.ones((len(times), 1))
 
-    lead = lead_by(residual, times, ABSURD) if len(times) >= FEWEST else None
-    return replace(lead, error=float(np.hypot(lead.error, FLOOR))) if lead else None
+    return lead_by(residual, times, ABSURD, FLOOR)
 
 
 def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
@@ -300,12 +298,9 @@ def _path(times: Array, values: Sequence[CarPose]) -> tuple[Signal, Signal, Sign
 
 def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
     """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
-    places = {
-        number: np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker)
-        for number, target in binding.targets.items()
-        if target not in binding.leaders.values() and target < len(binding.scenario.landmarks)
-        for m in [binding.scenario.landmarks[target]]
-    }
+    standing = {k: m for k, m in enumerate(binding.scenario.landmarks) if k not in binding.leaders.values()}
+    marks = {number: standing[target] for number, target in binding.targets.items() if target in standing}
+    places = {k: np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for k, m in marks.items()}
     to_body = binding.scenario.cameras[vehicle].to_body()
     rows = [
         (time, *(to_body @ ray)[:2], *places[marker][:2])
@@ -320,22 +315,15 @@ def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehi
 def moves_of(
     leads: Leads, topics: Sequence[Chosen], tolerance: float, fixed: Set[str], delays: Mapping[str, float]
 ) -> dict[str, int]:
-    """Return what is added to the stamps of topics, ns, so that they agree with their reference.
+    """Return what is added to the stamps of topics, ns, so that they agree with their reference up to a tolerance, s.
 
-    Where more of the topics with usual delays agree with each other than with the reference, that is moved. Odometry
-    whose motion does not tell goes with other odometry of its car that has the same delay.
-
-    Args:
-        leads: what topics measure.
-        topics: all of them.
-        tolerance: s up to which stamps agree.
-        fixed: topics whose offset is stated.
-        delays: s by which topics are behind their source by times of reception.
+    The `fixed` ones stay. Where more topics with small `delays` behind sources, s, agree with each other than with
+    the reference, that is moved. Odometry without a lead goes with other odometry of its car that has the same delay.
     """
     found: dict[str, float] = {}
     usual = {topic for topic, delay in delays.items() if abs(delay) <= tolerance}
     cars = {entry.topic: entry.car for entry in topics if entry.role in ODOMETRY}
-    own = {topic: lead for topic, lead in leads.items() if lead.error <= 2.0 * tolerance}
+    own = {topic: lead for topic, lead in leads.items() if lead.error <= 2.0 * STEP}
     for reference in {lead.reference for lead in own.values()}:
         moved = [entry.topic for entry in topics if reference == entry.clock]
         group = {topic: lead for topic, lead in own.items() if lead.reference == reference}
@@ -350,7 +338,7 @@ def moves_of(
             rest = replace(lead, seconds=lead.seconds - common)
             found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
     for topic in (delays.keys() & cars.keys()) - own.keys():
-        same = [t for t in found.keys() & own.keys() if cars.get(t) == cars[topic]]
+        same = sorted(t for t in found.keys() & own.keys() if cars.get(t) == cars[topic])
         if same and abs(delays[same[0]] - delays[topic]) <= tolerance:
             found[topic] = found[same[0]]
     return {topic: round(seconds * 1e9) for topic, seconds in found.items() if topic not in fixed}

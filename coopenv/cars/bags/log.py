@@ -187,10 +187,9 @@ class Track:
             return 0.0
         if abs(delay.drift) * (self.entries[-1].received - self.entries[0].received) <= 2.0 * tolerance:
             return 0.0
-        gained = [round(delay.drift * (entry.received - delay.middle)) for entry in self.entries]
-        self.entries = [
-            replace(e, stamp=e.stamp + g) if e.stamp else e for e, g in zip(self.entries, gained, strict=True)
-        ]
+        for k, entry in enumerate(self.entries):
+            gained = round(delay.drift * (entry.received - delay.middle)) if entry.stamp else 0
+            self.entries[k] = replace(entry, stamp=entry.stamp + gained)
         return delay.drift
 
 
@@ -220,8 +219,7 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
 def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Collection[str] = ()) -> list[Delays]:
     """Return by how many ns each source is behind the recorder, for each of so many files; set the tracks' sources.
 
-    A topic that is ahead of the recorder by more than the tolerance, ns, does not count where others are not. Topics
-    whose offset is `stated` are sources of their own.
+    Topics ahead of it by more than the tolerance, ns, do not count where others are not; those `stated` are sources.
     """
     found: list[dict[str, int]] = [{} for _ in range(files)]
     for file, source in {(track.file, track.chosen.source) for track in tracks}:
@@ -358,10 +356,7 @@ def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
 
 
 def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
-    """Return the samples in the order of their stamps, to which `moves` are added by topic, ns.
-
-    One that several files have is there once.
-    """
+    """Return the samples, each once, in the order of their stamps, to which `moves` are added by topic, ns."""
     found: dict[tuple[str, int], Sample] = {}
     for track in tracks:
         added, recorder = clocks.shifts.get(track.source), clocks.recorders[track.file]
