@@ -26,7 +26,7 @@ Times = NDArray[np.int64]
 
 OUTLYING = 50_000_000
 """ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
-NEAR = 101  # messages around one that give its usual delay
+WILD, NEAR = 10_000_000_000, 101  # ns between the middle of the delays near one, and a low one, that is no transport
 WINDOWS, LEAST = 20, 10  # number of windows, and of messages in one
 
 
@@ -43,7 +43,9 @@ class Delay:
 def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
     """Return which stamps (n,) are wrong: ahead of those around them, or behind them and out of order."""
     delays = (received - stamps).astype(np.float64)
-    usual = percentile_filter(delays, 20, size=min(NEAR, 2 * (len(delays) // 2) + 1), mode="mirror")
+    size = min(NEAR, 2 * (len(delays) // 2) + 1)
+    low, middle = (percentile_filter(delays, share, size=size, mode="mirror") for share in (20, 50))
+    usual = np.where(middle - low > WILD, middle, low)
     spread = float(np.median(np.abs(delays - np.median(usual)))) if len(delays) else 0.0
     most = max(OUTLYING, 5.0 * min(spread, 20.0 * OUTLYING))
     wrong: NDArray[np.bool_] = delays < usual - most
