@@ -246,7 +246,7 @@ def _export_layout(log: Path, out: Path) -> None:
     options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)
 
 
-WIDTH = 100
+WIDTH = 116
 """Columns of a table that is not for a terminal."""
 
 

@@ -95,8 +95,8 @@ class Lead:
     reference: str = ""  # and of the second
 
     def exceeds(self, tolerance: float) -> bool:
-        """Return whether it is larger than a tolerance, s, and than its error allows."""
-        return abs(self.seconds) > max(tolerance, SURE * self.error)
+        """Return whether it is well larger than a tolerance, s, and than its error allows."""
+        return abs(self.seconds) > max(1.5 * tolerance, SURE * self.error)
 
     def __str__(self) -> str:
         """Return the offset in ms, with its standard error in brackets."""
@@ -333,8 +333,7 @@ def moves_of(
         offsets = [*([0.0] if usual & set(moved) else []), *agreed]
         near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
         common = float(np.median(max(near, key=len, default=[0.0])))
-        if abs(common) <= tolerance or fixed & set(moved):
-            common = 0.0
+        common = 0.0 if abs(common) <= tolerance or fixed & set(moved) else common
         found |= dict.fromkeys(moved, -common) if common else {}
         for topic, lead in group.items():
             rest = replace(lead, seconds=lead.seconds - common)
