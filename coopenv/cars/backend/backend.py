@@ -177,11 +177,8 @@ class Svea:
     def _obstacles(self) -> Iterator[tuple[str, str]]:
         safety, profile = self.deployment.safety, self.binding.profile
         for car in self._local:
-            offset = self.intake.offsets[car].seconds  # other ages depend on it
-            if abs(offset) > safety.max_clock_offset:
-                where = f"{abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'}"
-                allowed = f"{safety.max_clock_offset * 1e3:.0f} ms are allowed"
-                yield car, f"its clock is {where} this computer's, {allowed}: let chrony or PTP synchronise them"
+            clocks = self.intake.unsynchronised(car, safety.max_clock_offset)  # other ages depend on them
+            yield from ((car, f"{why}: let chrony or PTP synchronise them") for why in clocks)
             yield from ((car, why) for why in self.watchdog.silent(car))
             camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
             if (age := self.station.silence(camera)) > safety.odometry_age:
@@ -268,7 +265,7 @@ class Svea:
             "rejections": dict(self.refused),
             "missed_deadlines": self.pacer.missed,
             "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,
-            "clock_offset": self.intake.offsets[name].seconds,
+            "clock_offset": self.intake.offset_of(name),
         }
 
     def _write_down(self, trip: Trip) -> None:
