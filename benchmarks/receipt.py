@@ -66,6 +66,10 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         return False
 
     @device_function
+    def no_mixture(memory: Any, world: int, i: int, most: Any, total: Any):  # type: ignore[no-untyped-def]
+        pass
+
+    @device_function
     def no_readmission(frame: Any, memory: Any, world: int, i: int, n: int, q: int):  # type: ignore[no-untyped-def]
         pass
 
@@ -80,6 +84,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
         "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
+        "covariance of likely faults": [(fault_hypotheses, "set_fault_mixture", no_mixture)],
         "readmission": [(observer, "test_excluded", no_readmission)],
         "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
         "gyro bias": [(constants, "GYRO_BIAS", 1e-6)],

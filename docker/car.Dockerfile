@@ -7,7 +7,8 @@ FROM python:3.11-slim
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 
 COPY . /src
-RUN pip install --constraint /src/constraints.txt '/src[svea]' && rm -rf /src
+RUN pip install --upgrade 'pip>=25.1' && pip install --no-deps /src \
+    && pip install --constraint /src/constraints.txt --group /src/pyproject.toml:gate && rm -rf /src
 
 # Keys and deployment are mounted here, readable for the user that runs the container and nobody else.
 VOLUME /etc/coopenv
@@ -15,9 +16,9 @@ RUN useradd --system --uid 1000 --no-create-home coopenv
 USER coopenv
 
 ENV CAR=svea7
-# No port is exposed: with --network host the gate connects to the car's own bridge or router, [gate] connect, by default
-# tcp/127.0.0.1:7447, and not to what network.connect names, which the radio may part it from.
-HEALTHCHECK --interval=5s --timeout=5s --start-period=10s --retries=3 \
+# No port is exposed: the gate connects to the car's own bridge or router, [gate] connect, and not to what network.connect
+# names, which the radio may part it from. With car-zenoh.json5 that is the unix socket in /run/coopenv, to be mounted.
+HEALTHCHECK --interval=5s --timeout=10s --start-period=10s --retries=3 \
     CMD coopenv svea health /etc/coopenv/fleet.toml --car "$CAR"
 
 # Neutral goes out before the gate does.

@@ -69,7 +69,7 @@ def test_no_deadlock_where_all_receive_each_other(environment: str, agent: str) 
     assert rates["arrival_rate"] >= least and rates["collision_rate"] <= 0.02, rates
 
 
-HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3}
+HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3, "take_turns": 1, "liar_among_us": 2}
 """How many vehicles, the first ones, can help the others."""
 
 
@@ -105,6 +105,20 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
     assert dependent_e95(others, environment) <= 0.8 * dependent_e95(own, environment)
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
     assert unseen[1] > 0.8 * unseen[0]
+    if environment == "liar_among_us":  # only the lie makes cooperation worth anything
+        honest = dependent_e95(team_episodes(environment, "look_ahead", "no lies")[0], environment)
+        assert honest <= 0.5 * dependent_e95(own, environment)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["lighthouse"])
+def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str) -> None:
+    agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
+    selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
+    assert learned["e95_m"][0] <= 1.15 * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
+    assert learned["arrival_rate"][0] >= 0.97 and learned["collision_rate"][0] < 0.01
+    unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
+    assert unseen[2] > 0.8 * unseen[0]
 
 
 LEAST = {"facade": 0.95, "behind_truck": 0.95, "open_square": 0.75}

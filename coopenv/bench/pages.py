@@ -85,15 +85,18 @@ def is_measured(name: str) -> bool:
 
 
 def cooperation_settings(scenario: Scenario) -> dict[str, Mapping[str, Any]]:
-    """Return overrides of the scenario by the name of the setting: without bearings to cars, without messages."""
+    """Return overrides of the scenario by the name of the setting: without bearings to cars, messages, or lies."""
     hidden = {f"vehicles.{i}.marker": (0.0, 0.0, 9.0) for i in range(len(scenario.vehicles))}  # m; above all images
-    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}}
+    lies = [i for i, faults in enumerate(scenario.all_faults) if faults.lie.kind != "none"]
+    honest = {"no lies": {f"vehicles.{i}.faults.lie.kind": "none" for i in lies}} if lies else {}
+    return {"as it is": {}, "cars unseen": hidden, "radio off": {"v2x.range": 1e-3}, **honest}
 
 
-def studied(name: str, scenario: Scenario) -> tuple[tuple[str, str], dict[str, Mapping[str, Any]]]:
+def studied(name: str, scenario: Scenario) -> tuple[tuple[str, ...], dict[str, Mapping[str, Any]]]:
     """Return the drivers that are measured, and the overrides of each setting that they are measured at."""
     if has_value_of_cooperation(name):
-        return TEAM_DRIVERS, cooperation_settings(scenario)
+        learned = [agent for agent in agents_for(name) if agent == f"{name}_team"]
+        return (*TEAM_DRIVERS, *learned), cooperation_settings(scenario)
     return DRIVERS, {how: {"sensing": how} for how in SETTINGS}
 
 
@@ -125,8 +128,8 @@ def write_figures(
     built = contests(environment, scenario, worlds)
     for place, (how, contest) in enumerate(built.items()):
 
-        def report(done: float, name: str, place: int = place, how: str = how) -> None:
-            on_progress((place + done / len(DRIVERS)) / len(built), f"{how}: {name}")
+        def report(done: float, name: str, place: int = place, how: str = how, of: int = len(contest.entrants)) -> None:
+            on_progress((place + done / of) / len(built), f"{how}: {name}")
 
         found = contest.drive(report).rows()
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]

@@ -246,7 +246,7 @@ def _export_layout(log: Path, out: Path) -> None:
     options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)
 
 
-WIDTH = 100
+WIDTH = 116
 """Columns of a table that is not for a terminal."""
 
 
@@ -305,18 +305,25 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
     if as_json:
         options.print_json([*rows])
         return
+    from coopenv.cars.bags.clocks import written
     from coopenv.runs.console import number_table
 
     read = any(row.role for row in rows)
     names = ["topic", "read as" if read else "type"]
-    numbers = ["messages", "rate\n[Hz]", *(["used", "longest\ngap [s]", "gaps", "clock\n[ms]"] if read else [])]
+    numbers = [
+        "messages",
+        "rate\n[Hz]",
+        *(["used", "bad\nstamps", "longest\ngap [s]", "gaps", "clock\n[ms]", "leads\n[ms]"] if read else []),
+    ]
     table = number_table(names, numbers)
     for column in table.columns[: len(names)]:
         column.no_wrap, column.overflow = False, "fold"
     for row in rows:
         about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
         offset = None if row.offset is None else 1e3 * row.offset
-        figures = [(row.rate, 1), *([(row.used, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)] if read else [])]
+        of_read = [(row.used, 0), (row.outlying, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)] if read else []
+        figures = [(row.rate, 1), *of_read]
         shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
-        table.add_row(row.topic, about, str(row.messages), *shown)
+        lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
+        table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
     options.console(least=WIDTH).print(table)

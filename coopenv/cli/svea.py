@@ -8,6 +8,7 @@ import threading
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
+from math import isnan
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
 svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None)
+HARMED = 1
+"""Exit status of an attack that got through."""
 STOPPED = 3
 """Exit status of a run that was stopped: by the watchdog, a person or another station."""
 
@@ -149,6 +152,8 @@ def gate(
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
     with closing(open_transport(fleet)) as transport:
         link = attach(transport, CLOCK)
+        if fleet.network.kind == "zenoh":
+            link.guard()
         interrupts.note(f"{car} is in neutral")
         if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
@@ -164,22 +169,50 @@ def health(
     off_board: options.OffBoard = False,
     patience: Annotated[float, typer.Option(min=0.1, help="s to wait for it.")] = 2.0,
 ) -> None:
-    """Wait for the next status of a car's gate and print it; the exit status is 2 where none comes.
+    """Print the next status of a car's gate, and try from outside a neutral command to the wheels.
 
-    On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
+    The exit status is 2 where no status comes, or where the command gets through: the gate notices it and stops the
+    car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
+    --connect ROUTER --off-board.
     """
+    from coopenv.cars.backend.station import BYPASSED, FOREIGN, neutral_command
+    from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import Role
+    from coopenv.cars.transport.base import UNIX, LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     topic = fleet.profile.topic_of(car, Role.GATE)
     with closing(open_transport(fleet)) as transport:
         status = next_status(transport, topic, patience)
-    if status is None:
-        raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}")
-    refused = sum(int(count) for count in status.counts)
-    print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
+        if status is None:
+            unset = not off_board and UNIX not in fleet.gate_connect[0]
+            hint = "; with docker/car-zenoh.json5 set [gate] connect" if unset else ""
+            raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}{hint}")
+        refused = sum(int(count) for count in status.counts)
+        print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
+        (after, way), v = fleet.safety.stopping(fleet.limits.speed), fleet.limits.speed
+        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration")
+        if fleet.network.kind != "zenoh":
+            return
+        foreign = _count(status, FOREIGN)
+        try:
+            lab = load_deployment(deployment, connect if off_board else None)
+            with closing(open_transport(lab, timeout=1.0)) as outside:
+                outside.publish(*neutral_command(fleet.profile, car), reliable=True)
+                for _ in range(2):  # the first may have been under way
+                    status = next_status(transport, topic, patience) or status
+        except LinkError as error:
+            print(f"{car}: not tried from outside: {error}")
+            return
+    if _count(status, FOREIGN) > foreign:
+        raise CoopenvError(f"{car}: {BYPASSED}")
+    print(f"{car}: a command to its wheels from outside does not get through")
+
+
+def _count(status: Any, reason: str) -> int:
+    return int(dict(zip(status.rejections, status.counts, strict=True)).get(reason, 0))
 
 
 def next_status(transport: "Transport", topic: str, patience: float) -> Any | None:
@@ -241,16 +274,68 @@ def router(
         list[str] | None,
         typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="File of Zenoh (JSON5), e.g. docker/car-zenoh.json5. --listen replaces its endpoints."),
+    ] = None,
 ) -> None:
     """Run a Zenoh router until it is interrupted; a line marks when it is ready."""
     from coopenv.base import interrupts
     from coopenv.cars.transport.zenoh import open_zenoh
 
-    endpoints = listen or ["tcp/127.0.0.1:7447"]
-    with closing(open_zenoh("router", listen=endpoints)):
+    endpoints = listen or ([] if config else ["tcp/127.0.0.1:7447"])
+    with closing(open_zenoh("router", listen=endpoints, config=config)):
         interrupts.note("the router is gone")
-        print(f"router ready at {', '.join(endpoints)}", flush=True)
+        print(f"router ready at {', '.join(endpoints) or f'the endpoints of {config}'}", flush=True)
         threading.Event().wait()
+
+
+@svea.command()
+def attack(
+    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="A fleet at a stand.")],
+    commands: Annotated[int, typer.Option(min=1, help="Messages of all kinds together, at least.")] = 10_000,
+    host: Annotated[
+        list[str] | None, typer.Option(help="Address of a car, whose open ports are looked for. Repeatable.")
+    ] = None,
+    connect: options.Connect = None,
+    seed: options.Seed = 0,
+    yes: Annotated[bool, typer.Option("--yes", help="Attack real cars without a question.")] = False,
+) -> None:
+    """Attack a fleet at a stand as a program without keys would: nothing may move a car.
+
+    Lists per kind of attack what was sent, what the gates refused, what got through, and the fastest car. The exit
+    status is 1 where anything got through or a port is open. An armed fleet is refused. Gates are stopped afterwards
+    if anything got through.
+    """
+    from coopenv.cars.attack import Intruder, open_ports, plan, refuse_driven
+    from coopenv.cars.attack import attack as attacked
+    from coopenv.cars.deployment import load_deployment
+    from coopenv.runs.console import Progress, number_table
+
+    fleet, log, out = load_deployment(deployment, connect), options.console(stderr=True), options.console()
+    cars = [car.name for car in fleet.cars if car.landmark is None]
+    ports = [port for each in host or () for port in open_ports(each)]
+    with closing(Intruder(fleet, cars, seed)) as intruder:
+        refuse_driven(intruder)
+        print(plan(intruder, fleet, commands), file=sys.stderr)
+        if not (yes or fleet.fakes) and not (sys.stdin.isatty() and typer.confirm("Attack?", err=True)):
+            raise CoopenvError("no attack on real cars without a yes (--yes)")
+        table = number_table(["\nattack"], ("\nsent", "refused\nby gate", "got\nthrough", "fastest\n[m/s]"))
+        sent, bad = 0, list[str]()
+        with Progress(log, "attacks", len(intruder.kinds())) as progress:
+            for found in attacked(intruder, commands):
+                sent += found.sent
+                bad += [found.what] if found.harmful else []
+                speed = "?" if isnan(found.speed) else f"{found.speed:.2f}"
+                cells = found.sent, found.refused, found.through, speed
+                table.add_row(found.what, *map(str, cells))
+                progress.advance()
+    out.print(table)
+    out.print(f"{len(bad)} of {len(table.rows)} kinds got through, of {sent} messages: {'; '.join(bad) or 'none'}.")
+    if host:
+        out.print(f"Open ports: {', '.join(ports) or 'none of those that should be closed'}.")
+    if bad or ports:
+        raise typer.Exit(HARMED)
 
 
 @dataclass(frozen=True, kw_only=True)

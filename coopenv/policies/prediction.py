@@ -75,8 +75,8 @@ class PlanarCovariance(NamedTuple):
         """
         shape = odds.shape[:-1]
         parts = np.stack([np.broadcast_to(part, shape).ravel() for part in self])
-        count = odds.shape[-1]
-        offset, variance, odds = offset.reshape(-1, count, 2), variance.reshape(-1, count), odds.reshape(-1, count)
+        flat = parts.shape[1], (count := odds.shape[-1])
+        offset, variance, odds = offset.reshape(*flat, 2), variance.reshape(flat), odds.reshape(flat)
         for k in range(count):
             rows = np.flatnonzero(odds[:, k] > LEAST_ODDS)
             if len(rows):

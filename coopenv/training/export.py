@@ -110,9 +110,10 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
         },
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
+    begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {environment.title}",
-        "description": f"PPO, one policy for all vehicles{arm}, seed {plan.seed}.",
+        "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
         "kind": "learned",
         "entry": ENTRY,
         "environments": [environment.name],

@@ -120,8 +120,8 @@ class EvaluationSettings(Section):
 class Settings(Section):
     """Everything that decides how a training goes, but for environment and seed."""
 
-    steps: Count | None = None
-    """Length of the training, decisions of vehicles (default: 2 million)."""
+    steps: Annotated[int, Field(ge=0, le=2**31)] | None = None
+    """Length of the training, decisions of vehicles (default: 2 million); 0: the clone alone."""
     minutes: Positive | None = None
     """Length of the training, min, instead of `steps`."""
     scenario: dict[str, Any] = Field(default={})
@@ -139,7 +139,7 @@ class Settings(Section):
         """Steps and seconds at which to end; one of them is None."""
         if self.minutes is not None:
             return None, 60.0 * self.minutes
-        return self.steps or 2_000_000, None
+        return 2_000_000 if self.steps is None else self.steps, None
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ class NormalisedEnv(VecEnvWrapper):
         super().__init__(venv, observation_space=spaces.Box(-clip, clip, shape=shape, dtype=np.float32))
         self.statistics = RunningMeanStd(shape=shape or ())
         self._clip, self._reward_scale = clip, reward_scale
-        self._seen: deque[np.ndarray] = deque(maxlen=SEEN)
+        self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
 
     def start(self) -> None:
@@ -191,7 +191,10 @@ class NormalisedEnv(VecEnvWrapper):
 
     def seen(self, columns: slice) -> tuple[float, float]:
         """Return between which values nearly all of some entries of the last observations lay."""
-        low, high = np.percentile(np.concatenate(self._seen)[:, columns], (0.1, 99.9))
+        known = self.looked_at or [
+            self.statistics.mean + 3.0 * self.std * np.array([[-1.0], [1.0]])
+        ]  # none: just resumed
+        low, high = np.percentile(np.concatenate(known)[:, columns], (0.1, 99.9))
         return round(float(low), 4), round(float(high), 4)
 
     def reset(self) -> np.ndarray:
@@ -208,7 +211,7 @@ class NormalisedEnv(VecEnvWrapper):
         observations, rewards, dones, infos = self.venv.step_wait()
         if self.venv.acted.any():
             self.statistics.update(observations[self.venv.acted])
-            self._seen.append(observations[self.venv.acted])
+            self.looked_at.append(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
         return self.normalise(observations), rewards * self._reward_scale, dones, infos
@@ -321,26 +324,20 @@ class Trainer:
         """
         policy, ppo, seed = self.model.policy, self.plan.settings.ppo, self.plan.seed
         all_worlds, threads = sum(count for _, count in self._scenarios), self.batch.engine.world.threads
-        watched = [
-            watch(
-                each,
-                max(1, clone.episodes * count // all_worlds),
-                clone,
-                ppo.gamma,
-                seed + APART * place,
-                threads,
-                report,
-            )
-            for place, (each, count) in enumerate(self._scenarios)
-        ]
+        watched = []
+        for place, (each, count) in enumerate(self._scenarios):
+            worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
+            watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report))
         raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))
         self.env.statistics.update(raw)
+        self.env.looked_at.append(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
         values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
         optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
         shuffle = torch.Generator().manual_seed(seed)
         for epoch in range(clone.epochs):
+            optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
             report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
             for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
                 latent_policy, latent_value = policy.mlp_extractor(observations[rows])
@@ -399,7 +396,8 @@ class Trainer:
 
     def _spent(self) -> float:
         steps, seconds = self.plan.settings.budget
-        return min(1.0, self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf))
+        share = self.model.num_timesteps / steps if steps else self.seconds / (seconds or math.inf)
+        return 1.0 if steps == 0 else min(1.0, share)
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""

@@ -355,3 +355,13 @@ def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyP
     with pytest.raises(CoopenvError, match="--onnx needs the package onnx"):
         train(TrainingPlan("urban_crossing", read_settings(here / "train.toml"), 0), Path("agent"), onnx=True)
     assert not (here / "agent").exists()
+
+
+def test_a_clone_alone_is_an_agent(here: Path) -> None:
+    (here / "train.toml").write_text(
+        "steps = 0\nclone = { agent = 'peek', episodes = 1, epochs = 2 }\n" + SETTINGS.split("\n", 2)[2]
+    )
+    assert main(fresh()) == 0
+    card = read_card(here / "agent")
+    assert card.training["steps"] == 0 and card.network and card.network.seen
+    assert not (here / "agent" / "checkpoint.safetensors").exists()

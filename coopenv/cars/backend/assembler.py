@@ -190,7 +190,7 @@ class Assembler:
                 bearings[target], visible[target] = self._to_body[i] @ ray, True
 
 
-WINDOW = 2_000_000_000  # ns over which the least delay is looked for
+WINDOW = 2_000_000_000  # ns over which delays are looked at; a tenth of their stamps may be wrong
 
 BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 """Messages between cars."""
@@ -198,23 +198,21 @@ BROADCAST = (Role.ESTIMATE, Role.POINT, Role.REPORT)
 
 @dataclass
 class ClockOffset:
-    """Least delay of a car's messages between stamp and reception; times in ns."""
+    """Low quantile of the delays of a topic's messages between stamp and reception; times in ns."""
 
-    _least: deque[tuple[int, int]] = field(default_factory=deque)  # time of reception, delay; increasing delays
+    _delays: deque[tuple[int, int]] = field(default_factory=deque)  # time of reception, delay
 
     def put(self, stamp: int, received: int) -> None:
         """Take a message."""
-        delay = received - stamp
-        while self._least and self._least[-1][1] >= delay:
-            self._least.pop()
-        self._least.append((received, delay))
-        while self._least[0][0] < received - WINDOW:
-            self._least.popleft()
+        self._delays.append((received, received - stamp))
+        while self._delays[0][0] < received - WINDOW:
+            self._delays.popleft()
 
     @property
     def seconds(self) -> float:
-        """Offset of the car's clock behind the receiver's, network delay included, s; NaN: no message yet."""
-        return self._least[0][1] * 1e-9 if self._least else float("nan")
+        """Offset of the topic's clock behind the receiver's, transport included, s; NaN: no message yet."""
+        delays = sorted(delay for _, delay in self._delays)
+        return delays[len(delays) // 10] * 1e-9 if delays else float("nan")
 
 
 class Intake:
@@ -223,7 +221,6 @@ class Intake:
     def __init__(self, binding: Binding, sensors: Sensors) -> None:
         """Collect the topics that are read."""
         self._sensors, self._profile = sensors, binding.profile
-        self.offsets = {name: ClockOffset() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
         self.calibrations = {name: Calibration.of(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
@@ -238,6 +235,7 @@ class Intake:
             for role in some
         }
         """Car, role and camera of the topics that are read, by name."""
+        self.offsets = {topic: ClockOffset() for topic, (name, _, _) in self.topics.items() if name in binding.cars}
 
     def samples(self, arrival: Arrival) -> Iterator[Sample]:
         """Yield the sample of a message, or none if the message is malformed."""
@@ -254,6 +252,26 @@ class Intake:
             return
         if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
             value = Twist(value.linear, None)  # the IMU's turn rate alone counts
-        if car in self.offsets and role is not Role.TRUTH:
-            self.offsets[car].put(stamp, arrival.received)
+        if arrival.topic in self.offsets:
+            self.offsets[arrival.topic].put(stamp, arrival.received)
         yield Sample(car, role, stamp, arrival.received, value)
+
+    def offset_of(self, car: str) -> float:
+        """Return the least offset of the topics of a car, without motion capture, s; NaN: no message yet."""
+        own = (topic for topic, (name, role, _) in self.topics.items() if name == car and role is not Role.TRUTH)
+        return min((found for topic in own if (found := self.offsets[topic].seconds) == found), default=float("nan"))
+
+    def unsynchronised(self, car: str, most: float) -> Iterator[str]:
+        """Yield the clocks of a car and of its topics that are off by more than `most`, s.
+
+        Frames of a camera may be behind by their maximal age besides, which is exposure and processing.
+        """
+        found = [("its clock is", self.offset_of(car), most)]
+        for topic, (name, role, _) in self.topics.items():
+            if name == car:
+                age = self._profile.topics[role].max_age if KINDS.get(role) == "frame" else None
+                found.append((f"stamps of {topic} are", self.offsets[topic].seconds, most + (age or 0.0)))
+        for what, offset, behind in found:
+            if not -most <= offset <= behind and offset == offset:
+                side, allowed = ("behind", behind) if offset > 0.0 else ("ahead of", most)
+                yield f"{what} {abs(offset) * 1e3:.0f} ms {side} this computer's, {allowed * 1e3:.0f} ms are allowed"

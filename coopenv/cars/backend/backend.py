@@ -24,13 +24,14 @@ from coopenv.cars.backend.binding import (
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
 from coopenv.cars.backend.station import Gates, Pacer, Station
 from coopenv.cars.backend.status import ROLES, StatusBoard
-from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, since
+from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
 from coopenv.cars.codec import encode, make, warm_up
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, load_keys
 from coopenv.cars.profile import RESET_TOPIC, VELOCITY, Role, presence_of
 from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.zenoh import open_transport
+from coopenv.estimation.poses import left_covariance
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import OVERRIDES
@@ -86,6 +87,9 @@ class Svea:
         """Samples that were not used, by reason."""
         self.pacer = Pacer(1.0 / self.scenario.rates.camera, self.scenario.ticks_per_decision)
         self._origin = np.array(self.scenario.map.origin)
+        landmarks = self.scenario.landmarks
+        self._landmarks = np.array([mark.position for mark in landmarks]).reshape(-1, 3) - self._origin
+        self._static = np.array([mark.motion.kind == "static" for mark in landmarks], dtype=bool)
         self._armed, self._received_once, self._began, self._index = False, False, 0, 0
         self._key, self._episode = 0, 0
         self._closed = threading.Lock()
@@ -94,10 +98,10 @@ class Svea:
         cars, others = tuple(self._local), tuple(name for name in fleet if name not in self._local)
         self._odometry = VELOCITY[deployment.sensors.odometry]
         self.intake, self._assembler = Intake(binding, deployment.sensors), Assembler(binding)
-        identity = deployment.security.identity
+        identity, zenoh = deployment.security.identity, deployment.network.kind == "zenoh"
         signers = {profile.topic_of(name, role): (name, identity) for name in fleet for role in BROADCAST}
         self.station = Station(transport, self.intake.topics, verifier, signers)
-        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile)
+        self.gates = Gates(transport, cars, deployment.limits, signer, verifier, profile, zenoh)
         self.board = StatusBoard(transport, cars, deployment.remote, deployment.conditions, profile)
         self.monitor = LinkMonitor(deployment.safety.judge)
         self.watchdog = Watchdog(
@@ -173,11 +177,8 @@ class Svea:
     def _obstacles(self) -> Iterator[tuple[str, str]]:
         safety, profile = self.deployment.safety, self.binding.profile
         for car in self._local:
-            offset = self.intake.offsets[car].seconds  # other ages depend on it
-            if abs(offset) > safety.max_clock_offset:
-                where = f"{abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'}"
-                allowed = f"{safety.max_clock_offset * 1e3:.0f} ms are allowed"
-                yield car, f"its clock is {where} this computer's, {allowed}: let chrony or PTP synchronise them"
+            clocks = self.intake.unsynchronised(car, safety.max_clock_offset)  # other ages depend on them
+            yield from ((car, f"{why}: let chrony or PTP synchronise them") for why in clocks)
             yield from ((car, why) for why in self.watchdog.silent(car))
             camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
             if (age := self.station.silence(camera)) > safety.odometry_age:
@@ -220,6 +221,7 @@ class Svea:
         self.monitor.looked = self.pacer.now()
 
     def _counted(self, tick: Sensed) -> Sensed:
+        self._tick = tick
         self.health.count(tick, list(self.binding.local))
         refused = sum(self.intake.rejected.values(), self._assembler.refused + self.station.dropped)
         self.refused, self.health.rejected = dict(refused), sum(refused.values())
@@ -231,11 +233,23 @@ class Svea:
             name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
             if not all(np.isfinite(part).all() for part in (each.rotation, each.position, each.covariance)):
                 continue
+            self._judge(name, each)
             if self.deployment.safety.judge == "estimate":
                 self.monitor.place(name, each.position + self._origin, moment)
             self.gates.send(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
             if (report := report_message(each, moment, self._origin)) is not None:
                 self.gates.send(name, Role.REPORT, report)
+
+    def _judge(self, name: str, sent: VehicleBroadcast) -> None:
+        """Compare an estimate with the truth, the bearings and its own covariance at its tick."""
+        tick, i = self._tick, sent.vehicle
+        seen = np.flatnonzero(tick.visible[i][: len(self._static)] & self._static)
+        R, p, P = sent.rotation, sent.position, sent.covariance
+        stated, lever = bool(P.any()), np.array(self.scenario.cameras[i].position)
+        nis = bearing_nis(sent, self._landmarks[seen], lever, tick.bearings[i][seen]) if stated else np.zeros(0)
+        std = float(np.sqrt(max(np.linalg.eigvalsh(left_covariance(R.T @ p, P)[3:, 3:])[-1], 0.0)))
+        error = float("nan") if tick.truth is None else float(np.linalg.norm(p - tick.truth.position[i]))
+        self.monitor.judge(name, self.deployment.safety, error, std, nis)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""
@@ -251,7 +265,7 @@ class Svea:
             "rejections": dict(self.refused),
             "missed_deadlines": self.pacer.missed,
             "lateness": self.pacer.lateness[-1] if self.pacer.lateness else 0.0,
-            "clock_offset": self.intake.offsets[name].seconds,
+            "clock_offset": self.intake.offset_of(name),
         }
 
     def _write_down(self, trip: Trip) -> None:

@@ -12,8 +12,9 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
+from coopenv.cars.gate.core import write_drive
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.profile import GATE_TYPES, SVEA, CarProfile, Limits, Role
+from coopenv.cars.profile import GATE_TYPES, NEUTRAL, SVEA, CarProfile, Limits, Role
 from coopenv.cars.transport.base import Arrival, Transport
 
 MOST_WAITING = 256
@@ -162,6 +163,7 @@ class GateState:
     nonce: str = ""
     stamp: int = 0  # ns, by the clock of the car
     rejections: dict[str, int] = field(default_factory=dict)
+    accepted: int = 0  # commands, since its start
     received: float = float("-inf")  # by the monotonic clock, s
 
     @property
@@ -181,10 +183,14 @@ class Gates:
         signer: Signer | None,
         verifier: Verifier | None = None,
         profile: CarProfile = SVEA,
+        probed: bool = True,
     ) -> None:
-        """Listen to the gates; with a verifier only to what they have signed."""
+        """Listen to the gates; with a verifier only to what they have signed.
+
+        Unless not `probed`, arming tries from here a neutral command to the wheels: a gate that notices it stays shut.
+        """
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self.profile, self._lock = profile, threading.Lock()
+        self.profile, self._probed, self._lock = profile, probed, threading.Lock()
         self._states = {car: GateState() for car in cars}
         self._before: dict[str, dict[str, int]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
@@ -233,7 +239,8 @@ class Gates:
             if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
                 return
-            self._states[car] = GateState(m.state, m.session, m.nonce, stamp, counts, time.monotonic())
+            known = m.state, m.session, m.nonce, stamp, counts, int(m.accepted)
+            self._states[car] = GateState(*known, time.monotonic())
             if m.state == "stopped" and not self._stopping:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)
@@ -260,11 +267,15 @@ class Gates:
                 if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
                     self.end()
                     self.stopped_by_others.add(car)
+                    if states[car].rejections.get(FOREIGN, 0) > before[car].rejections.get(FOREIGN, 0):
+                        raise CoopenvError(f"not armed: {car}: {BYPASSED}")
                     raise CoopenvError(f"{car}: was stopped while it was being armed")
             if time.monotonic() > until:
                 self.end()
                 raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
+                if self._probed:  # like the arming, so that it comes before it
+                    self._transport.publish(*neutral_command(self.profile, car), reliable=True)
                 self._arm(car, True, states[car].nonce)  # of that status: a later stop invalidates it
             time.sleep(5 * POLL)
         with self._lock:
@@ -330,6 +341,19 @@ class Gates:
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
         kind = self.profile.topics[role]
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
+
+
+FOREIGN = "foreign"
+"""Under which a gate counts commands to the wheels that it has not sent."""
+BYPASSED = (
+    "commands get to its wheels without its gate: give its bridge docker/car-zenoh.json5 "
+    "(docs/cars_safety.md#ways-around-the-gate)"
+)
+
+
+def neutral_command(profile: CarProfile, car: str) -> tuple[str, bytes]:
+    """Return topic and bytes of a command to the wheels of a car to stand, such as its gate alone may send."""
+    return profile.topic_of(car, Role.MANUAL), write_drive(time.time_ns(), profile.command, NEUTRAL)
 
 
 def _why_closed(before: GateState, now: GateState) -> str:

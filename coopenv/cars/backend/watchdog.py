@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,12 +11,13 @@ from typing import Literal
 
 import numpy as np
 
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.station import OLD, OPEN, Gates, Station
+from coopenv.cars.backend.station import BYPASSED, FOREIGN, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
-from coopenv.estimation.poses import Array
+from coopenv.estimation.poses import Array, skew
 from coopenv.observers.contract import Message
 
 
@@ -25,6 +27,37 @@ class Place:
 
     position: Array  # (3,) m, in the coordinates of the scenario's file
     time: int  # ns, when that was known
+    velocity: Array  # (3,) m/s, the mean over `VELOCITY_TIME`
+
+
+def bearing_nis(sent: VehicleBroadcast, landmarks: Array, lever: Array, bearings: Array) -> Array:
+    """Return the normalised innovation squared per degree of freedom (m,) of bearings to landmarks.
+
+    Args:
+        sent: the estimate.
+        landmarks: (m, 3) map, m.
+        lever: (3,) of the camera in the body frame, m.
+        bearings: (m, 3) measured, unit vectors in the body frame.
+    """
+    found = []
+    for landmark, bearing in zip(landmarks, bearings, strict=True):
+        seen = sent.rotation.T @ landmark  # of it the error of (2 lambda, p) takes [seen]x and -I
+        ray = seen - sent.rotation.T @ sent.position - lever
+        distance = max(float(np.linalg.norm(ray)), 1e-3)
+        across = np.eye(3) - np.outer(ray, ray) / distance**2
+        J = across @ np.hstack([skew(seen), -np.eye(3)]) / distance
+        tangent = across @ bearing
+        angle = np.arctan2(np.linalg.norm(tangent), bearing @ ray / distance)
+        r = tangent / max(float(np.linalg.norm(tangent)), 1e-9) * angle
+        found.append(float(r @ np.linalg.solve(J @ sent.covariance @ J.T + BEARING_STD**2 * np.eye(3), r)) / 2.0)
+    return np.array(found)
+
+
+BEARING_STD = 0.01  # rad, with calibration
+NIS_TIME = 1_000_000_000  # ns over which the median is taken
+FEWEST = 8  # bearings of which it is taken
+LASTING = 0.2  # s
+VELOCITY_TIME = 200_000_000  # ns
 
 
 class LinkMonitor:
@@ -45,6 +78,9 @@ class LinkMonitor:
         """Replaced as a whole whenever one changes."""
         self.looked = self._begun = now
         """When messages were looked at last."""
+        self._nis: dict[str, deque[tuple[int, float]]] = {}
+        self._recent: dict[str, deque[Place]] = {}
+        self._doubts: dict[str, tuple[str, int]] = {}  # why an estimate is wrong, and since when, ns
 
     def put(self, sample: Sample) -> None:
         """Take a sample that is newer than all before of its car and role."""
@@ -58,7 +94,45 @@ class LinkMonitor:
     def place(self, car: str, position: Array, time: int) -> None:
         """Set the position of a car, m, and the time at which it was known, ns."""
         if np.isfinite(position).all():
-            self.places = {**self.places, car: Place(position, time)}
+            recent = self._recent.setdefault(car, deque())
+            while len(recent) > 1 and recent[1].time <= time - VELOCITY_TIME:
+                recent.popleft()
+            lasted, velocity = time - recent[0].time if recent else 0, np.zeros(3)
+            if lasted > VELOCITY_TIME // 2:  # noise counts for too much before
+                velocity = (position - recent[0].position) / (lasted * 1e-9)
+            recent.append(Place(position, time, velocity))
+            self.places = {**self.places, car: recent[-1]}
+
+    def judge(self, car: str, safety: Safety, error: float, std: float, nis: Array) -> None:
+        """Compare an estimate with the limits.
+
+        Args:
+            car: its name.
+            safety: limits.
+            error: distance to the true position, m; NaN: not known.
+            std: of its position, m.
+            nis: per degree of freedom, of the bearings of its tick.
+        """
+        now, recent = self.looked, self._nis.setdefault(car, deque())
+        recent.extend((now, float(value)) for value in nis)
+        while recent and recent[0][0] < now - NIS_TIME:
+            recent.popleft()
+        median = float(np.median([value for _, value in recent])) if len(recent) >= FEWEST else 0.0
+        found = ((error, "max_error", " m from motion capture"), (std, "max_std", " m uncertain"))
+        measured = (*found, (median, "max_nis", " squared standard deviations from its bearings"))
+        for value, name, what in measured:
+            most = getattr(safety, name)
+            if most is not None and value > most:
+                why = f"its estimate is {value:.3g}{what}, safety.{name} = {most:g}"
+                since_when = self._doubts[car][1] if car in self._doubts else now
+                self._doubts[car] = why, since_when
+                return
+        self._doubts.pop(car, None)
+
+    def doubt(self, car: str) -> str:
+        """Return why the estimate of a car has been wrong for too long; empty: it has not."""
+        why, since_when = self._doubts.get(car, ("", self.looked))
+        return why if (self.looked - since_when) * 1e-9 > LASTING else ""
 
     def age(self, car: str, role: Role) -> float:
         """Return the age of a sensor's last message when messages were looked at last, s; inf: none was received."""
@@ -204,13 +278,14 @@ class Watchdog:
             yield from ((car, why) for why in self.silent(car))
             if not self._present[presence_of(car)]:
                 yield car, "is gone"
-            if why := self._happened(car):
+            if why := self._happened(car) or self._monitor.doubt(car):
                 yield car, why
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
                 yield car, f"its gate is silent for {gate.age:.2f} s"
             elif gate.state not in OPEN:
-                yield car, f"its gate is {gate.state}"
+                foreign = self._gates.refused(car).get(FOREIGN)
+                yield car, f"its gate is {gate.state}" + (f": {foreign} {BYPASSED}" if foreign else "")
             elif gate.session != self._gates.session:
                 yield car, "another station has armed its gate"
         missed, beat = self._safety.missed_deadlines, self._beat
@@ -245,13 +320,25 @@ class Watchdog:
                 rules = {"fence": safety.geofence and car in cars, "separation": apart}
                 by = " and ".join(name for name, judged in rules.items() if judged)
                 yield car, f"its place {unknown}: {by} cannot be judged"
-        places = {car: monitor.places[car].position for car in watched if car in monitor.places}
+        places = {car: monitor.places[car].position[:2] for car in watched if car in monitor.places}
+        ways = {car: self._way_to_stand(monitor.places[car]) for car in places}
         for car in cars:
             if safety.geofence and car in places:
-                x, y = float(places[car][0]), float(places[car][1])
+                (x, y), way = places[car], ways[car]
                 if not inside(safety.geofence, x, y):
                     yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
+                elif not inside(safety.geofence, x + way[0], y + way[1]):
+                    yield car, f"at ({x:.2f}, {y:.2f}) m it needs {np.linalg.norm(way):.2f} m to stand in the geofence"
         for car, other in combinations(places, 2) if apart else ():
-            distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
-            if distance < safety.separation and (car in cars or other in cars):
-                yield car, f"{distance:.2f} m from {other}, {safety.separation:g} m is the least"
+            between, nearing = places[car] - places[other], ways[other] - ways[car]
+            now = float(np.linalg.norm(between))  # both stop at once: straight on, in equal shares of their ways
+            share = np.clip(between @ nearing / max(float(nearing @ nearing), 1e-9), 0.0, 1.0)
+            least = float(np.linalg.norm(between - share * nearing))
+            if least < safety.separation and (car in cars or other in cars):
+                near = "" if now < safety.separation else f", and {least:.2f} m where they come to a stand"
+                yield car, f"{now:.2f} m from {other}{near}, {safety.separation:g} m is the least"
+
+    def _way_to_stand(self, place: Place) -> Array:
+        """Return the vector (2,), m, along which a car rolls until it stands, if it is stopped."""
+        speed = float(np.linalg.norm(place.velocity[:2]))
+        return place.velocity[:2] * (self._safety.stopping(speed)[1] / max(speed, 1e-9))

@@ -1,10 +1,12 @@
 """Everything that is read of one or several bags: samples of all cars on one clock, and a table of what there is.
 
 Every message has two times: its stamp, by the clock of who sent it, and when it was received, by the clock of who
-recorded it. A *source* is whose clock makes the stamps: a car, or motion capture, which is one source for all bodies.
+recorded it. A *source* is whose clock makes the stamps: a car, or motion capture, which is one source for all bodies,
+or a topic whose delay is far from those of the other topics of its car.
 
-- Within a file, a source's clock is behind the recorder's by the smallest (received - stamp) over the file, the least
-  time that a message was on its way included. By no more than the tolerance, stamps stay what they are.
+- Within a file, a source's clock is behind the recorder's by the least (received - stamp) of its topics, the least
+  time of transport included; wrong stamps are dropped. By no more than the tolerance, stamps stay what they are.
+- Topics of a car that measure the same motion are brought together by it, see `clocks.py`.
 - Files of different recorders are brought together by what they have in common. A source that stands in both, motion
   capture above all, is behind one recorder by d1 and behind the other by d2, so that the clocks of the recorders differ
   by d1 - d2. Files without anything in common with the others are merged by their stamps.
@@ -19,17 +21,20 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.cars.backend.binding import Binding
+from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.bags.topic_map import Chosen, MapFrame, TopicMap, select
+from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
 
+NS = 1_000_000_000
+
 Delays = Mapping[str, int]
-"""ns by which each source of a file is behind its recorder: the smallest (received - stamp)."""
+"""ns by which each source of a file is behind its recorder."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +144,6 @@ def in_frame(pose: CarPose, frame: MapFrame) -> CarPose:
     return CarPose(R @ pose.position + np.array(frame.position), rotation, covariance)
 
 
-WILD = 10_000_000_000  # ns by which a stamp may be ahead of the others of its topic before it is left out
-
-
 @dataclass
 class Track:
     """The messages of one topic in one file, and why some were left out."""
@@ -151,19 +153,43 @@ class Track:
     entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
-    def delays(self) -> list[int]:
-        """Return by how many ns its messages were received after their stamps."""
-        return [entry.received - entry.stamp for entry in self.entries if entry.stamp]
+    outlying: int = 0  # messages that were dropped for their stamps
+    delay: Delay | None = None  # None: no message with a stamp
+    source: str = ""  # whose clock makes the stamps
 
-    def leave_out_wild(self) -> None:
-        """Drop messages whose stamps are far ahead of those of the others."""
-        if not (delays := self.delays()):
-            return
-        least = float(np.median(delays)) - WILD
-        kept = [entry for entry in self.entries if not entry.stamp or entry.received - entry.stamp >= least]
-        if left_out := len(self.entries) - len(kept):
-            self.refused["its stamp is far in the future"] += left_out
-            self.entries = kept
+    def drop_outlying(self) -> None:
+        """Drop messages with wrong stamps, and measure the delay of the others."""
+        stamps, received = (
+            np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
+        )
+        given = stamps != 0
+        wrong = np.zeros(len(given), bool)
+        if given.any():
+            wrong[given] = outlying(stamps[given], received[given])
+            self.delay = delay_of(stamps[given & ~wrong], received[given & ~wrong])
+        self.outlying = int(wrong.sum())
+        self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
+
+    def behind(self, clocks: Clocks) -> float | None:
+        """Return by how many s it is behind after stamps of its source were moved; None: not known."""
+        delay, shift = self.delay, clocks.shifts.get(self.source)
+        if delay is None or shift is None or shift.offset is None:
+            return None
+        return (delay.offset + clocks.recorders[self.file] - shift.added) / NS
+
+    def remove_drift(self, tolerance: float) -> float:
+        """Remove the drift of its clock if that changes the offset by more than a tolerance, ns; return it, or 0."""
+        if (delay := self.delay) is None:
+            return 0.0
+        if abs(delay.drift) * (self.entries[-1].received - self.entries[0].received) <= 2.0 * tolerance:
+            return 0.0
+        for k, entry in enumerate(self.entries):
+            gained = round(delay.drift * (entry.received - delay.middle)) if entry.stamp else 0
+            self.entries[k] = replace(entry, stamp=entry.stamp + gained)
+        return delay.drift
+
+
+APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
 def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, stamped: bool) -> list[Track]:
@@ -182,17 +208,27 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.leave_out_wild()
+        track.drop_outlying()
     return list(tracks.values())
 
 
-def delays_of(tracks: Sequence[Track], files: int) -> list[Delays]:
-    """Return by how many ns each source is behind the recorder, for each of so many files."""
+def delays_of(tracks: Sequence[Track], files: int, tolerance: float, stated: Collection[str] = ()) -> list[Delays]:
+    """Return by how many ns each source is behind the recorder, for each of so many files; set the tracks' sources.
+
+    Topics ahead of it by more than the tolerance, ns, do not count where others are not; those `stated` are sources.
+    """
     found: list[dict[str, int]] = [{} for _ in range(files)]
-    for track in tracks:
-        if delays := track.delays():
-            least, source = found[track.file], track.chosen.source
-            least[source] = min(*delays, least.get(source, delays[0]))
+    for file, source in {(track.file, track.chosen.source) for track in tracks}:
+        own = [track for track in tracks if (track.file, track.chosen.source) == (file, source)]
+        delays = sorted(track.delay.offset for track in own if track.delay is not None)
+        usual = delays[(len(delays) - 1) // 2] if delays else 0
+        for track in own:
+            apart = track.delay is not None and abs(track.delay.offset - usual) > APART and source not in stated
+            track.source = track.chosen.topic if apart or track.chosen.topic in stated else source
+        for name in {track.source for track in own}:
+            known = [track.delay.offset for track in own if track.source == name and track.delay is not None]
+            if known:
+                found[file][name] = min([delay for delay in known if delay >= -tolerance] or known)
     return [*found]
 
 
@@ -209,7 +245,11 @@ class TopicRow:
     used: int | None = None  # messages
     gap: float | None = None  # s, the longest between two
     gaps: int | None = None  # pauses of more than three times the usual period
-    offset: float | None = None  # s by which its clock is behind the recorder's
+    offset: float | None = None  # s by which its stamps are behind the recorder's clock, transport included
+    outlying: int | None = None  # messages that were dropped for their stamps
+    lead: float | None = None  # s by which its stamps are early, by what it measures
+    lead_error: float | None = None  # s, standard error
+    reference: str | None = None  # what they are early against
 
 
 def rows_of(
@@ -217,6 +257,8 @@ def rows_of(
     chosen: Collection[Chosen] = (),
     samples: Sequence[Sample] = (),
     clocks: Clocks | None = None,
+    tracks: Sequence[Track] = (),
+    leads: Leads | None = None,
 ) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
     read_as = {entry.topic: entry for entry in chosen}
@@ -234,10 +276,12 @@ def rows_of(
             rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
         stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
-        shift = clocks.shifts.get(entry.source)
-        offset = None if shift is None or shift.offset is None else shift.offset * 1e-9
-        rate, gap, gaps = regularity(stamps)
-        rows.append(TopicRow(name, kind, count, rate, entry.car, entry.role.value, len(stamps), gap, gaps, offset))
+        own = [track for track in tracks if track.chosen is entry]
+        delays = [behind + clocks.shifts[t.source].added / NS for t in own if (behind := t.behind(clocks)) is not None]
+        (rate, gap, gaps), lead, bad = regularity(stamps), (leads or {}).get(name), sum(track.outlying for track in own)
+        read = (entry.car, entry.role.value, len(stamps), gap, gaps, min(delays, default=None), bad)
+        by_content = () if lead is None else (lead.seconds, lead.error, lead.reference)
+        rows.append(TopicRow(name, kind, count, rate, *read, *by_content))
     return tuple(rows)
 
 
@@ -247,9 +291,6 @@ def regularity(stamps: np.ndarray) -> tuple[float | None, float | None, int | No
     if not len(steps) or steps.sum() <= 0.0:
         return None, None, None
     return float(len(steps) / steps.sum()), float(steps.max()), int((steps > 3.0 * np.median(steps)).sum())
-
-
-NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -284,17 +325,31 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         lenses |= _published(files, chosen)  # a calibration that a car publishes replaces the environment's
         value, stamped = value_reader(given, binding, chosen, lenses), given.clocks.mode != "received"
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
+    if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:
+        known = listed(sorted(entry.topic for entry in chosen))
+        raise DataError(f"{given.path.name}: clocks.offsets: {odd[0]} is none of the topics that are read: {known}")
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
     tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
-    clocks = reconcile(delays_of(tracks, len(files)), tolerance, stated)
-    samples = _samples(tracks, clocks)
+    delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
+    drifts = {track.chosen.topic: drift for track in tracks if (drift := track.remove_drift(tolerance))}
+    clocks = reconcile(delays, tolerance, stated)
+    samples = _samples(tracks, clocks, {})
+    leads = leads_of(samples, chosen, binding) if stamped else {}
+    fixed = {track.chosen.topic for track in tracks if track.source in stated}
+    behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
+    moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
+    samples = _samples(tracks, clocks, moves) if moves else samples
+    notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves))
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
-    shifts = {entry: clocks.shifts.get(entry.source) for entry in chosen}
-    added = {(e.car, e.role): (e.topic, shift.added / NS if shift else 0.0) for e, shift in shifts.items()}
-    return BagLog(samples, rows_of(files, chosen, samples, clocks), tuple(_notes(tracks, clocks, given)), pixels, added)
+    added: dict[tuple[str, Role], tuple[str, float]] = {}
+    for track in tracks:
+        shift, topic = clocks.shifts.get(track.source), track.chosen.topic
+        moved = moves.get(topic, 0) + (shift.added if shift else 0)
+        added.setdefault((track.chosen.car, track.chosen.role), (topic, moved / NS))
+    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -308,29 +363,55 @@ def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
     raise DataError(f"{where}: topic {entry.topic} of {entry.car}: none of {total} messages is of use: {reason}")
 
 
-def _samples(tracks: Sequence[Track], clocks: Clocks) -> tuple[Sample, ...]:
-    """Return the samples in the order of their stamps; one that several files have is there once."""
+def _samples(tracks: Sequence[Track], clocks: Clocks, moves: Mapping[str, int]) -> tuple[Sample, ...]:
+    """Return the samples, each once, in the order of their stamps, to which `moves` are added by topic, ns."""
     found: dict[tuple[str, int], Sample] = {}
     for track in tracks:
-        added, recorder = clocks.shifts.get(track.chosen.source), clocks.recorders[track.file]
+        added, recorder = clocks.shifts.get(track.source), clocks.recorders[track.file]
+        moved = moves.get(track.chosen.topic, 0)
         for entry in track.entries:
-            time = entry.stamp + added.added if entry.stamp and added else entry.received + recorder
+            time = entry.stamp + added.added + moved if entry.stamp and added else entry.received + recorder
             found.setdefault((track.chosen.topic, time), replace(entry, stamp=time, received=time))
     return tuple(sorted(found.values(), key=lambda sample: sample.stamp))
 
 
-def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap) -> Iterator[str]:
+def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Mapping[str, float]) -> Iterator[str]:
     """Yield what was left out, moved, or used unchanged."""
     for track in tracks:
+        total = track.refused.total() + len(track.entries) + track.outlying
+        if track.delay is not None and track.delay.jump:
+            jump = f"its clock jumps by {track.delay.jump / NS:.2g} s"
+            yield f'topic {track.chosen.topic}: {jump}; clocks.mode = "received" needs no stamps'
+        if track.outlying:
+            yield f"topic {track.chosen.topic}: {track.outlying} of {total} messages left out: wrong stamps"
         if track.refused:
             [(reason, _)], count = track.refused.most_common(1), track.refused.total()
-            total = count + len(track.entries)
             yield f"topic {track.chosen.topic}: {count} of {total} messages left out: {reason}"
     for source, shift in sorted(clocks.shifts.items()):
         if shift.offset is None:
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
         elif shift.added and source not in given.clocks.offsets:
             yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
+    for topic, drift in drifts.items():
+        yield f"topic {topic}: its clock drifts by {1e6 * drift:+.0f} us per s, which was removed"
     for track in tracks if given.clocks.mode != "received" else ():
         if not all(entry.stamp for entry in track.entries):
             yield f"topic {track.chosen.topic}: messages without stamps count when they were received"
+
+
+def _lead_notes(
+    tracks: Sequence[Track], clocks: Clocks, given: TopicMap, leads: Leads, moves: Mapping[str, int]
+) -> Iterator[str]:
+    """Yield which topics were moved by what they measure, or were not, and the key that states it."""
+    seen: set[str] = set()
+    for track in tracks:
+        topic, shift = track.chosen.topic, clocks.shifts.get(track.source)
+        lead, added, moved = leads.get(topic), 0 if shift is None else shift.added, moves.get(topic)
+        name = TRUTH if track.chosen.source == TRUTH else topic
+        why = f"{track.chosen.car}: {lead}" if lead else f"{name}: its clock is not that of most topics"
+        key = f'clocks.offsets = {{ "{name}" ='
+        if moved is not None and name not in seen:
+            yield f"{why}; stamps were moved by {moved / NS:+.3f} s, as with {key} {(added + moved) / NS:.4f} }}"
+        elif lead is not None and not moves and lead.exceeds(given.clocks.tolerance):
+            yield f"{why}; stamps are unchanged, unlike with {key} {added / NS + lead.seconds:.4f} }}"
+        seen.add(name)

@@ -96,7 +96,7 @@ class ClockSettings(Section):
     tolerance: Positive = 0.02
     """Offset of a clock above which its stamps are shifted, s."""
     offsets: dict[str, Number] = Field(default={}, max_length=64)
-    """Time added to the stamps of a car, or of `truth`, instead of the estimated offset, s."""
+    """Time added to the stamps of a car, of `truth`, or of a topic, instead of the estimated offset, s."""
 
 
 class MapFrame(Section):
@@ -154,8 +154,8 @@ class TopicMap(Section):
         refuse_repeated(self.cars, self.markers)
         known = {car.name for car in self.cars} | {"truth"}
         for name in self.clocks.offsets:
-            if name not in known:
-                raise ValueError(f"clocks.offsets: {name!r} is none of {', '.join(sorted(known))}")
+            if name not in known and not name.startswith("/"):
+                raise ValueError(f"clocks.offsets: {name!r} is none of {', '.join(sorted(known))}, or a topic")
         return self
 
     @property
@@ -213,6 +213,11 @@ class Chosen:
     def source(self) -> str:
         """Whose clock makes its stamps."""
         return TRUTH if self.role is Role.TRUTH else self.car
+
+    @property
+    def clock(self) -> str:
+        """Name of its clock as a reference of others."""
+        return f"the camera of {self.car}" if self.role in (Role.DETECTIONS, Role.BEARINGS) else self.source
 
 
 def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chosen]:

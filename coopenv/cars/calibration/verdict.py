@@ -235,6 +235,8 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         told = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
         lines += [f"{title} is wrong: {', '.join(told)}"] if told else []
     for c, car in enumerate(batch.cars):
+        shifted = ((topic, added) for topic, added in car.topics if abs(added) > FINEST["s"])
+        lines += [f"{car.name}: import has moved the stamps of {topic} by {added:+.3f} s" for topic, added in shifted]
         late = batch.own(c).start + np.array([CAMERA_TIME, TRUTH_TIME])
         if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")

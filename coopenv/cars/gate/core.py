@@ -137,7 +137,7 @@ class GateMode(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a message has been rejected."""
+    """Why a message has been rejected; the last one stops the car: a command to the wheels that is not the gate's."""
 
     TOO_LONG = "too_long"
     MALFORMED = "malformed"
@@ -150,6 +150,7 @@ class Reason(StrEnum):
     NOT_FINITE = "not_finite"
     LIMITS = "limits"
     NONCE = "nonce"
+    FOREIGN = "foreign"
 
 
 class Rejected(Exception):  # noqa: N818
@@ -241,6 +242,11 @@ class Gate:
             self._output = MotionCommand(steering, speed)
         self._ticked = now
         return write_drive(self._clock.wall(), self.profile.command, self._output)
+
+    def foreign(self) -> None:
+        """Stop, whatever the state: the wheels got a command that this gate has not sent."""
+        self._counts[Reason.FOREIGN] += 1
+        self._come_to_a_stand(GateMode.STOPPED)  # with another nonce: an arming under way opens nothing
 
     def neutral(self) -> bytes:
         """Close for good and return the message of a car that stands."""

@@ -1,9 +1,12 @@
 """The gate on the network: messages come in by callbacks, the car's command goes out 20 times a second."""
 
+import os
 import secrets
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +14,15 @@ from typing import Any
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Car, Deployment, load_deployment
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, write
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, GateMode, Malformed, read_drive, write
 from coopenv.cars.keys import Signer, check_identity, load_keys
-from coopenv.cars.profile import Role, presence_of
+from coopenv.cars.profile import NEUTRAL, Role, presence_of
 from coopenv.cars.transport.base import SECURE, Arrival, Transport, address_of
 
 CLOCK = GateClock(time.time_ns, time.monotonic_ns)
 TICKS_PER_STATUS = 4  # 5 Hz
 LAST_NEUTRALS = 5  # that the car gets before the gate goes
+MOST_SENT = 1200  # own commands that may be under way: a minute
 
 
 class GateConnection:
@@ -37,11 +41,35 @@ class GateConnection:
         self._lock = threading.Lock()
         self._ticks = 0
         self._own = secrets.token_bytes(16)  # marks what comes back to us: it must not stop a car that is armed again
+        self._sent: dict[bytes, bool] = {}  # own commands that have not come back yet, oldest first
         self.news = threading.Event()
         """Set when the state or the nonce has changed, so that the status is published at once."""
         for role in (Role.COMMAND, Role.ARM, Role.STOP):
             transport.subscribe(self._topics[role], partial(self._arrive, role))
         transport.announce(presence_of(gate.car))
+
+    def guard(self) -> None:
+        """Stop the car from now on at the first command to its wheels that is not this gate's.
+
+        The network must pass on what this end publishes to this end as well, as Zenoh does.
+        """
+        # The wildcard stands for nothing: it admits messages under wildcard keys, which reach the wheels as well.
+        self._transport.subscribe(f"{self._topics[Role.MANUAL]}/**", self._guard)
+
+    def _guard(self, arrival: Arrival) -> None:
+        payload = arrival.payload
+        with self._lock:
+            if self._sent.pop(payload, False):
+                return
+            self._gate.foreign()
+            answer = self._gate.tick()
+        self.news.set()
+        try:
+            harmless = read_drive(payload, self._gate.profile.command) == NEUTRAL
+        except Malformed:  # to us, perhaps not to the car
+            harmless = False
+        if not harmless:  # so that two gates of one car do not answer each other for ever
+            self._send(Role.MANUAL, answer)
 
     def tick(self) -> bytes:
         """Send the car's command, and every 0.2 s the status; return the command."""
@@ -87,12 +115,28 @@ class GateConnection:
 
     def _send(self, role: Role, payload: bytes, attachment: bytes = b"") -> None:
         topic = self._gate.profile.topics[role]
+        if role is Role.MANUAL:
+            with self._lock:
+                self._sent[payload] = True
+                if len(self._sent) > MOST_SENT:
+                    del self._sent[next(iter(self._sent))]
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
+def tell_systemd(state: str) -> None:
+    """Tell systemd, where it has started this process, that it lives (`WATCHDOG=1`) or is ready (`READY=1`)."""
+    if place := os.environ.get("NOTIFY_SOCKET"):
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.sendto(state.encode(), "\0" + place[1:] if place.startswith("@") else place)
+
+
 def run(link: GateConnection) -> None:
-    """Tick until an exception, such as that of a signal, ends it; the car then gets neutral before that goes on."""
+    """Tick until an exception, such as that of a signal, ends it; the car then gets neutral before that goes on.
+
+    systemd restarts a process that no longer ticks: `WatchdogSec`.
+    """
     due = time.monotonic_ns()
+    tell_systemd("READY=1")
     try:
         while True:
             wait = (due - time.monotonic_ns()) / 1e9
@@ -100,6 +144,7 @@ def run(link: GateConnection) -> None:
                 link.publish_status()
             elif wait <= 0.0 or time.monotonic_ns() >= due:
                 link.tick()
+                tell_systemd("WATCHDOG=1")
                 missed = max(time.monotonic_ns() - due, 0) // PERIOD
                 due += (missed + 1) * PERIOD
     finally:

@@ -161,9 +161,11 @@ class HeartbeatTransport(ABC):
                     callback(name, name not in before)
 
 
-PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")
+UNIX = "unixsock-stream"
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats", UNIX)
 SECURE = ("tls", "quic")
 
+WRITTEN_UNIX = re.compile(rf"({UNIX})/(/[^\s?#]{{1,106}})")  # the kernel takes 107 bytes
 WRITTEN = re.compile(r"([a-z]+)/(\[[0-9A-Fa-f:.]+\]|[^\s/:?#\[\]]+):(\d{1,5})(?:[?#]\S*)?")
 
 
@@ -172,8 +174,8 @@ class Address:
     """An endpoint."""
 
     protocol: str
-    host: str  # without the brackets of IPv6
-    port: int
+    host: str  # without the brackets of IPv6; the absolute path of a unix socket
+    port: int  # 0 for a unix socket
 
     @property
     def authority(self) -> str:
@@ -182,7 +184,9 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether it is on this computer, whatever its networks: 127.0.0.0/8, ::1 or localhost."""
+        """Whether it is on this computer, whatever its networks: 127.0.0.0/8, ::1, localhost or a unix socket."""
+        if self.protocol == UNIX:
+            return True
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -191,10 +195,12 @@ class Address:
 
 def address_of(endpoint: str) -> Address:
     """Return the parts of an endpoint such as tcp/127.0.0.1:7447. Raises CoopenvError: it is none."""
-    found = WRITTEN.fullmatch(endpoint)
-    if found is None or found[1] not in PROTOCOLS or int(found[3]) > 65_535:
-        known = listed(PROTOCOLS)
-        raise CoopenvError(f"{shown(endpoint)} is no endpoint, expected for example tcp/127.0.0.1:7447 (or {known})")
+    if unix := WRITTEN_UNIX.fullmatch(endpoint):
+        return Address(UNIX, unix[2], 0)
+    found, known = WRITTEN.fullmatch(endpoint), PROTOCOLS[:-1]
+    if found is None or found[1] not in known or int(found[3]) > 65_535:
+        example = f"tcp/127.0.0.1:7447 (or {listed(known)}), or {UNIX}//run/SOCKET"
+        raise CoopenvError(f"{shown(endpoint)} is no endpoint, expected for example {example}")
     return Address(found[1], found[2].strip("[]"), int(found[3]))
 
 
@@ -212,6 +218,11 @@ def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float)
     if address.protocol in ("udp", "quic"):
         return None
     try:
+        if address.protocol == UNIX:
+            with socket.socket(socket.AF_UNIX) as plain:
+                plain.settimeout(timeout)
+                plain.connect(address.host)
+            return None
         with socket.create_connection((address.host, address.port), timeout) as plain:
             if address.protocol == "tls" and context is not None:
                 with context.wrap_socket(plain, server_hostname=address.host) as secured, suppress(TimeoutError):

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
@@ -11,6 +12,7 @@ from coopenv.base.installation import needing
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport.base import (
     SECURE,
+    UNIX,
     Arrival,
     Callback,
     Certificates,
@@ -29,16 +31,16 @@ class Zenoh:
     """A Zenoh session as a transport."""
 
     def __init__(self, session: Any, module: Any) -> None:
-        self._session, self._zenoh = session, module
+        self.session, self.library = session, module
         self._kept: list[Any] = []  # a declaration ends with its last reference
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
     ) -> None:
         """Send, see `Transport`."""
-        z = self._zenoh
+        z = self.library
         with suppress(z.ZError):  # the session is closed
-            self._session.put(
+            self.session.put(
                 topic,
                 payload,
                 attachment=attachment or None,
@@ -48,31 +50,34 @@ class Zenoh:
             )
 
     def subscribe(self, pattern: str, callback: Callback) -> None:
-        """Subscribe, see `Transport`."""
+        """Subscribe, see `Transport`. What is put under a wildcard key reaches patterns with a wildcard alone."""
+        wild = "*" in pattern
 
         def arrive(sample: Any) -> None:
+            if "*" in str(sample.key_expr) and not wild:
+                return
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             callback(Arrival(str(sample.key_expr), sample.payload.to_bytes(), time.time_ns(), attachment))
 
-        self._kept.append(self._session.declare_subscriber(pattern, arrive))
+        self._kept.append(self.session.declare_subscriber(pattern, arrive))
 
     def announce(self, name: str) -> None:
         """Announce, see `Transport`."""
-        self._kept.append(self._session.liveliness().declare_token(name))
+        self._kept.append(self.session.liveliness().declare_token(name))
 
     def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
         """Watch, see `Transport`."""
 
         def change(sample: Any) -> None:
-            callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+            callback(str(sample.key_expr), sample.kind == self.library.SampleKind.PUT)
 
-        self._kept.append(self._session.liveliness().declare_subscriber(pattern, change, history=True))
+        self._kept.append(self.session.liveliness().declare_subscriber(pattern, change, history=True))
 
     def close(self) -> None:
         """End the session."""
         self._kept.clear()
-        if not self._session.is_closed():
-            self._session.close()
+        if not self.session.is_closed():
+            self.session.close()
 
 
 def library() -> Any:
@@ -88,6 +93,7 @@ def open_zenoh(
     listen: Sequence[str] = (),
     tls: Certificates | None = None,
     timeout: float = 2.0,
+    config: Path | None = None,
 ) -> Zenoh:
     """Open a session that uses the given endpoints and nothing else: nothing is looked for by multicast.
 
@@ -97,40 +103,50 @@ def open_zenoh(
         listen: endpoints to listen at.
         tls: certificates, which endpoints `tls/...` need; others are refused then, so that nothing goes in the clear.
         timeout: s to wait for the endpoints to connect to.
+        config: Zenoh's own file in place of all that; endpoints replace those in it, where any are given.
 
     Raises:
-        CoopenvError: the extra is not installed, or an endpoint is not one.
+        CoopenvError: the extra is not installed, an endpoint is not one, or the file cannot be used.
         LinkError: an endpoint cannot be reached, or cannot be listened at.
     """
     for endpoint in (*connect, *listen):
-        if (address_of(endpoint).protocol in SECURE) != (tls is not None):
+        protocol = address_of(endpoint).protocol
+        if (protocol in SECURE) != (tls is not None) and protocol != UNIX and config is None:
             raise CoopenvError(f"{endpoint}: tls/... and certificates (tls) go together")
     zenoh = library()
-    config = zenoh.Config()
-    entries: dict[str, Any] = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": list(connect),
-        "listen/endpoints": list(listen),
-        "connect/timeout_ms": int(timeout * 1000),
-        "connect/exit_on_failure": bool(connect),
-        "connect/retry": RETRY,
-        "transport/link/tx/lease": LEASE,
-        # How long a reliable message may keep its sender waiting, us, before the link counts as broken.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": LEASE * 1000,
-        **{f"transport/link/tls/{key}": value for key, value in (tls.for_zenoh() if tls else {}).items()},
-    }
+    made = _read_config(config) if config else zenoh.Config()
+    entries: dict[str, Any] = {"connect/endpoints": list(connect), "listen/endpoints": list(listen)}
+    if config is None:
+        entries |= {
+            "mode": mode,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": False,
+            "connect/timeout_ms": int(timeout * 1000),
+            "connect/exit_on_failure": bool(connect),
+            "connect/retry": RETRY,
+            "transport/link/tx/lease": LEASE,
+            # How long a reliable message may keep its sender waiting, us, before the link counts as broken.
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": LEASE * 1000,
+            **{f"transport/link/tls/{key}": value for key, value in (tls.for_zenoh() if tls else {}).items()},
+        }
     try:
-        for key, value in entries.items():
-            config.insert_json5(key, json.dumps(value))
-        return Zenoh(zenoh.open(config), zenoh)
+        for key, value in entries.items() if config is None or connect or listen else ():
+            made.insert_json5(key, json.dumps(value))
+        return Zenoh(zenoh.open(made), zenoh)
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen]) or "no endpoints"
         text = str(error).split(" at /")[0].split("\n")[0][:120]  # the first sentence
         text = f"no answer within {timeout:g} s" if connect and "Timeout" in text else text
         reason = first_trouble(connect, tls.context() if tls else None, text)
         raise LinkError(f"{where}: no Zenoh there ({reason})") from None
+
+
+def _read_config(path: Path) -> Any:
+    try:
+        return library().Config.from_file(path)
+    except library().ZError as error:
+        reason = " ".join(str(error).split(" at /")[0].split())
+        raise CoopenvError(f"{path}: no configuration of Zenoh: {reason}") from None
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:

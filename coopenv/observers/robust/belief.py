@@ -69,6 +69,12 @@ def own_estimate(memory: Any, world: int, i: int):
 
 
 @device_function
+def estimate_with_faults(memory: Any, world: int, i: int):
+    """Return the own estimate with a covariance that includes the mixture of likely faults."""
+    return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
+
+
+@device_function
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Propagate a member by an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)

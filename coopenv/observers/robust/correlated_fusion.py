@@ -172,7 +172,8 @@ def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
 def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
     """Inflate the covariance where member n's new report shows a reset; return whether to replace the old report.
 
-    A reset shows as a covariance that has grown much, or as a jump of the position after a long silence.
+    A reset shows as a covariance that has grown much, or as a jump of the position after a long silence. A jump alone
+    inflates nothing: the new position may be the wrong one, and bearings will tell.
     """
     report = memory.member[world, i, n].report
     P = mat66d(report.P)
@@ -184,7 +185,6 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     if dt > wp.float64(constants.SHORT_TIME):
         estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
         if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.POSE_GATE):
-            inflate_dependents(memory, world, i, n, wp.length_sq(report.pose.p - memory.member[world, i, n].pose.p))
             return True
     return False
 

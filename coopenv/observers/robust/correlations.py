@@ -69,7 +69,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
 @device_function
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
-    P = memory.P[world, i, 0, 0]
+    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):

@@ -2,15 +2,15 @@
 
 All sources have the same prior odds. The source of a hypothesis that is nearly certain is excluded: unless the gate has
 rejected its bearings, the covariance grows by what the solution without it differs by, and what it is less certain.
-An excluded source stays under test, and is readmitted when its bearings fit without a fault and not with the one that
-it had.
+Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An excluded
+source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
 
 from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3
+from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.belief import remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
@@ -22,6 +22,7 @@ from coopenv.observers.robust.memory import (
     fill,
     mat33d,
     mat63d,
+    mat66d,
     vec3d,
 )
 from coopenv.observers.robust.reports import includes
@@ -41,15 +42,25 @@ from coopenv.world.warp_internals import device_function
 
 
 @device_function
+def spread_of(memory: Any, world: int, i: int, q: int):
+    """Return what a fault of a source adds to the covariance of the source's error.
+
+    Nothing, where the gate rejects its bearings: they do not pass into the estimate.
+    """
+    f = memory.source[world, i, q].offset
+    spread = memory.source[world, i, q].covariance + wp.outer(f, f)
+    if is_rejected(memory, world, i, q):
+        spread = mat33d()
+    return spread
+
+
+@device_function
 def inflate_by_fault(memory: Any, world: int, i: int, q: int):
     """Add to the covariance what the solution without a source differs by, and what it is less certain.
 
     The pose stays: how much of a recent fault has passed into it is not known, and the next bearings will show it.
     """
-    f = memory.source[world, i, q].offset
-    spread = memory.source[world, i, q].covariance + wp.outer(f, f)
-    if is_rejected(memory, world, i, q):  # what the gate keeps out does not pass into the estimate
-        spread = mat33d()
+    spread = spread_of(memory, world, i, q)
     for o in range(memory.belief[world, i].first_sender):
         X = memory.sensitivity[world, i, q, o] * spread
         for j in range(o + 1):
@@ -139,12 +150,29 @@ def exclude_drifting(memory: Any, world: int, i: int, landmarks: int) -> bool:
 
 
 @device_function
+def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
+    """Set the mixture covariance, which the hypotheses of single faults add to the covariance of the own pose.
+
+    A hypothesis of a probability w adds the covariance of the solution without the source and the square of its
+    distance, both times w.
+    """
+    mixture = mat66d()
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            w = weight_of(memory.source[world, i, q].ratio, most) / total
+            Phi = memory.sensitivity[world, i, q, 0]
+            mixture += w * (Phi * spread_of(memory, world, i, q) * wp.transpose(Phi))
+    memory.fault_mixture[world, i] = symmetric_part(mixture)
+
+
+@device_function
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain.
 
     Innovations of a wrong pose, while the gate is disabled, show no faults but those of the own odometry.
     """
     end_block(memory, world, i, time)
+    memory.fault_mixture[world, i] = mat66d()
     lost = memory.belief[world, i].gate_disabled == 1
     if not lost and exclude_drifting(memory, world, i, landmarks):
         forget_faults(memory, world, i)
@@ -165,6 +193,8 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
         exclude(memory, world, i, worst)
     if certain or lost:
         forget_faults(memory, world, i)
+    elif worst >= 0:
+        set_fault_mixture(memory, world, i, most, total)
 
 
 @wp.func

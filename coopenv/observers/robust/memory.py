@@ -245,6 +245,7 @@ class RobustMemory:
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
+    fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
     effect: array("WAQ", mat23d)  # scratch: of an innovation by the fault of a source
     block_scratch: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors or faults
     block_member: array("WK", wp.int32)  # scratch: the members to which they belong
@@ -356,7 +357,7 @@ def robust_rules() -> dict[str, Rule]:
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
-        "measurement.common_noise measurement.weight scratch.column projection effect sensitivity "
+        "measurement.common_noise measurement.weight scratch.column projection fault_mixture effect sensitivity "
         "information drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio "
         "source.vector source.ratio source.sum source.information source.covariance source.offset"
     )

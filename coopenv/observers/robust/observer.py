@@ -36,6 +36,7 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.belief import (
     apply_error,
     begin_belief,
+    estimate_with_faults,
     own_estimate,
     set_anchor,
     set_block,
@@ -269,7 +270,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 
     The state holds positions in the body frame and covariances of (2 lambda, p), to first order.
     """
-    estimate = own_estimate(memory, world, i)
+    estimate = estimate_with_faults(memory, world, i)
     if memory.search[world, i].active == 1:
         estimate = memory.search[world, i].prior
         if memory.search[world, i].hypotheses > 0:

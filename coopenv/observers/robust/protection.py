@@ -1,7 +1,7 @@
 """Protection levels: bounds of the own errors that hold with any single faulty source, at the risk `RISK`.
 
-Without source q the solution is x + Phi f with the covariance P + Phi V^-1 Phi^T, see source_monitor.py. If q
-is the faulty source, the error is at most |Phi f| and the quantile of that covariance.
+Without source q the solution is x + Phi f with the covariance P + Phi V^-1 Phi^T, see source_monitor.py. The mixture of
+likely faults adds to P. If q is the faulty source, the error is at most |Phi f| and the quantile of that covariance.
 The level is the largest over all sources that are used, or infinite where the covariance without one of them is too
 large to linearise.
 Source: Blanch et al., Baseline advanced RAIM user algorithm and possible improvements, IEEE Transactions on Aerospace
@@ -68,7 +68,7 @@ def levels(up: Any, variances: Any, mean: Any):
 def protection_level(memory: Any, world: int, i: int):
     """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown."""
     up = wp.transpose(memory.member[world, i, 0].pose.R) * vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-    own = own_variances(up, memory.P[world, i, 0, 0])
+    own = own_variances(up, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
     most = levels(up, own, vec6d())
     for q in range(SOURCES):
         if is_active(memory, world, i, q):

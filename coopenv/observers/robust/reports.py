@@ -47,7 +47,7 @@ def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     """
     report = SenderReport()
     report.tick = tick
-    P = memory.P[world, i, 0, 0]
+    P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):

@@ -15,6 +15,7 @@ from coopenv.observers.robust.memory import (
     fill,
     mat33d,
     mat63d,
+    mat66d,
     vec3d,
     vec6d,
 )
@@ -73,6 +74,7 @@ def release_slot(memory: Any, world: int, i: int, q: int):
 @device_function
 def begin_sources(memory: Any, world: int, i: int):
     """Begin without any information about sources; all are used."""
+    memory.fault_mixture[world, i] = mat66d()
     for q in range(SOURCES):
         release_slot(memory, world, i, q)
 

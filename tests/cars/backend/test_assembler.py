@@ -402,3 +402,26 @@ def test_what_one_says_is_where_the_other_hears_it(role: Role, write: Any) -> No
     np.testing.assert_allclose(np.asarray(heard.rotation), ROTATION, atol=1e-12)
     if role is Role.REPORT:
         np.testing.assert_allclose(heard.extra["odometry"], ODOMETRY, atol=1e-12)  # from where it began
+
+
+def test_the_clock_of_each_topic_is_checked_against_a_few_wrong_stamps() -> None:
+    intake, wheel = Intake(binding(), Sensors(odometry="wheel+imu")), SVEA.topic_of("car0", Role.WHEEL)
+    camera = SVEA.topic_of("car0", Role.DETECTIONS)
+    fields = {Role.WHEEL: {"twist": {"twist": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.3))}}, Role.DETECTIONS: {"objects": []}}
+
+    def send(role: Role, delay: int) -> None:
+        for k in range(100):
+            stamp = START + k * 20 * MS - (-3_000 if k % 33 == 7 else delay) * MS
+            payload = encode(make(SVEA.topics[role].type, header=header(stamp), **fields[role]))
+            list(intake.samples(Arrival(SVEA.topic_of("car0", role), payload, START + k * 20 * MS)))
+
+    send(Role.WHEEL, 450)
+    send(Role.DETECTIONS, 40)
+    assert list(intake.unsynchronised("car0", 0.05)) == [
+        f"stamps of {wheel} are 450 ms behind this computer's, 50 ms are allowed"
+    ]
+    assert intake.offset_of("car0") == pytest.approx(0.04)
+    send(Role.WHEEL, 1)
+    assert not list(intake.unsynchronised("car0", 0.02))  # the camera may take its time besides
+    send(Role.DETECTIONS, -100)
+    assert list(intake.unsynchronised("car0", 0.02))[1].startswith(f"stamps of {camera} are 100 ms ahead of this")

@@ -213,16 +213,17 @@ def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("safety", "second", "why"),
     [
-        ("separation = 0.7\n", -1.0, "m from svea1, 0.7 m is the least"),
-        ("geofence = [[-9, -9], [9, -9], [9, AHEAD], [-9, AHEAD]]\n", 1.0, "svea1: left the geofence at ("),
+        ("separation = 0.7\n", -1.0, "m where they come to a stand, 0.7 m is the least"),
+        ("geofence = [[-9, -9], [9, -9], [9, AHEAD], [-9, AHEAD]]\n", 1.0, "m to stand in the geofence"),
     ],
 )
-def test_cars_that_break_a_rule_are_stopped(lab: Any, tmp_path: Path, safety: str, second: float, why: str) -> None:
+def test_cars_stand_before_they_break_a_rule(lab: Any, tmp_path: Path, safety: str, second: float, why: str) -> None:
     path, hub, made = lab
     env = env_of(cars(path, hub))
     env.reset(seed=0)  # puts the cars at their start
     env.close()
-    fence = safety.replace("AHEAD", str(max(place(made, car)[1] for car in made) + 0.4))
+    ahead = max(place(made, car)[1] for car in made) + 0.4
+    fence = safety.replace("AHEAD", str(ahead))
     with closing(env_of(cars(write_fleet(tmp_path, safety=PATIENT + fence), hub))) as env:
         env.reset(seed=0, options={"arm": True})
         infos: dict[str, Any] = {}
@@ -231,6 +232,29 @@ def test_cars_that_break_a_rule_are_stopped(lab: Any, tmp_path: Path, safety: st
                 break
             infos = env.step({"vehicle_1": np.array([1.0, 0.0]), "vehicle_2": np.array([second, 0.0])})[-1]
         assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
+        time.sleep(1.0)
+        first, second_place = (place(made, car) for car in made)
+        kept = (
+            max(first[1], second_place[1]) < ahead
+            if "geofence" in safety
+            else np.linalg.norm(first - second_place) > 0.65
+        )
+        assert kept, (first, second_place, ahead)
+
+
+@pytest.mark.parametrize(("safety", "why"), [("", "m from motion capture"), ("max_error = 1e6\n", "its bearings")])
+def test_cars_stand_before_they_drive_on_a_wrong_estimate(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
+    _, hub, made = lab
+    with closing(env_of(cars(write_fleet(tmp_path, safety=PATIENT + safety), hub))) as env:
+        for car in made:
+            send_fault(hub, car, "swapped_signatures@0+6")
+        env.reset(seed=3, options={"arm": True})
+        before = {car: place(made, car) for car in made}
+        infos = drive(env, 60)
+        assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
+        time.sleep(0.8)
+        assert all(np.linalg.norm(place(made, car) - before[car]) < 0.3 for car in made)
+        time.sleep(4.0)  # the fault is over
 
 
 @pytest.mark.parametrize(

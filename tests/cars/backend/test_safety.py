@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend import status
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.station import LATE, Gates, Station
 from coopenv.cars.backend.status import StatusBoard
-from coopenv.cars.backend.watchdog import LinkMonitor, Watchdog
+from coopenv.cars.backend.watchdog import BEARING_STD, LinkMonitor, Watchdog, bearing_nis
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote, Safety
 from coopenv.cars.gate.core import Gate, GateClock
@@ -22,6 +23,7 @@ from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist
 from coopenv.cars.transport.base import Arrival
+from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
 from tests.helpers.hub import Hub
 from tests.helpers.processes import wait_until
@@ -70,6 +72,41 @@ def test_places_come_from_what_judges() -> None:
         assert monitor.lost("a") == pytest.approx(0.4), "not a number is no place"
 
 
+def test_an_estimate_that_is_wrong_for_long_is_doubted() -> None:
+    monitor, none = LinkMonitor("truth"), np.zeros(0)
+    safety = Safety(max_std=0.5)
+    cases = {
+        "1.2 m from motion capture, safety.max_error = 1": (1.2, 0.1, none),
+        "0.6 m uncertain, safety.max_std = 0.5": (float("nan"), 0.6, none),
+        "20 squared standard deviations from its bearings": (float("nan"), 0.1, np.full(8, 20.0)),
+        "": (0.9, 0.4, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
+    }
+    for said, given in cases.items():
+        monitor.begin(BEGIN)
+        for ms in (0, 100, 190, 210):
+            monitor.looked = BEGIN + ms * MS
+            monitor.judge("a", safety, *given)
+            assert bool(monitor.doubt("a")) == (bool(said) and ms > 200)
+        assert said in monitor.doubt("a") and not monitor.doubt("b")
+        monitor.judge("a", Safety(max_error=None, max_nis=None), *given)
+        assert not monitor.doubt("a")
+
+
+def test_the_innovation_of_bearings_counts_in_standard_deviations() -> None:
+    rng = np.random.default_rng(0)
+    lever, landmarks = np.array([0.3, 0.0, 0.2]), rng.uniform(-4.0, 4.0, (6, 3)) + np.array([0.0, 8.0, 0.0])
+    P, found, wrong = np.diag([4e-4] * 3 + [9e-4] * 3), [], []
+    for _ in range(400):
+        R, p = exp_so3(rng.normal(size=3)), rng.normal(size=3)
+        rays = (landmarks - p) @ R - lever
+        bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True) + rng.normal(0.0, BEARING_STD, (6, 3))
+        theta, place = rng.normal(0.0, 0.02, 3), R.T @ p + rng.normal(0.0, 0.03, 3)  # errors of (2 lambda, p)
+        sent = VehicleBroadcast(0, R @ exp_so3(theta), R @ exp_so3(theta) @ place, P, None)
+        found.append(bearing_nis(sent, landmarks, lever, bearings))
+        wrong.append(bearing_nis(sent, landmarks, lever, bearings[::-1]))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.1) and np.median(wrong) > 50.0
+
+
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 
 
@@ -99,6 +136,30 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     monitor.looked = BEGIN + 700 * MS
     lost = [wrong for _, wrong in watchdog.misplaced()]
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
+
+
+@pytest.mark.parametrize(
+    ("starts", "velocities", "found"),
+    [
+        ({"a": -0.5, "b": 1.0}, {"a": 0.6}, []),  # 0.36 m to a stand
+        ({"a": 0.5, "b": -0.5}, {"a": 0.6}, ["a: at (0.68, 0.00) m it needs 0.36 m to stand in the geofence"]),
+        ({"a": 0.9, "b": -0.5}, {"a": -0.1}, []),  # to the inside
+        ({"a": -0.5, "b": 0.9}, {"a": 0.6, "b": -0.6}, ["a: 1.04 m from b, and 0.32 m where they come to a stand, "]),
+        ({"a": -0.5, "b": 0.3}, {"a": 0.6, "b": 0.6}, []),  # one behind the other
+    ],
+)
+def test_cars_stop_in_time_to_stand_inside_the_fence_and_apart(starts: Any, velocities: Any, found: list[str]) -> None:
+    monitor = LinkMonitor("truth")
+    monitor.begin(BEGIN)
+    for k in range(31):
+        for car, x in starts.items():
+            monitor.place(car, np.array([x + velocities.get(car, 0.0) * 0.01 * k, 0.0, 0.0]), BEGIN + 10 * k * MS)
+    monitor.looked = BEGIN + 310 * MS
+    safety, station = Safety(geofence=CORNERS, separation=0.35), Station(Hub().connect(), (), None, {})
+    watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
+    watchdog.close()
+    told = [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()]
+    assert len(told) == len(found) and all(a.startswith(b) for a, b in zip(told, found, strict=True)), told
 
 
 class Yard:

@@ -7,11 +7,12 @@ import subprocess
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from coopenv.cars.codec import decode
-from coopenv.cars.gate.core import read_drive
+from coopenv.cars.gate.core import Malformed, read_drive
 from coopenv.cars.keys import Signer
 from coopenv.cars.profile import SVEA, MotionCommand, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
@@ -55,8 +56,8 @@ class Station:
         self.status, self.statuses = decode(arrival.payload, SVEA.topics[Role.GATE].type), self.statuses + 1
 
     def _see(self, arrival: Arrival) -> None:
-        drive = read_drive(arrival.payload, SVEA.command)
-        with self._lock:
+        with suppress(Malformed), self._lock:
+            drive = read_drive(arrival.payload, SVEA.command)
             self.outputs.append((time.monotonic(), drive))
 
     def _halt(self, _arrival: Arrival) -> None:

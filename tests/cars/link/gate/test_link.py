@@ -94,6 +94,30 @@ def test_another_arming_of_an_armed_gate_is_news() -> None:
         assert station.status.session == session
 
 
+@pytest.mark.parametrize(
+    ("payload", "answers"),
+    [
+        (write_drive(1, SVEA.command, NEUTRAL), 0),  # of a second gate: no answer for ever
+        (write_drive(1, SVEA.command, MotionCommand(0.0, 0.3)), 1),
+        (b"\0\0\0\0 in another byte order", 1),
+    ],
+)
+def test_a_command_of_another_to_the_wheels_stops_the_car(payload: bytes, answers: int) -> None:
+    link, station = pair()
+    link.guard()
+    station.send(Role.ARM, messages.arm(time.time_ns(), "s", link._gate.nonce))
+    sent = [link.tick() for _ in range(5)]
+    assert station.status.state == "armed" and link._gate.state is GateMode.ARMED, "its own are no others"
+    nonce, wheels = link._gate.nonce, list[bytes]()
+    link._transport.subscribe(SVEA.topic_of(CAR, Role.MANUAL), lambda arrival: wheels.append(arrival.payload))
+    for command, count in ((payload, 1), (sent[1], 2)):  # a repetition of its own is not its own
+        station.send(Role.MANUAL, command)
+        assert link._gate.state is GateMode.STOPPED and link._gate.nonce != nonce and link.news.is_set()
+        link.publish_status()
+        assert (station.status.state, station.count("foreign")) == ("stopped", count)
+    assert len(wheels) == 2 + answers and station.outputs[-1][1] == NEUTRAL
+
+
 def test_an_exception_leaves_the_car_in_neutral() -> None:
     link, station = pair(Broken)
     with pytest.raises(RuntimeError, match="broken"):
@@ -122,7 +146,7 @@ def test_no_bad_message_is_accepted_or_kept() -> None:
     grown = tracemalloc.get_traced_memory()[0] - used
     tracemalloc.stop()
     assert None not in reasons
-    assert set(reasons) == set(Reason) - {Reason.NOT_ARMED}  # each kind of them has been there
+    assert set(reasons) == set(Reason) - {Reason.NOT_ARMED, Reason.FOREIGN}  # each kind of them has been there
     status = bench.status()
     counts = dict(zip(status.rejections, status.counts.tolist(), strict=True))
     assert counts == {**{str(reason): reasons[reason] for reason in Reason}}

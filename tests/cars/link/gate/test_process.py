@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -94,6 +97,21 @@ def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
     assert set(station.since(begun)) == {NEUTRAL}
     station.sequence += 10
     station.drive()
+
+
+def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(10.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        process = start_gate(endpoint, tmp_path)
+        assert [systemd.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
+        process.send_signal(signal.SIGSTOP)
+        systemd.settimeout(1.0)
+        with pytest.raises(TimeoutError):
+            for _ in range(50):  # those under way
+                systemd.recv(64)
+        end(process)
 
 
 @pytest.mark.parametrize("duration", [0.2, 2.0])
@@ -239,3 +257,26 @@ def test_it_loads_neither_the_simulation_nor_numpy() -> None:
     )
     loaded = {name.partition(".")[0] for name in result.stdout.split()}
     assert not {"numpy", "warp", "scipy", "matplotlib", "rosbags", "gymnasium"} & loaded
+
+
+@pytest.mark.parametrize("command", ["gate", "health"])
+def test_a_car_needs_only_the_packages_of_its_group(command: str) -> None:
+    root = Path(__file__).resolve().parents[4]
+    with (root / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)
+    needed, small = project["project"]["dependencies"], project["dependency-groups"]["gate"]
+    absent = sorted({re.split("[<>]", each)[0].removesuffix("-lang") for each in {*needed} - {*small}})
+    assert "scipy" in absent and "warp" in absent
+    code = f"import sys; sys.argv[0] = 'coopenv'; sys.modules |= dict.fromkeys({absent})"
+    code += "; from coopenv.cli import main; sys.exit(main(sys.argv[1:]))"
+    words = [
+        "svea",
+        command,
+        str(root / "examples/fleet/overtaking.toml"),
+        "--car",
+        CAR,
+        "--connect",
+        "tcp/127.0.0.1:1",
+    ]
+    ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2 and "tcp/127.0.0.1:1: no Zenoh there" in ended.stderr, ended.stderr

@@ -1,0 +1,345 @@
+"""Offsets of clocks in a bag: by times of reception, robust against wrong stamps, and by what topics measure.
+
+- By reception: the delay (received - stamp) of a topic is the offset of its clock and the time of transport. Its level
+  is a low quantile over windows; a robust line through the windows gives offset and drift.
+- By content: topics of a car measure the same motion. Turns and distances by gyro, wheels and motion capture, and the
+  bearings of landmarks, agree best at one offset between their stamps. It contains no time of transport.
+"""
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import percentile_filter
+from scipy.stats import theilslopes
+
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.bags.topic_map import TRUTH, Chosen
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist
+from coopenv.estimation.poses import Array
+from coopenv.scenario.base import rotation_of
+
+Times = NDArray[np.int64]
+
+OUTLYING = 50_000_000
+"""ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
+WILD, NEAR = 10_000_000_000, 101  # ns between the middle of the delays near one, and a low one, that is no transport
+WINDOWS, LEAST = 20, 10  # number of windows, and of messages in one
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of a topic's messages, (received - stamp), as a line; ns."""
+
+    offset: int  # in the middle of the file
+    drift: float  # per ns of reception
+    middle: int
+    jump: int = 0  # largest change of its level that is no drift; 0: none
+
+
+def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
+    """Return which stamps (n,) are wrong: ahead of those around them, or behind them and out of order."""
+    delays = (received - stamps).astype(np.float64)
+    size = min(NEAR, 2 * (len(delays) // 2) + 1)
+    low, middle = (percentile_filter(delays, share, size=size, mode="mirror") for share in (20, 50))
+    usual = np.where(middle - low > WILD, middle, low)
+    spread = float(np.median(np.abs(delays - np.median(usual)))) if len(delays) else 0.0
+    most = max(OUTLYING, 5.0 * min(spread, 20.0 * OUTLYING))
+    wrong: NDArray[np.bool_] = delays < usual - most
+    reached = np.maximum.accumulate(np.where(wrong, np.iinfo(np.int64).min, stamps))
+    wrong |= (stamps < reached) & (delays > usual + 2.0 * most)
+    return wrong
+
+
+def delay_of(stamps: Times, received: Times) -> Delay:
+    """Return the delay of a topic by its messages (n,), n > 0, none of them outlying."""
+    delays, middle = received - stamps, int(received[0] + received[-1]) // 2
+    parts = np.array_split(np.arange(len(delays)), max(1, min(WINDOWS, len(delays) // LEAST)))
+    low = np.array([np.sort(delays[part])[len(part) // 20] for part in parts])
+    at = np.array([float(np.median(received[part] - middle)) for part in parts])
+    if len(parts) < LEAST:
+        return Delay(int(low.min()), 0.0, middle)
+    level = (low - low[0]).astype(np.float64)
+    slope, _, least, most = theilslopes(level, at)
+    drift = float(slope) if least * most > 0.0 else 0.0
+    apart = np.abs(level - drift * at - np.median(level - drift * at)) > OUTLYING
+    if apart.mean() > 0.2:
+        return Delay(int(low.min()), 0.0, middle, int(np.ptp(low)))
+    return Delay(round(float(np.quantile(level - drift * at, 0.2))) + int(low[0]), drift, middle)
+
+
+HOLE = 0.25  # s between two messages over which nothing is compared
+INTERVAL = 0.4  # s over which turns and distances are compared
+SEARCHED, STEP = 1.0, 0.02
+"""s to both sides in which an offset is looked for, and the step of the search."""
+BLOCK = 2.0  # s within which errors are taken as dependent
+SURE = 4.0  # standard errors above which an offset counts
+FLOOR, PARALLAX = 0.001, 0.015
+"""s, least standard errors: of interpolation, and of turns by bearings, to which the translation adds."""
+UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may remain at the right one
+CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
+FEWEST, MOST = 50, 20_000  # elements compared
+ABSURD = 0.1  # rad between bearings and poses, with which no camera or map is right
+
+
+@dataclass(frozen=True)
+class Lead:
+    """Offset between the stamps of two topics by what they measure."""
+
+    seconds: float  # by which the stamps of the first are early
+    error: float  # its standard error
+    first: str = ""  # role of the first
+    reference: str = ""  # and of the second
+
+    def exceeds(self, tolerance: float) -> bool:
+        """Return whether it is well larger than a tolerance, s, and than its error allows."""
+        return abs(self.seconds) > max(1.5 * tolerance, SURE * self.error)
+
+    def __str__(self) -> str:
+        """Return the offset in ms, with its standard error in brackets."""
+        ahead = "leads" if self.seconds > 0.0 else "lags behind"
+        return f"{self.first} {ahead} {self.reference} by {written(abs(self.seconds), self.error)} ms"
+
+
+def written(seconds: float, error: float) -> str:
+    """Return a time in ms, with its standard error in brackets."""
+    return f"{1e3 * seconds:.0f}({max(1.0, 1e3 * error):.0f})"
+
+
+Leads = Mapping[str, Lead]  # by topic
+
+
+class Signal:
+    """A cumulated signal of time: heading, distance or pose; there is none within holes."""
+
+    def __init__(self, times: Array, values: Array) -> None:
+        """Take increasing times (n,), s, and values (n,) or (n, k)."""
+        self.times, self.values = times, values.reshape(len(times), -1)
+        ends = np.flatnonzero(np.diff(times) > HOLE)
+        self._from, self._to = times[ends], times[ends + 1]
+
+    @classmethod
+    def of_rates(cls, times: Array, rates: Array) -> "Signal":
+        """Return the integral of rates (n,)."""
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) * (rates[1:] + rates[:-1]) / 2)]))
+
+    def over(self, begin: Array, end: Array, *, level: bool = False) -> Array:
+        """Return the changes (m, k) between times (m,), NaN across holes; `level`: the values at the ends."""
+        first, last = (
+            np.array([np.interp(t, self.times, v, np.nan, np.nan) for v in self.values.T]).T for t in (begin, end)
+        )
+        change: Array = last if level else last - first
+        change[np.searchsorted(self._from, end) > np.searchsorted(self._to, begin, side="right")] = np.nan
+        return change
+
+
+Residual = Callable[[float], tuple[Array, Array]]
+"""Returns at an offset in s a difference (n,), and what explains it up to factors (n, p); NaN where there is none."""
+
+
+def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> tuple[Array, Array]:
+    """Return what N (n, p) does not explain of e (n,), and weights (n,), 0 or 1, without outliers unless given.
+
+    With `scaled`, the first factor is not negative.
+    """
+    there = np.isfinite(e) & np.isfinite(N).all(axis=-1)
+    e, N = np.where(there, e, 0.0), np.where(there[:, None], N, 0.0)
+    weights = there.astype(np.float64) if w is None else there * w
+    for _ in range(3 if w is None else 1):
+        factors = np.linalg.lstsq(N * weights[:, None], e * weights, rcond=None)[0]
+        if scaled and factors[0] < 0.0:
+            factors = np.array([0.0, (e * weights).sum() / max(1.0, weights.sum())])
+        rest = np.where(there, e - N @ factors, 0.0)
+        if w is None and there.any():
+            weights = there * (np.abs(rest) <= CUT * np.quantile(np.abs(rest[there]), 0.9) + 1e-9)
+    return rest, weights
+
+
+def lead_by(residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False) -> Lead | None:
+    """Return the offset at which a residual, of elements at times (n,), is smallest; None: no clear minimum.
+
+    There is none either if its root mean square is above `most`. `least` is added to the error, `scaled` as in `fit`.
+    """
+    if len(times) < FEWEST:
+        return None
+
+    def cost(offset: float) -> float:
+        rest, w = fit(*residual(offset), scaled=scaled)
+        return float((w * rest**2).sum() / w.sum()) if w.sum() >= FEWEST else np.inf
+
+    tried = np.arange(-SEARCHED, SEARCHED + STEP / 2, STEP)
+    costs = np.array([cost(offset) for offset in tried])
+    best, known = int(np.argmin(costs)), costs[np.isfinite(costs)]
+    if best in (0, len(tried) - 1) or len(known) < len(tried) / 2:
+        return None
+    if costs[best] > min(UNEXPLAINED * known.max(), most**2):
+        return None
+    offset, h = float(tried[best]), STEP / 4
+    for _ in range(5):
+        rest, w = fit(*residual(offset))
+        slope = (fit(*residual(offset + h), w)[0] - fit(*residual(offset - h), w)[0]) / (2 * h)
+        information = float((w * slope**2).sum())
+        if information <= 0.0:
+            return None
+        offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
+    blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
+    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, least)))
+
+
+def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
+    """Return by how much the stamps of turns or distances are early, by another source of the same."""
+    span = reference.times[-1] - reference.times[0]
+    begin = np.arange(reference.times[0], reference.times[-1] - INTERVAL, max(STEP, span / MOST))
+    end, one = begin + INTERVAL, np.ones((len(begin), 1))
+    change = reference.over(begin, end)[:, 0]
+
+    def residual(offset: float) -> tuple[Array, Array]:
+        return change, np.concatenate([signal.over(begin - offset, end - offset), one], axis=-1)
+
+    return lead_by(residual, begin, np.inf, least, scaled=True)
+
+
+def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Array, path: Signal) -> Lead | None:
+    """Return by how much the stamps of bearings are early, by the known path (x, y, heading) of the car.
+
+    They are (n,) times, s, azimuths in the body frame and (n, 2) targets in the map; the camera is at (2,) in the body.
+    """
+
+    def residual(offset: float) -> tuple[Array, Array]:
+        x, y, heading = path.over(times + offset, times + offset, level=True).T
+        away = targets - np.column_stack([x, y])
+        ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
+        return np.angle(ahead * np.exp(-1j * azimuths)), np.ones((len(times), 1))
+
+    return lead_by(residual, times, ABSURD, FLOOR)
+
+
+def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:
+    """Return the heading (n,) by the bearings of standing landmarks, as `lead_of_bearings` has them.
+
+    Between two frames it changes by the median change of their azimuths; translation adds a little to that.
+    """
+    frames, at = np.unique(times, return_inverse=True)
+    _, number = np.unique(places, axis=0, return_inverse=True)
+    seen = np.full((len(frames), number.max(initial=0) + 1), np.nan)
+    seen[at, number.ravel()] = azimuths
+    steps = np.angle(np.exp(1j * np.diff(seen, axis=0)))
+    common = np.isfinite(steps).any(axis=1)
+    turned = np.zeros(len(steps))
+    turned[common] = -np.nanmedian(steps[common], axis=1)
+    kept = np.concatenate([[True], common])
+    return Signal(frames[kept], np.concatenate([[0.0], np.cumsum(turned)])[kept]) if common.any() else None
+
+
+CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
+
+
+def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> dict[str, Lead]:
+    """Return by how much the stamps of the topics of vehicles are early by what they measure.
+
+    The reference is motion capture, or the camera where there is none; topics whose motion does not tell are left out.
+    """
+    found: dict[str, Lead] = {}
+    start = samples[0].stamp if samples else 0
+    for car, vehicle in binding.cars.items():
+        topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
+        values = {}
+        for role in topics:
+            own = [sample for sample in samples if (sample.car, sample.role) == (car, role)]
+            stamps = np.array([(sample.stamp - start) * 1e-9 for sample in own])
+            values[role] = stamps, [cast(Any, sample.value) for sample in own]
+        moved = {role: _cumulated(*values[role]) for role in topics if role in ODOMETRY}
+        truth = _path(*values[Role.TRUTH]) if Role.TRUTH in topics else None
+        camera = next(role for role in CAMERAS if role in topics)
+        seen = _azimuths(*values[camera], binding, vehicle)
+        place = np.array(binding.scenario.cameras[vehicle].position[:2])
+        leads: dict[Role, Lead | None] = {}
+        if truth is not None:
+            for role, signals in moved.items():
+                each = [lead_of_motion(s, r) for s, r in zip(signals, truth[:2], strict=True) if s is not None]
+                leads[role] = min((lead for lead in each if lead), key=lambda lead: lead.error, default=None)
+            leads[camera] = lead_of_bearings(*seen, place, truth[2])
+        else:
+            turned = turn_of(*seen)
+            known = {role: turn for role, (_, turn) in moved.items() if turn is not None}
+            leads |= {role: lead_of_motion(turn, turned, PARALLAX) for role, turn in known.items()} if turned else {}
+        reference = f"the camera of {car}" if truth is None else TRUTH
+        found |= {topics[r]: replace(lead, first=r.value, reference=reference) for r, lead in leads.items() if lead}
+    return found
+
+
+ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
+
+
+def _cumulated(times: Array, values: Sequence[Twist]) -> tuple[Signal | None, Signal | None]:
+    """Return cumulated distances and turns of a topic; None: it does not measure them."""
+    found = []
+    for name, axis in (("linear", 0), ("angular", 2)):
+        rates = np.array([np.nan if (v := getattr(value, name)) is None else v[axis] for value in values])
+        given = np.isfinite(rates)
+        measured = given.sum() > 1 and np.ptp(rates[given]) > 0.0
+        found.append(Signal.of_rates(times[given], rates[given]) if measured else None)
+    return found[0], found[1]
+
+
+def _path(times: Array, values: Sequence[CarPose]) -> tuple[Signal, Signal, Signal] | None:
+    """Return distance, heading and path (x, y, heading) by motion capture; None: there is none."""
+    known = [(t, v.position, v.rotation) for t, v in zip(times, values, strict=True) if v.rotation is not None]
+    if len(known) < FEWEST:
+        return None
+    t, p, R = (np.array(part) for part in zip(*known, strict=True))
+    heading = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
+    middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(p, axis=0)
+    forward = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
+    distance = np.concatenate([[0.0], np.cumsum(forward)])
+    return Signal(t, distance), Signal(t, heading), Signal(t, np.column_stack([p[:, :2], heading]))
+
+
+def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
+    """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
+    standing = {k: m for k, m in enumerate(binding.scenario.landmarks) if k not in binding.leaders.values()}
+    marks = {number: standing[target] for number, target in binding.targets.items() if target in standing}
+    places = {k: np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for k, m in marks.items()}
+    to_body = binding.scenario.cameras[vehicle].to_body()
+    rows = [
+        (time, *(to_body @ ray)[:2], *places[marker][:2])
+        for time, frame in zip(times, values, strict=True)
+        for marker, ray in zip(frame.markers, frame.bearings, strict=True)
+        if marker in places
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return table[:, 0], np.arctan2(table[:, 2], table[:, 1]), table[:, 3:]
+
+
+def moves_of(
+    leads: Leads, topics: Sequence[Chosen], tolerance: float, fixed: Set[str], delays: Mapping[str, float]
+) -> dict[str, int]:
+    """Return what is added to the stamps of topics, ns, so that they agree with their reference up to a tolerance, s.
+
+    The `fixed` ones stay. Where more topics with small `delays` behind sources, s, agree with each other than with
+    the reference, that is moved. Odometry without a lead goes with other odometry of its car that has the same delay.
+    """
+    found: dict[str, float] = {}
+    usual = {topic for topic, delay in delays.items() if abs(delay) <= tolerance}
+    cars = {entry.topic: entry.car for entry in topics if entry.role in ODOMETRY}
+    own = {topic: lead for topic, lead in leads.items() if lead.error <= 2.0 * STEP}
+    for reference in {lead.reference for lead in own.values()}:
+        moved = [entry.topic for entry in topics if reference == entry.clock]
+        group = {topic: lead for topic, lead in own.items() if lead.reference == reference}
+        agreed = sorted((lead.seconds for topic, lead in group.items() if topic in usual), key=abs)
+        offsets = [*([0.0] if usual & set(moved) else []), *agreed]
+        near = [[other for other in offsets if abs(other - offset) <= tolerance] for offset in offsets]
+        common = float(np.median(max(near, key=len, default=[0.0])))
+        common = 0.0 if abs(common) <= tolerance or fixed & set(moved) else common
+        found |= dict.fromkeys(moved, -common) if common else {}
+        for topic, lead in group.items():
+            rest = replace(lead, seconds=lead.seconds - common)
+            found |= {topic: rest.seconds} if rest.exceeds(tolerance) else {}
+    for topic in (delays.keys() & cars.keys()) - own.keys():
+        same = sorted(t for t in found.keys() & own.keys() if cars.get(t) == cars[topic])
+        if same and abs(delays[same[0]] - delays[topic]) <= tolerance:
+            found[topic] = found[same[0]]
+    return {topic: round(seconds * 1e9) for topic, seconds in found.items() if topic not in fixed}

@@ -1,0 +1,177 @@
+"""Clocks of topics: against stamps, motions and bags whose offsets are known by construction."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from coopenv import DataError
+from coopenv.base.errors import DataWarning
+from coopenv.cars.bags import Bag
+from coopenv.cars.bags.clocks import Signal, delay_of, lead_of_bearings, lead_of_motion, outlying, turn_of
+from coopenv.observers import Recording, run
+from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
+from tests.helpers import bags
+
+pytest.importorskip("rosbags", reason="needs the extra 'log'")
+
+S = 1_000_000_000
+
+
+@given(
+    share=st.floats(0.0, 0.1),
+    wrong=st.one_of(st.floats(0.2, 1e4), st.floats(-1e4, -0.3)),
+    rate=st.sampled_from([10.0, 60.0, 200.0]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=30)
+def test_wrong_stamps_are_found_and_no_others(share: float, wrong: float, rate: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true = (np.arange(600) / rate * S).astype(np.int64) + 10**15
+    received = np.maximum.accumulate(true + (rng.exponential(0.005, 600) * S).astype(np.int64))
+    off = (rng.random(600) < share) & (np.arange(600) > (0 if wrong > 0.0 else 20))
+    assert_array_equal(outlying(true + off * round(wrong * S), received), off)
+
+
+def test_a_recorder_that_stalls_drops_nothing() -> None:
+    true = np.arange(0, 20 * S, S // 50)
+    received = np.where((true > 5 * S) & (true < 7 * S), 7 * S, true + S // 500)
+    assert not outlying(true, received).any()
+    assert delay_of(true, received).offset == S // 500
+
+
+@pytest.mark.parametrize(("offset", "drift"), [(3.0, 0.0), (-0.2, 1e-3), (0.0, -5e-5)])
+def test_offset_and_drift_of_a_clock(offset: float, drift: float) -> None:
+    rng = np.random.default_rng(1)
+    true = np.arange(0, 60 * S, S // 100)
+    received = true + (0.002 * S + rng.exponential(0.004, len(true)) * S).astype(np.int64)
+    found = delay_of(true - round(offset * S) - np.round(drift * (true - 30 * S)).astype(np.int64), received)
+    assert found.offset * 1e-9 == pytest.approx(offset + 0.002, abs=1e-3)
+    assert found.drift == pytest.approx(drift, abs=1e-5) and not found.jump
+    stepped = delay_of(np.where(true > 30 * S, true + S // 2, true), received)
+    assert stepped.jump * 1e-9 == pytest.approx(0.5, abs=0.01)
+
+
+def heading(t: np.ndarray | float) -> np.ndarray:
+    """Heading of a car on a circle's arc that sways, rad."""
+    return np.asarray(0.1 * t + 0.4 * np.sin(0.9 * t) + 0.2 * np.sin(0.37 * t + 1.0))
+
+
+def turning(t: np.ndarray) -> np.ndarray:
+    """Its turn rate."""
+    return np.asarray(0.1 + 0.36 * np.cos(0.9 * t) + 0.074 * np.cos(0.37 * t + 1.0))
+
+
+@pytest.mark.parametrize("offset", [-0.5, -0.05, 0.0, 0.13, 0.45])
+def test_leads_of_gyro_and_camera(offset: float) -> None:
+    """The car turns on the spot, so that bearings are known in closed form; the gyro has a bias and a wrong scale."""
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 25.0, 0.005)
+    gyro = Signal.of_rates(t - offset, 1.03 * turning(t) + 0.02 + rng.normal(0.0, 0.02, len(t)))
+    frames = np.arange(0.02, 25.0, 1 / 30)
+    truth = Signal(t[::2], np.column_stack([0.0 * t[::2], 0.0 * t[::2], heading(t[::2])]))
+    found = lead_of_motion(gyro, Signal(t[::2], heading(t[::2]) + rng.normal(0.0, 0.002, len(t[::2]))))
+    assert found is not None and abs(found.seconds - offset) < max(0.003, 4.0 * found.error) < 0.02
+    places = np.array([[3.0, 1.0], [-2.0, 2.0], [1.0, -4.0]])
+    rows = [(time, np.arctan2(y, x) - heading(time), x, y) for time in frames for x, y in places]
+    times, azimuths, x, y = np.array(rows).T
+    azimuths += rng.normal(0.0, 0.005, len(azimuths))
+    azimuths[::50] += 1.0  # false blocks
+    seen = lead_of_bearings(times - offset, azimuths, np.column_stack([x, y]), np.zeros(2), truth)
+    assert seen is not None and seen.seconds == pytest.approx(offset, abs=0.003)
+    turned = turn_of(times, azimuths, np.column_stack([x, y]))
+    assert turned is not None
+    against = lead_of_motion(gyro, turned)
+    assert against is not None and against.seconds == pytest.approx(offset, abs=0.015)
+
+
+def test_a_motion_that_tells_nothing_has_no_lead() -> None:
+    t = np.arange(0.0, 20.0, 0.01)
+    rng = np.random.default_rng(3)
+    steady, noise = Signal(t, 0.3 * t), Signal.of_rates(t, rng.normal(0.0, 0.05, len(t)))
+    assert lead_of_motion(noise, steady) is None and lead_of_motion(noise, Signal(t, heading(t))) is None
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    """Ten seconds of a car that turns both ways and stops."""
+    legs = [(0.5, 0.0, 0.0), (2.0, 0.26, 0.25), (2.0, 0.15, -0.3), (0.5, 0.0, 0.0), (2.5, 0.26, -0.15), (3.0, 0.2, 0.2)]
+    segments = [{"duration": d, "linear": [v, 0.0, 0.0], "angular": [0.0, 0.0, w]} for d, v, w in legs]
+    overrides = {
+        "camera.distortion": bags.DISTORTION,
+        "rates.odometry": 60.0,
+        "observer.P0": (0.1, 0.1),
+        "vehicles.0.initial_estimate": {"position": [0.2, 0.0, 0.1], "yaw": 1.8},
+        "horizon": 10.0,
+        "vehicles.0.motion": {"kind": "segments", "segments": segments},
+    }
+    return record(load_scenario("crossing_path", overrides), 0)
+
+
+BLOCKS, TWIST, TRUTH = "/agent8/pixy_node/objectsInfo", "/agent8/actuation_twist", "/qualisys/svea3/pose"
+
+
+def opened(folder: Path, messages: list[bags.Message], text: str = bags.MAP) -> tuple[Bag, float, str]:
+    """Return a bag, the position RMSE of the observer `robust` on it, and its notes."""
+    (folder / "topics.toml").write_text(text, encoding="utf-8")
+    path = folder / f"bag{len(list(folder.iterdir()))}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        bag = Bag([bags.write(path, messages, "mcap")], folder / "topics.toml")
+    return bag, float(run("robust", record(bag)).position_rmse(3.0)[0]), "\n".join(bag.log.notes)
+
+
+@pytest.mark.parametrize(
+    ("topic", "offset", "at_reception"),
+    [(TWIST, -0.45, False), (BLOCKS, 0.05, False), (BLOCKS, 0.3, True), (TRUTH, 0.15, True), ("", 0.0, False)],
+)
+def test_a_topic_with_another_clock_and_wrong_stamps_cost_nothing(
+    topic: str, offset: float, at_reception: bool, drive: Recording, tmp_path: Path
+) -> None:
+    clean = bags.messages(drive)
+    moved = bags.later(clean, stamps=offset, received=offset if at_reception else 0.0, topics=topic or "/none")
+    frames = [m for m in moved if m.topic == BLOCKS]
+    wrong = frames[40::97]
+    assert len(wrong) > 5
+    ahead = [*(m for m in moved if m not in wrong), *bags.later(wrong, stamps=3.0)]
+    _, reference, _ = opened(tmp_path, clean)
+    bag, error, notes = opened(tmp_path, ahead)
+    assert error < 1.3 * reference + 5e-4
+    rows = {row.topic: row for row in bag.log.rows}
+    assert rows[BLOCKS].outlying == len(wrong) and f"{len(wrong)} of {len(frames)} messages left out: wrong" in notes
+    if topic in (TWIST, BLOCKS):
+        assert rows[topic].lead == pytest.approx(-offset, abs=0.02)  # twists are held until the next one
+        assert re.search(rf"svea3: .* truth by \d+\(\d+\) ms; stamps were moved .* \"{topic}\" = ", notes)
+    assert ("stamps were moved" in notes) == bool(topic) and ('{ "truth" = -0.1' in notes) == (topic == TRUTH)
+
+
+def test_what_is_printed_can_be_stated(drive: Recording, tmp_path: Path) -> None:
+    apart = bags.later(bags.messages(drive), stamps=-0.3, topics=TWIST)
+    bag, _, notes = opened(tmp_path, apart)
+    key = re.search(r"clocks\.(offsets = \{.*\})", notes)
+    assert key is not None
+    stated, _, silent = opened(tmp_path, apart, f"{bags.MAP}[clocks]\n{key[1]}\n")
+    assert "moved" not in silent
+    first, second = ([s.stamp for s in each.log.samples] for each in (bag, stated))
+    assert np.abs(np.subtract(first, second)).max() < 100_000
+    _, _, unchanged = opened(tmp_path, apart, f'{bags.MAP}[clocks]\nmode = "stamps"\n')
+    assert "stamps are unchanged" in unchanged
+    with pytest.raises(
+        DataError, match=r"topics.toml: clocks.offsets: /agent8/twist is none of the topics .*actuation"
+    ):
+        opened(tmp_path, apart, f'{bags.MAP}[clocks]\noffsets = {{ "/agent8/twist" = 0.3 }}\n')
+
+
+def test_without_motion_capture_the_camera_is_the_reference(drive: Recording, tmp_path: Path) -> None:
+    without = [m for m in bags.messages(drive) if m.topic != TRUTH]
+    bag, _, notes = opened(tmp_path, bags.later(without, stamps=-0.45, topics=TWIST))
+    lead = {row.topic: row.lead for row in bag.log.rows}[TWIST]
+    assert lead == pytest.approx(0.45, abs=0.03) and "wheel leads the camera of svea3 by 4" in notes
