@@ -24,23 +24,24 @@ def calibrate(
 ) -> None:
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
     from coopenv.backends.sources import SourceKind, kind_of, open_bags, open_recording
-    from coopenv.base.files import replace_text
+    from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
     from coopenv.cars.calibration.verdict import calibrate as calibrated
     from coopenv.cars.calibration.verdict import toml_text
     from coopenv.runs.console import Progress, number_table
 
-    if topics is not None:
-        drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
-    elif overrides:
-        raise CoopenvError("--set: needs the map of the bags' topics, --map topics.toml")
-    elif len(bags) > 1 or kind_of(bags[0]) is not SourceKind.LOG:
-        raise CoopenvError(f"{bags[0]}: needs the map of its topics, --map topics.toml; a log of coopenv does not")
-    else:
-        drive = drive_of_recording(open_recording(bags[0]), bags[0])
-    with Progress(options.console(stderr=True), "calibrating"):
-        result = calibrated(drive, not no_truth)
-    out.mkdir(parents=True, exist_ok=True)
+    with new_folder(out):
+        check_file(out / "calibration.toml")
+        if topics is not None:
+            drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
+        elif overrides:
+            raise CoopenvError("--set: needs the map of the bags' topics, --map topics.toml")
+        elif len(bags) > 1 or kind_of(bags[0]) is not SourceKind.LOG:
+            raise CoopenvError(f"{bags[0]}: needs the map of its topics, --map topics.toml; a log of coopenv does not")
+        else:
+            drive = drive_of_recording(open_recording(bags[0]), bags[0])
+        with Progress(options.console(stderr=True), "calibrating"):
+            result = calibrated(drive, not no_truth)
     files = [out / "calibration.toml"]
     replace_text(files[0], toml_text(result))
     if not no_figures:
