@@ -95,7 +95,7 @@ LINES_AND_FILES = {
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
-    "policies": (1550, 8),
+    "policies": (1570, 8),
     "runs": (3060, 13),
     "scenario": (3095, 12),
     "training": (1360, 5),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.policies.prediction import LEAST_ODDS, FieldOfView, Occluders, PlanarCovariance, unhidden
+from coopenv.policies.prediction import LEAST_ODDS, FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
@@ -42,6 +42,18 @@ class _Path(NamedTuple):
         dx, dy = stride * np.cos(heading), stride * np.sin(heading)
         along = self.along + stride * np.cos(heading - bend)
         return _Path(self.x + dx, self.y + dy, heading, along, self.aside + stride * np.sin(heading - bend)), dx, dy
+
+
+class _Sight(NamedTuple):
+    """What can be measured in some rows."""
+
+    landmarks: np.ndarray
+    """(rows, K, 2), m, own frame: those that are of use in any row."""
+    known: np.ndarray
+    """(rows, 1, K), which of them are."""
+    boxes: list[Occluder]
+    """What hides them."""
+    view: FieldOfView
 
 
 class _Follower(NamedTuple):
@@ -133,13 +145,7 @@ class LookAhead(RouteFollower):
 
     def costs(self, observations: np.ndarray, vehicle: np.ndarray, followers: list[_Follower]) -> np.ndarray:
         """Return the costs, (rows, plans) in s, for rows that are of these vehicles, (rows,)."""
-        pieces, bends = self._route_pieces(observations)
-        landmarks = self.read(observations, "map_position")[..., :2]
-        boxes = self.occluders.boxes(partial(self.read, observations))
-        known = (self.known(observations) & self._sees_landmarks[vehicle][:, None])[:, None]
-        useful = known.any(axis=(0, 1))
-        landmarks, known = landmarks[:, useful], known[..., useful]
-        view = self.view if self._one_view else FieldOfView.of_rows(self._views, vehicle)
+        (pieces, bends), sight = self._route_pieces(observations), self._sight(observations, vehicle)
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         none = np.zeros_like(std)
         covariance = PlanarCovariance(axes[:, :1] ** 2, none, none, axes[:, 1:2] ** 2, none, std**2)
@@ -165,12 +171,7 @@ class LookAhead(RouteFollower):
             now, dx, dy = now.moved(wanted, bend, stride, self._sharpest * stride)
             covariance = covariance.driven(dx, dy, self.drift * STEP, self.turn_drift * STEP)
             place = np.stack([now.x, now.y], axis=-1)
-            line = landmarks[:, None] - place[:, :, None]
-            bearing, radial, lateral = covariance.along(line)
-            odds = view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
-            camera = place + view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
-            odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, self.cruise * STEP * (step + 1))
-            covariance = covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
+            covariance = self._measured(covariance, sight, place, now.heading, STEP * (step + 1))
             # Uncertainty costs per metre: what a slow plan does not drive is counted at its end.
             cost = cost + STEP * self.price * paces * np.maximum(covariance.std - self.tolerated, 0.0)
             missing = missing + (1.0 - paces) * top * STEP
@@ -190,6 +191,25 @@ class LookAhead(RouteFollower):
             later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
             cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / top + BACK * np.abs(now.aside))
+
+    def _sight(self, observations: np.ndarray, vehicle: np.ndarray) -> _Sight:
+        """Return what can be measured in rows that are of these vehicles."""
+        known = (self.known(observations) & self._sees_landmarks[vehicle][:, None])[:, None]
+        useful = known.any(axis=(0, 1))
+        landmarks = self.read(observations, "map_position")[..., :2][:, useful]
+        view = self.view if self._one_view else FieldOfView.of_rows(self._views, vehicle)
+        return _Sight(landmarks, known[..., useful], self.occluders.boxes(partial(self.read, observations)), view)
+
+    def _measured(
+        self, covariance: PlanarCovariance, sight: _Sight, place: np.ndarray, heading: np.ndarray, time: float
+    ) -> PlanarCovariance:
+        """Return a covariance after the bearings that can be expected at places (rows, plans, 2), m, at a time, s."""
+        line = sight.landmarks[:, None] - place[:, :, None]
+        bearing, radial, lateral = covariance.along(line)
+        odds = sight.view.odds(line, heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * sight.known
+        camera = place + sight.view.ahead * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        odds = odds * unhidden(sight.boxes, odds > LEAST_ODDS, camera, sight.landmarks, self.cruise * time)
+        return covariance.measured(line, self.bearing_variance(line, radial, lateral), odds)
 
     def follow(self, follower: _Follower, time: float, place: np.ndarray, covariance: PlanarCovariance) -> _Follower:
         """Return a follower a step later, after the bearings to this vehicle that it can be expected to have.
