@@ -12,6 +12,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.terms import GROUPS
 from tests.helpers.four_way import FOUR_WAY
 
@@ -86,6 +87,8 @@ def test_observation_does_not_move_when_everything_moves_together(name: str, obs
     engine = Engine(scenario, 2, "float64")
     engine.reset([5, 5])
     L = len(scenario.landmarks)
+    if any(target >= L for target in neighbour_sets(scenario)[0]):
+        pytest.skip("the first vehicle measures another one, which follows it")
     state = engine.get_state()
     camera = state["position"][1, L] + state["rotation"][1, L] @ np.array(scenario.camera.position)
     # Only the first vehicle's leaders are landmarks; its followers may be anywhere without its noticing.

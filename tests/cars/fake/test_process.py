@@ -195,7 +195,8 @@ def test_cars_come_and_go() -> None:
             assert len(mentioning(endpoint)) == 3
             told = health(SHIPPED, endpoint).output.splitlines()
             assert told[0] == "svea7: gate disarmed, 0 commands accepted, 0 messages refused"
-            assert told[1].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
+            assert told[1] == "svea7: from 0.5 m/s to a stand 0.8 s and 0.28 m, with safety.deceleration"
+            assert told[2].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
         raise ZeroDivisionError
     assert not mentioning(endpoint)
 
