@@ -26,8 +26,8 @@ def calibrate(
     from coopenv.backends.sources import SourceKind, kind_of, open_bags, open_recording
     from coopenv.base.files import check_file, new_folder, replace_text
     from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
-    from coopenv.cars.calibration.verdict import calibrate as calibrated
-    from coopenv.cars.calibration.verdict import toml_text
+    from coopenv.cars.calibration.findings import calibrate as calibrated
+    from coopenv.cars.calibration.findings import toml_text
     from coopenv.runs.console import Progress, number_table
 
     with new_folder(out):
@@ -52,7 +52,7 @@ def calibrate(
             save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)
         ]
     if as_json:
-        options.print_json({"rows": result.rows, "verdict": result.verdict, "noise": result.noise})
+        options.print_json({"rows": result.rows, "findings": result.findings, "noise": result.noise})
         return
     table = number_table(["constant", "unit", "finding"], ["given", "estimate", "std. error"])
     for row in result.rows:
@@ -62,6 +62,6 @@ def calibrate(
     if any(car.lens is None for car in drive.cars):
         console.print("Bearings without pixels: intrinsics cannot be estimated.")
     console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
-    for line in result.verdict or ("No constant is wrong.",):
+    for line in result.findings or ("No constant is wrong.",):
         console.print(line, soft_wrap=True)
     console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)

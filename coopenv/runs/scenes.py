@@ -287,7 +287,7 @@ def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width
     if mp4:
         _write_mp4(path, fps, images)
         return
-    quality: dict[str, Any] = {"quality": 70, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
+    quality: dict[str, Any] = {"quality": 55, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
     if kept := [image if quality else image.quantize(64) for image in images]:
         ends = np.round(np.arange(len(kept) + 1) * 100.0 / fps) * 10.0
         duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from coopenv.cars.calibration.verdict import Calibrated
+from coopenv.cars.calibration.findings import Calibrated
 from coopenv.viz import style as house
 
 MOST_ARROWS = 400

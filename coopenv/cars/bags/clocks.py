@@ -4,6 +4,9 @@
   is a low quantile over windows; a robust line through the windows gives offset and drift.
 - By content: topics of a car measure the same motion. Turns and distances by gyro, wheels and motion capture, and the
   bearings of landmarks, agree best at one offset between their stamps. It contains no time of transport.
+
+Source of the line: Sen, Estimates of the regression coefficient based on Kendall's tau, Journal of the American
+Statistical Association 63, 1968.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set

@@ -8,6 +8,8 @@ Geman and McClure, whose scale follows from the residuals; odometry has the dens
 
 Standard errors are the larger of those by the information and of those by the spread of the scores of stretches of a
 second ("sandwich"): whole pixels give residuals that are correlated in time.
+Source: Geman and McClure, Statistical methods for tomographic image reconstruction, Bulletin of the International
+Statistical Institute 52, 1987; White, Maximum likelihood estimation of misspecified models, Econometrica 50, 1982.
 """
 
 from collections.abc import Sequence

@@ -158,8 +158,8 @@ def test_cars_stop_in_time_to_stand_inside_the_fence_and_apart(starts: Any, velo
     safety, station = Safety(geofence=CORNERS, separation=0.35), Station(Hub().connect(), (), None, {})
     watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
     watchdog.close()
-    told = [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()]
-    assert len(told) == len(found) and all(a.startswith(b) for a, b in zip(told, found, strict=True)), told
+    reasons = [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()]
+    assert len(reasons) == len(found) and all(a.startswith(b) for a, b in zip(reasons, found, strict=True)), reasons
 
 
 class Yard:

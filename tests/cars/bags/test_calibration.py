@@ -13,7 +13,7 @@ import pytest
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.drives import CarDrive, Drive
-from coopenv.cars.calibration.verdict import Calibrated, calibrate, toml_text
+from coopenv.cars.calibration.findings import Calibrated, calibrate, toml_text
 from coopenv.cars.readings import Calibration, rays
 from coopenv.cli import main
 from coopenv.scenario import load_scenario
@@ -127,14 +127,14 @@ def test_the_wrong_constant_is_named_and_recovered(
     given: dict[str, Any], named: str, true: dict[str, float], truth: bool
 ) -> None:
     result = calibrate(drive(**given), truth)
-    assert len(result.verdict) == bool(named) and all(line.startswith(named) for line in result.verdict)
+    assert len(result.findings) == bool(named) and all(line.startswith(named) for line in result.findings)
     for name, value in true.items():
         assert off(result, name, value) < 3.0, name
 
 
 def test_motion_capture_that_is_late_is_named() -> None:
     result = calibrate(drive(truth_late=0.15))
-    assert [line.split(" is")[0] for line in result.verdict] == ["car: stamps"]
+    assert [line.split(" is")[0] for line in result.findings] == ["car: stamps"]
     assert off(result, "car.truth.offset", -0.15) < 3.0
 
 
@@ -143,7 +143,7 @@ def test_bearings_alone_give_the_mounting_and_no_intrinsics() -> None:
     car = given.cars[0]
     blind = replace(car, lens=None, pixel=np.full_like(car.pixel, np.nan))
     result = calibrate(replace(given, cars=(blind,)))
-    assert off(result, "car.camera.z", 0.2233) < 3.0 and len(result.verdict) == 1
+    assert off(result, "car.camera.z", 0.2233) < 3.0 and len(result.findings) == 1
     assert not any(row.name.endswith((".fx", ".k1")) for row in result.rows)
 
 
@@ -209,7 +209,7 @@ def test_residuals_that_nothing_explains_are_no_calibration() -> None:
     given = drive()
     pixel = np.random.default_rng(0).uniform(5.0, 200.0, given.cars[0].pixel.shape)
     result = calibrate(replace(given, cars=(replace(given.cars[0], pixel=pixel),)), truth=False)
-    assert [line[:40] for line in result.verdict] == ["car: no constant explains the residuals "]
+    assert [line[:40] for line in result.findings] == ["car: no constant explains the residuals "]
     assert not any(row.finding == "wrong" for row in result.rows)
 
 
@@ -220,4 +220,4 @@ def test_one_landmark_is_too_few_without_motion_capture() -> None:
     alone = replace(given, cars=(replace(given.cars[0], **rows),))
     with pytest.raises(DataError, match="two static landmarks are never seen within 6 s"):
         calibrate(alone, truth=False)
-    assert not calibrate(alone).verdict
+    assert not calibrate(alone).findings

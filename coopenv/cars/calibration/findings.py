@@ -4,6 +4,7 @@ Every group of constants that may be wrong together is a hypothesis: a camera's 
 distortion, one marker. From the fit with all of them as given, the linearised gain ranks the hypotheses; the best ones
 are fitted. The one that lowers the cost most, less a penalty per constant (BIC), is accepted, and the search goes on
 from there until none is worth its penalty.
+Source: Schwarz, Estimating the dimension of a model, Annals of Statistics 6, 1978.
 """
 
 from collections.abc import Iterator, Sequence
@@ -65,7 +66,7 @@ class Calibrated:
     given: Fit  # with all constants as given
     fit: Fit  # with the wrong ones corrected
     rows: tuple[Row, ...]
-    verdict: tuple[str, ...]  # a line per finding
+    findings: tuple[str, ...]  # a line per finding
     noise: dict[str, float]  # measured, by key of an environment
 
 
@@ -80,7 +81,7 @@ PARTS = {
     "stamps": ("camera.offset", "wheel.offset", "truth.offset"),
     "body of motion capture": ("truth.body_yaw", "truth.body_x", "truth.body_y"),
 }
-"""Constants of a car that are wrong together, and that a line of the verdict names together."""
+"""Constants of a car that are wrong together, and that one finding names together."""
 ALSO = (
     *(PARTS["camera orientation"] + PARTS["camera position"], PARTS["focal length"] + PARTS["principal point"]),
     PARTS["focal length"] + PARTS["principal point"] + PARTS["lens distortion"],
@@ -90,7 +91,7 @@ ALSO = (
 
 
 def parts_of(batch: Batch) -> dict[str, list[int]]:
-    """Return the constants that a line of the verdict names together, by its title."""
+    """Return the constants that one finding names together, by its title."""
     number = {kind.name: n for n, kind in enumerate(batch.kinds)}
     found = {f"{car.name}: {title}": [number[f"{car.name}.{name}"] for name in names]
              for car in batch.cars for title, names in PARTS.items()}  # fmt: skip
@@ -131,7 +132,7 @@ def exchanged(batch: Batch) -> list[tuple[int, int]]:
 
 
 def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
-    """Return constants and verdict of a drive; `truth`: whether motion capture counts.
+    """Return constants and findings of a drive; `truth`: whether motion capture counts.
 
     Raises:
         DataError: the poses of a car are not determined.
@@ -232,8 +233,8 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
     lines = [*unexplained, *(f"markers {names[i]} and {names[j]} are exchanged" for i, j in pairs)]
     for title, part in parts_of(batch).items():
         found = [rows[n] for n in part if bad[n]]
-        told = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
-        lines += [f"{title} is wrong: {', '.join(told)}"] if told else []
+        changes = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
+        lines += [f"{title} is wrong: {', '.join(changes)}"] if changes else []
     for c, car in enumerate(batch.cars):
         shifted = ((topic, added) for topic, added in car.topics if abs(added) > FINEST["s"])
         lines += [f"{car.name}: import has moved the stamps of {topic} by {added:+.3f} s" for topic, added in shifted]
