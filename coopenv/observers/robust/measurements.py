@@ -10,9 +10,9 @@ import warp as wp
 from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
+from coopenv.observers.robust.algebra import averaging_time, between, by_rows, is_known, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, vec3d
+from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, mat66d, vec3d
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.reports import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
@@ -62,10 +62,15 @@ def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any
 
 @device_function
 def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether a fresh report of a sender is received and valid; False for a landmark, which is below 0."""
+    """Return whether a fresh report of a sender is received and valid; False for a landmark, which is below 0.
+
+    A vehicle whose pose is not known sends none, so that such a report is not from a correct one.
+    """
     if sender < 0:
         return False
-    return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
+    if not fresh(model, state, world, i, sender, tick) or memory.inbox[world, i, sender].valid == 0:
+        return False
+    return is_known(mat66d(memory.inbox[world, i, sender].P))
 
 
 @device_function
