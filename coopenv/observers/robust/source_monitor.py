@@ -101,7 +101,10 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
 
 @device_function
 def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
-    """Correct the own and the calibration errors by a sender's drift, if that is a fault."""
+    """Correct the own and the calibration errors by a sender's drift, if that is a fault.
+
+    A bearing that fits and would not with the drift shows that the odometry is wrong instead, and counts as without it.
+    """
     f = -(wp.transpose(memory.scratch[world, 0].pose.R) * memory.source[world, i, q].drift)
     for n in range(frame.bearings):
         if memory.measurement[world, n].fits == 1:
@@ -110,10 +113,11 @@ def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q
                 r = r + memory.derivative[world, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
             if memory.measurement[world, n].source == q:
                 r = r - memory.derivative[world, n, 0].jacobian[:, 3:] * f
-            r = memory.measurement[world, n].weight * r
-            for k in range(memory.belief[world, i].first_sender):
-                e = memory.drift_effect[world, i, q - 1, k] - wp.transpose(memory.projection[world, n, k]) * r
-                memory.drift_effect[world, i, q - 1, k] = e
+            weighted = memory.measurement[world, n].weight * r
+            if wp.dot(r, weighted) < wp.float64(constants.BEARING_GATE):
+                for k in range(memory.belief[world, i].first_sender):
+                    e = wp.transpose(memory.projection[world, n, k]) * weighted
+                    memory.drift_effect[world, i, q - 1, k] = memory.drift_effect[world, i, q - 1, k] - e
 
 
 @device_function
