@@ -10,7 +10,14 @@ import warp as wp
 from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import averaging_time, between, by_rows, is_known, odometry_noise, position_variance
+from coopenv.observers.robust.algebra import (
+    averaging_time,
+    between,
+    by_rows,
+    is_known,
+    odometry_noise,
+    position_variance,
+)
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, mat66d, vec3d
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances

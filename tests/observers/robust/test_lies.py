@@ -202,6 +202,34 @@ def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
     assert errors_beside(sender, 12.0, 2, 24.0, True).max() < 0.8
 
 
+@dataclass
+class OneAltered:
+    """Changes a message of the third vehicle that carries correlations: its covariance, or its odometry from then on."""
+
+    what: str
+    done: bool = False
+
+    def applies(self, vehicle: int, time: float) -> bool:
+        return vehicle == 2 and time > 4.0 and not (self.done and self.what == "covariance")
+
+    def broadcast(self, observer: Any, message: Message) -> Message:
+        self.done |= "correlations" in message.extra
+        if not self.done:
+            return message
+        if self.what == "covariance":
+            return replace(message, covariance=1e9 * message.covariance)
+        return replace(message, extra={**message.extra, "odometry": message.extra["odometry"] + np.float32(1e3)})
+
+
+@pytest.mark.parametrize("what", ["covariance", "odometry"])
+def test_a_single_absurd_message_makes_nobody_uncertain(what: str) -> None:
+    recording = record(scene(horizon=9.0), 907)
+    found = run("robust", recording, OneAltered(what))
+    others = found.covariance[recording.t > 4.0][:, [0, 1, 3, 4]]
+    assert np.sqrt(np.trace(others[..., 3:, 3:], axis1=-2, axis2=-1)).max() < 0.4
+    assert found.position_error[recording.t > 4.0].max() < 0.4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 15.0])
 @pytest.mark.parametrize("sender", range(4))
