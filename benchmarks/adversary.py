@@ -98,7 +98,7 @@ class Worlds:
         scenario = self.envs.scenario
         self._seconds = int(scenario.horizon - START)
         self._decisions = round(scenario.rates.decision)
-        self._idle = np.zeros((self.envs.num_envs, scenario.action.size), np.float32)
+        self._idle = np.zeros((self.envs.num_envs, scenario.action_size), np.float32)
         self._honest = np.arange(self.envs.vehicles) != LIAR
 
     def play(self, seeds: Sequence[int], steering: Steering) -> Rollouts:

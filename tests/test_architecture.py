@@ -86,8 +86,8 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (130, 2),
-    "api": (3830, 19),
-    "backends": (3275, 17),
+    "api": (3875, 19),
+    "backends": (3280, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
     "cars": (9110, 41),
@@ -95,12 +95,12 @@ LINES_AND_FILES = {
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
-    "policies": (1570, 8),
+    "policies": (1730, 10),
     "runs": (3060, 13),
-    "scenario": (3095, 12),
-    "training": (1360, 5),
+    "scenario": (3135, 12),
+    "training": (1380, 5),
     "viz": (4500, 18),
-    "world": (4312, 17),
+    "world": (4390, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -184,14 +184,28 @@ def test_the_page_on_watching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert (tmp_path / "replay.html").stat().st_size > 500_000
 
 
+def flat(table: dict[str, Any], under: str = "") -> dict[str, Any]:
+    """Return the values of nested tables by dotted key."""
+    pairs = ((f"{under}{key}", value) for key, value in table.items())
+    return {
+        k: v
+        for key, value in pairs
+        for k, v in (flat(value, f"{key}.") if isinstance(value, dict) else {key: value}).items()
+    }
+
+
 def test_the_tables_of_terms() -> None:
-    own, driven = (tomllib.loads(text) for text in tables("terms.md"))
+    (own,) = (tomllib.loads(text) for text in tables("terms.md"))
     lanes = tomllib.loads((ROOT / "examples" / "lane_keeping" / "lane_keeping.toml").read_text(encoding="utf-8"))
     for table in ("reward", "observation", "termination"):
         assert own[table].items() <= (lanes[table] | own[table]).items()
         assert own[table]["custom"].keys() == lanes[table]["custom"].keys()
-    overrides = {f"{table}.{key}": value for table, keys in driven.items() for key, value in keys.items()}
-    assert load_scenario("urban_crossing", overrides).observation.map_size == 6
+    page = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    rows = [tomllib.loads(line.split("`")[1]) for line in page.splitlines() if re.match(r"\| `[^`]* = [^`]*` \|", line)]
+    roles = [row for row in rows if {*row} & {"action", "vehicles"} or "own_share" in row.get("reward", {})]
+    assert len(roles) == 3
+    for row in roles:
+        assert load_scenario("scout_platoon", {**flat(row), "reward.team": "mean"})
 
 
 def test_the_settings_of_training(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from coopenv.backends.base import Backend, SensingWorld
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
 from coopenv.base.errors import CoopenvError, check_memory, error_text, training_seed, world_keys
+from coopenv.base.installation import load_reference
 from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
@@ -76,6 +77,11 @@ class Engine:
         on_host = self.world.observer is HOST
         self.plugins = PlugIns(scenario.observer.name, self.world) if on_host else None
         """The observers that run on the host; None where the embedded one estimates."""
+        if on_host and (scenario.action.radio or scenario.reward.by_name["radio"]):
+            raise CoopenvError(
+                f"action.radio and reward.weights.radio: observer '{scenario.observer.name}' runs on the "
+                "host; use riccati, robust or dead_reckoning"
+            )
         self.layout = observation_layout(scenario)
         self.reward_terms = tuple(scenario.reward.by_name)
         """Names of the reward terms, in the order of the field `terms`."""
@@ -91,6 +97,9 @@ class Engine:
         self._table = results_table(scenario, self.layout, device)
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
+        scripted = load_reference("coopenv.policies.scripted:ScriptedVehicles")  # policies stand on environments
+        self.scripted: Any = scripted(scenario) if any(scenario.drivers) else None
+        """Drivers in place of actions; None without any."""
         self.begun = False
         """Whether every world has been reset, or restored from one that had."""
 
@@ -119,8 +128,7 @@ class Engine:
         if parameters:
             self.world.set_parameters(parameters, chosen)
         self.world.reset(seeds, mask, options)
-        if self.plugins is not None:
-            self.plugins.start(np.flatnonzero(chosen))
+        self._start_on_host(chosen)
         self._fresh.assign(chosen.astype(np.int32))
         self._fill("results fresh", self._fresh, self._fresh)
         if self.backend.capabilities.real_time and not self.begun:
@@ -148,6 +156,7 @@ class Engine:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, A) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
+        self._drive_scripted()
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self._own_terms.end_episodes()
         self.refresh()
@@ -159,6 +168,7 @@ class Engine:
             self.step()
             return
         wp.copy(self.world.mask, self.results.over)
+        self._drive_scripted()
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision)
         self._restart()
         self._own_terms.end_episodes()
@@ -176,8 +186,24 @@ class Engine:
 
     def _restart(self) -> None:
         self.world.restart()
+        if self.plugins is not None or self.scripted is not None:
+            self._start_on_host(self.world.mask.numpy() != 0)
+
+    def _start_on_host(self, chosen: np.ndarray) -> None:
+        """Start what runs on the host in worlds (W,) that have just been reset: observers and scripted drivers."""
         if self.plugins is not None:
-            self.plugins.start(np.flatnonzero(self.world.mask.numpy()))
+            self.plugins.start(np.flatnonzero(chosen))
+        if self.scripted is not None:
+            self.scripted.restart(chosen, self.world.model.vehicles)
+
+    def _drive_scripted(self) -> None:
+        """At a decision, let the drivers that the scenario names choose the actions of their vehicles."""
+        if self.scripted is not None:
+            ticks = self.view("tick")[self.view("over") == 0]
+            if not (ticks % self.world.model.ticks_per_decision).any():
+                actions = np.array(self.view("actions"))
+                self.scripted.act(self.view("observation"), actions)
+                self.set_actions(actions)
 
     def _fill(self, key: str, fresh: Any, chosen: Any) -> None:
         """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun."""
@@ -188,7 +214,8 @@ class Engine:
         self._own_terms.fill(key, fresh, chosen)
         if self._team != "own":
             least = int(self._team == "min")
-            arguments = [world.model, PerWorld(world.state), PerWorld(self.results), least, PerWorld(chosen)]
+            share = self.backend.scenario.reward.own_share
+            arguments = [world.model, PerWorld(world.state), PerWorld(self.results), least, share, PerWorld(chosen)]
             world.launch(f"{key} of the team", team_results, arguments)
         if world.device == "cpu":  # reading from a GPU would wait for it
             self._own_terms.check(self.view)
@@ -260,7 +287,8 @@ class Engine:
             CoopenvError: a plug-in observer cannot be copied.
         """
         memory = {name: getattr(self.results, name).numpy().copy() for name in MEMORY}
-        own = {} if self.plugins is None else {"observers": self.plugins.get_state()}
+        own: dict[str, Any] = {} if self.plugins is None else {"observers": self.plugins.get_state()}
+        own |= {} if self.scripted is None else {"drivers": self.scripted.get_state()}
         return {**self.world.get_state(), **self.world.source_state(), **memory, **own}
 
     def set_state(self, values: Mapping[str, Any]) -> None:
@@ -274,6 +302,8 @@ class Engine:
         self.world.set_source_state(values)
         if self.plugins is not None:
             self.plugins.set_state(values.get("observers"), has_begun(checked["start_rotation"]))
+        if self.scripted is not None:
+            self.scripted.set_state(values.get("drivers"))
         overwrite(self.world.state_arrays(), checked)
         self.refresh()
         overwrite(memory, checked)

@@ -85,7 +85,10 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
         here = backend.capabilities.estimated
         names = scenario.vehicle_names
-        self.possible_agents = [name for i, name in enumerate(names) if here is None or i in here]
+        drivers = scenario.drivers
+        self.possible_agents = [n for i, n in enumerate(names) if drivers[i] is None and (here is None or i in here)]
+        if not self.possible_agents:
+            raise CoopenvError("vehicles.*.motion.driver: every vehicle has a driver, no agent is left")
         self._agents: list[str] = []
         self._np_random: np.random.Generator | None = None
         self._index = {agent: names.index(agent) for agent in self.possible_agents}

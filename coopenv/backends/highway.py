@@ -185,6 +185,8 @@ class Simulation:
     def reset(self, seed: int) -> Poses:
         """Draw traffic and starts; of the traffic, the cars nearest to the first driven one are connected.
 
+        Those beyond `most_vehicles` are taken off the road.
+
         Raises:
             ScenarioError: its road does not have the vehicles that the scenario names.
         """
@@ -201,6 +203,9 @@ class Simulation:
         else:
             raise ScenarioError(f"vehicles: {connected} are in traffic, but highway-env has fewer there")
         traffic.sort(key=lambda car: float(np.linalg.norm(car.position - drivers[0].position)))
+        assert self._scenario.highway is not None
+        surplus = {id(car) for car in traffic[connected + self._scenario.highway.most_vehicles :]}
+        self.environment.road.vehicles = [car for car in self.environment.road.vehicles if id(car) not in surplus]
         own, others = iter(drivers), iter(traffic)
         self._cars = [next(own if is_driven else others) for is_driven in self._driven]
         return self.poses()

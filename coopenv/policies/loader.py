@@ -215,6 +215,6 @@ def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
         CoopenvError: there is no such policy, or the agent cannot drive in this scenario.
     """
     if name in PLAIN:
-        return PLAIN[name](seed, scenario.action.size)
+        return PLAIN[name](seed, scenario.action_size)
     check_agent(name, "policy", PLAIN)
     return load_agent(name, scenario)

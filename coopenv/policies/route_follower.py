@@ -1,12 +1,14 @@
 """The baseline: along the route at full speed, giving way to vehicles whose messages it receives."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
-from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.layout import RADIO, observation_layout
+from coopenv.policies.giving_way import at_arc_lengths, discs_along, nearest, right_of_way
 from coopenv.scenario import Scenario
-from coopenv.scenario.schema import neighbour_sets
 
 MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
 """Of `observation.route_step`: how far ahead the entries of `route_ahead` are."""
@@ -75,6 +77,7 @@ class Driver(ABC):
         wanted = self.drive(np.asarray(observations, dtype=np.float32))
         for k, (field, values) in enumerate(zip(self.layout.action, wanted, strict=False)):
             actions[:, k] = np.clip(field.level(values), -1.0, 1.0)
+        actions[:, [field.name.startswith(RADIO) for field in self.layout.action]] = 1.0  # it sends whole reports
         return actions
 
     def read(self, observations: np.ndarray, name: str) -> np.ndarray:
@@ -138,6 +141,17 @@ REACTION = 0.5
 """s; cars that stop slowly look ahead for as long as stopping takes and this: their guesses are good for no longer."""
 
 
+SAME_WAY = np.cos(np.pi / 4.0)
+"""Cosine of the angle up to which a car drives the same way; one behind that does keeps its own distance."""
+
+PATIENCE, STANDING = 3.0, 0.5
+"""s for which a car waits that is slower than this, m/s, before it takes others to go on as they do now, until it
+drives at half of its top speed."""
+
+PREDICTED = 11
+"""Points in time of a predicted motion of a car that stops slowly."""
+
+
 class RouteFollower(Driver):
     """Pure pursuit of the route by the vehicle's own estimate; stops where driving on comes too close to vehicles.
 
@@ -155,17 +169,28 @@ class RouteFollower(Driver):
     def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
         """See `Driver`."""
         super().__init__(scenario, cruise=cruise)
-        least = (self.length + self.width) / 2.0 + GAP
-        self.clearance, self.closest = max(self.clearance, least), max(self.closest, least)
-        stopping = self.cruise / scenario.dynamics.max_acceleration
-        nimble = stopping <= SOON
+        self.braking = scenario.dynamics.max_acceleration
+        stopping = self.cruise / self.braking
+        self.nimble = nimble = stopping <= SOON
         self.goes_first = right_of_way(scenario)
         """(N, N - 1), whether a vehicle has the right of way over the sender of each message."""
-        self.blocking = (self.length + self.width) / 2.0 + 0.4 * GAP
+        traffic = [vehicle.motion.kind == "traffic" for vehicle in scenario.vehicles]
+        self.traffic = np.array([traffic[:i] + traffic[i + 1 :] for i in range(len(traffic))])
+        """(N, N - 1), which senders are cars of a backend's traffic."""
+        self.discs = np.zeros(1) if nimble else discs_along(self.length, self.width)
+        """Centres of the discs that cover a car, m ahead of its reference point; a nimble car is one disc."""
+        reach = (self.length + self.width) / 2.0 if nimble else np.hypot(self.length / len(self.discs), self.width)
+        more = (self.clearance - self.closest) * self.scale
+        self.closest = max(self.closest if nimble else 0.0, reach + GAP)
+        self.clearance = max(self.clearance, self.closest) if nimble else self.closest + more
+        self.blocking = reach + 0.4 * GAP
         """Distance, m, below which a vehicle blocks the way."""
         self.foresight = 6.0 if nimble else stopping + REACTION
         """How far ahead to look for others, s."""
-        self.paces = (1.0,) if nimble else (0.0, 0.5, 1.0)
+        self.period = 1.0 / scenario.rates.decision
+        self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(3)), np.zeros(0))
+        """Of the last decision: which messages there were, their places, ages and velocities, and s of standing."""
+        self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
@@ -190,27 +215,88 @@ class RouteFollower(Driver):
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
 
-        Others are expected to go straight on at the speed `cruise`, or at any of `paces` of it.
+        Others are expected to go straight on at one of `velocities`.
         """
         mask, place, forward = self.received(observations)
         points, distance = self.route_points(observations)
-        velocities = [pace * self.cruise * forward for pace in self.paces]
-
-        keep, times = self.distance_to_keep(observations), distance / self.cruise
+        if not self.nimble:
+            mask = mask & ((place[..., 0] > 0.0) | (forward[..., 0] < SAME_WAY))
+        keep, times, count = self.distance_to_keep(observations), distance / self.cruise, len(self.discs)
+        velocities = [np.repeat(v, count, axis=1) for v in self.velocities(observations, mask, place, forward)]
+        place = (place[:, :, None] + self.discs[:, None] * forward[:, :, None]).reshape(len(place), -1, 2)
+        mask, forward = (np.repeat(values, count, axis=1) for values in (mask, forward))
         near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
-        clear = nearest(points, times, place, 0.0 * forward, mask, SOON) >= np.minimum(self.blocking, near)
+        soon = SOON if self.nimble else self.foresight
+        clear = nearest(points, times, place, 0.0 * forward, mask, soon) >= np.minimum(self.blocking, near)
         clear |= not self.goes_first.any()  # those who never have the right of way keep the larger distance below
         vehicles = len(self.goes_first)
         if len(mask) % vehicles == 0:  # else the rows are of unknown vehicles, which give way to all
-            mask = self.before(mask, np.arange(len(mask)) % vehicles)
+            senders = self.before(mask[:, ::count], np.arange(len(mask)) % vehicles)
+            mask = np.repeat(senders, count, axis=1)
 
-        def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
-            found = [nearest(path, times, place, velocity, mask, self.foresight) for velocity in velocities]
+        def least(paths: Sequence[np.ndarray], times: np.ndarray) -> np.ndarray:
+            found = [nearest(p, times, place, v, mask, self.foresight) for p, v in product(paths, velocities)]
             return np.asarray(np.min(found, axis=0))
 
-        going = least(points, times)
-        waiting = least(np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0]))
+        if self.nimble:
+            going = least([points], times)
+            waiting = least([np.zeros((len(observations), 2, 2))], np.array([0.0, 1.0]))
+        else:
+            times = np.linspace(0.0, self.foresight, PREDICTED)
+            s = self.going(observations, times)
+            going, waiting = (least(self.swept(points, distance, arcs), times) for arcs in (s, 0.0 * s))
         return np.where(clear & ((going >= keep) | (going > waiting)), self.cruise, 0.0)
+
+    def velocities(
+        self, observations: np.ndarray, mask: np.ndarray, place: np.ndarray, forward: np.ndarray
+    ) -> list[np.ndarray]:
+        """Return what velocities senders may have, (rows, M, 2) in m/s each: `paces` of the speed `cruise`.
+
+        A car that stops slowly, and has stood for `PATIENCE`, measures those of the traffic by two messages, in its own
+        frame, whose motion is that of the odometry: otherwise both might wait for each other for ever.
+        """
+        expected = [pace * self.cruise * forward for pace in self.paces]
+        if self.nimble or not {"velocity", "angular_velocity", "message_age"} <= {*self.layout}:
+            return expected
+        speed = self.read(observations, "velocity")[:, 0]
+        turn = -self.period * self.read(observations, "angular_velocity")[:, -1]
+        age = self.read(observations, "message_age")[..., None]
+        if len(self._last[0]) != len(place):
+            self._last = np.zeros_like(mask), place, age, np.full_like(place, np.nan), np.zeros(len(place))
+        received, before, aged, velocity, stood = self._last
+        x, y, c, s = before[..., 0] - self.period * speed[:, None], before[..., 1], np.cos(turn), np.sin(turn)
+        before = np.stack([c[:, None] * x - s[:, None] * y, s[:, None] * x + c[:, None] * y], axis=-1)
+        span = self.period + aged - age  # s, between the sendings
+        velocity = np.where(span > self.period / 2.0, (place - before) / np.maximum(span, self.period / 2.0), velocity)
+        velocity[~(mask & received)] = np.nan
+        stood = np.where(speed < STANDING, stood + self.period, np.where(speed < self.cruise / 2.0, stood, 0.0))
+        self._last = mask, place, age, velocity, stood
+        waits = (stood < PATIENCE)[:, None, None]
+        if len(place) % len(self.traffic) == 0:
+            waits = waits | ~self.traffic[np.arange(len(place)) % len(self.traffic)][..., None]
+        measured = np.where(np.isnan(velocity), expected[-1], velocity)
+        return [measured, *(np.where(waits, each, measured) for each in expected)]
+
+    def reset(self, mask: np.ndarray) -> None:
+        """See `Driver.reset`."""
+        super().reset(mask)
+        if len(self._last[0]) == len(mask):
+            self._last[0][mask], self._last[-1][mask] = False, 0.0
+
+    def going(self, observations: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Return the arc lengths, (rows, P) in m, at times (P,) in s of going on at full speed."""
+        speed = np.full((len(observations), 1), self.cruise)
+        if "velocity" in self.layout:
+            speed = np.clip(self.read(observations, "velocity")[:, :1], 0.0, self.cruise)
+        gains = np.minimum(times, (self.cruise - speed) / self.braking)
+        return np.asarray(speed * times + self.braking * gains * (times - gains / 2.0))
+
+    def swept(self, points: np.ndarray, distance: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
+        """Return where the centres of the own discs are, (rows, P, 2) each, at arc lengths (rows, P) of the route."""
+        along = [at_arc_lengths(points, distance, arc) for arc in (s, s + 0.1)]
+        forward = along[1] - along[0]
+        forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)
+        return [along[0] + ahead * forward for ahead in self.discs]
 
     def distance_to_keep(self, observations: np.ndarray) -> np.ndarray:
         """Return the distances to keep, (rows,) in m: they grow with the standard deviation of the own position."""
@@ -218,47 +304,6 @@ class RouteFollower(Driver):
             return np.full(len(observations), self.clearance)
         std = 10.0 ** self.read(observations, "position_std")[:, 0]
         return np.asarray(np.minimum(self.closest + std, self.clearance))
-
-
-def right_of_way(scenario: Scenario) -> np.ndarray:
-    """Return over whose messages each vehicle has the right of way, (N, N - 1): of driven vehicles after it in order.
-
-    None, where some driven vehicle does not receive another one's messages.
-    """
-    driven = np.array([vehicle.motion.kind == "driven" for vehicle in scenario.vehicles])
-    first, landmarks = np.triu(driven[:, None] & driven, 1), len(scenario.landmarks)
-    if scenario.v2x.links != "all":
-        receives = np.array([np.isin(np.arange(len(driven)) + landmarks, row) for row in neighbour_sets(scenario)])
-        first &= bool((receives | ~(driven[:, None] & driven) | np.eye(len(driven), dtype=bool)).all())
-    return np.asarray(first[~np.eye(len(driven), dtype=bool)].reshape(len(driven), -1))
-
-
-def nearest(
-    path: np.ndarray, times: np.ndarray, place: np.ndarray, velocity: np.ndarray, mask: np.ndarray, until: float
-) -> np.ndarray:
-    """Return the closest approach of other vehicles, (rows,) in m; infinite without any.
-
-    Args:
-        path: (rows, P, 2), m, own places at these times, with straight lines between and after them.
-        times: (P,), s.
-        place: (rows, M, 2), m, of others now.
-        velocity: (rows, M, 2), m/s, of others.
-        mask: (rows, M), which vehicles count.
-        until: s.
-    """
-    found = np.full(len(path), np.inf)
-    for k in range(len(times) - 1):
-        begin, end = times[k], times[k + 1] if k < len(times) - 2 else max(until, times[k + 1])
-        own = (path[:, k + 1] - path[:, k]) / (times[k + 1] - times[k])
-        apart = place + velocity * begin - path[:, k][:, None]
-        away = velocity - own[:, None]
-        square = np.maximum((away**2).sum(axis=-1), 1e-9)
-        time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, min(end, until) - begin)
-        distance = np.linalg.norm(apart + time[..., None] * away, axis=-1)
-        found = np.minimum(found, np.min(distance, axis=1, where=mask, initial=np.inf))
-        if end >= until:
-            break
-    return found
 
 
 class IntelligentDriver(RouteFollower):
@@ -279,7 +324,6 @@ class IntelligentDriver(RouteFollower):
     def __init__(self, scenario: Scenario, *, cruise: float | None = None) -> None:
         """See `Driver`."""
         super().__init__(scenario, cruise=cruise)
-        self.period = 1.0 / scenario.rates.decision
         bodies = [vehicle.body.size[0] for vehicle in scenario.vehicles if vehicle.body]
         self.length = max(bodies, default=0.0)
 

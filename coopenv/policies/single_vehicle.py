@@ -29,7 +29,7 @@ def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
     except CoopenvError:
         if others is not None:
             raise
-        return zero_policy(width=scenario.action.size)
+        return zero_policy(width=scenario.action_size)
 
 
 class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
@@ -60,8 +60,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self._spec: EnvSpec | None = None
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names, scenario = self.world.possible_agents, self.world.scenario
-        driven = [n for n, v in zip(names, scenario.vehicles, strict=True) if v.motion.kind == "driven"] or names
-        self.vehicle = driven[-1] if vehicle is None else vehicle
+        acting = [n for n, acts in zip(scenario.vehicle_names, scenario.acting, strict=True) if acts and n in names]
+        self.vehicle = (acting or names)[-1] if vehicle is None else vehicle
         check_one_of("unknown vehicle", self.vehicle, names)
         self._others = driver_of(others, scenario)
         self.render_mode = self.world.render_mode
@@ -91,7 +91,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
             observations, infos = self.world.reset()  # an episode without it
         else:
             raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
-        restart(self._others, np.ones(len(self.world.possible_agents), dtype=bool))
+        restart(self._others, np.ones(len(self.world.scenario.vehicles), dtype=bool))
         return observations[self.vehicle], infos[self.vehicle]
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -100,8 +100,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             ActionError: the action has the wrong shape or is not finite.
         """
-        observed, width = self.world.engine.view("observation")[0], self.world.scenario.action.size
-        chosen = dict(zip(self.world.possible_agents, decide(self._others, observed, width), strict=True))
+        observed, width = self.world.engine.view("observation")[0], self.world.scenario.action_size
+        chosen = dict(zip(self.world.scenario.vehicle_names, decide(self._others, observed, width), strict=True))
         actions = {agent: chosen[agent] for agent in self.world.agents}
         if self.vehicle in actions:
             actions[self.vehicle] = action

@@ -128,6 +128,8 @@ class DrivenMotion(Section):
     """Driven by the agent's actions through the kinematic bicycle of `[dynamics]`."""
 
     kind: Literal["driven"] = "driven"
+    driver: Annotated[str, Field(min_length=1, max_length=1_000)] | None = None
+    """Agent that drives it in place of actions: name, folder or `file.py:Class` (none: actions)."""
     initial_speed: Number = 0.0
     """m/s"""
     initial_speed_spread: NonNegative = 0.0

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, ConfigDict, Field, create_model, model_vali
 
 from coopenv.base.errors import listed, suggest
 from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Number, Positive
+from coopenv.scenario.base import NonNegative, Number, Positive, Probability
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -118,19 +118,18 @@ class Pan(Section):
 
 
 class Action(Section):
-    """Meaning of the entries of an action in [-1, 1]; with `[action.pan]` there is a third one, the camera's angle."""
+    """Meaning of the entries of an action in [-1, 1]: two, with `[action.pan]` a third one, the camera's angle."""
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
     steering: Positive | None = None
     """Steering angle at action 1, rad (none: max_steering)."""
     pan: Pan | None = None
-    """None: cameras do not turn, and an action has two entries."""
-
-    @property
-    def size(self) -> int:
-        """How many entries an action has."""
-        return 2 if self.pan is None else 3
+    """None: cameras do not turn."""
+    radio: bool = False
+    """Whether further entries, one per other vehicle in ascending order, choose what is sent to it until the next
+    decision: up to 0 nothing, up to 0.5 the pose alone, for its driver, above 0.5 the whole report, for its estimator,
+    too. Otherwise reports are broadcast."""
 
 
 _built_in: dict[str, Any] = {
@@ -164,6 +163,8 @@ class Reward(Section):
     """Whose weighted sum a driven vehicle is rewarded for: its own, or the mean or the least of all driven vehicles.
     For the latter two an episode goes on, without actions, until it is over for all of them; the mean is over all that
     are there, the least over those under way."""
+    own_share: Probability = 0.0
+    """With a team: the share of a vehicle's own weighted sum in its reward; the rest of it is the team's."""
     uncertainty_threshold: NonNegative = 0.02
     """m; terms per metre count what is above it"""
     uncertainty_cap: Positive = 1.0

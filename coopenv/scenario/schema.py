@@ -144,6 +144,23 @@ class Scenario(Section):
         return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
 
     @property
+    def drivers(self) -> list[str | None]:
+        """The agent that drives each vehicle in place of actions; None: none does."""
+        return [getattr(vehicle.motion, "driver", None) for vehicle in self.vehicles]
+
+    @property
+    def acting(self) -> list[bool]:
+        """Whether actions drive each vehicle."""
+        driven = [vehicle.motion.kind == "driven" for vehicle in self.vehicles]
+        return [each and driver is None for each, driver in zip(driven, self.drivers, strict=True)]
+
+    @property
+    def action_size(self) -> int:
+        """How many entries an action has."""
+        radio = len(self.vehicles) - 1 if self.action.radio else 0
+        return (2 if self.action.pan is None else 3) + radio
+
+    @property
     def has_lasting_errors(self) -> bool:
         """Whether any vehicle's odometry or camera has errors that last, see `[noise]` and `[camera]`."""
         noises, cameras = self.noises, self.cameras
@@ -293,6 +310,12 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
     driven = sum(vehicle.motion.kind == "driven" for vehicle in s.vehicles)
     if s.reward.team != "own" and driven < 2:
         yield f"reward.team: '{s.reward.team}' needs at least two driven vehicles, got {driven}"
+    landmarks = len(s.landmarks)
+    receives = any(target >= landmarks for targets in neighbour_sets(s) for target in targets)
+    if s.action.radio and not (receives or (s.v2x.links == "all" and len(s.vehicles) > 1)):
+        yield "action.radio: no vehicle receives messages of another one here (v2x.links, vehicles.*.neighbours)"
+    if s.reward.own_share and s.reward.team == "own":
+        yield "reward.own_share: only with reward.team = 'mean' or 'min'"
     steering, decision = s.action.steering, 1.0 / s.rates.decision
     for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
         own = vehicle.dynamics is not None

@@ -96,6 +96,12 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("sighting_mask", "neighbour", 1, "bool", 1, 0, "1: measured in this frame"),
         ("sighting_age", "neighbour", 1, "s", "age_scale", 0, "time since it was measured"),
     ],
+    "seen": [
+        ("seen_mask", "neighbour", 1, "bool", 1, 0,
+         "1: a message is at hand by which the neighbour measured this vehicle in the frame of its sending"),
+        ("seen_age", "neighbour", 1, "s", "age_scale", 0,
+         "time since the neighbour measured this vehicle, by its last message; 1: longer ago than the scale, or never"),
+    ],
     "map": [
         ("map_position", "landmark", 3, "m", "map_scale", -1,
          "landmark of the map seen from one's own estimate, body frame", XY),
@@ -137,6 +143,9 @@ REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
     ("off_route", "1", False, "-1 in the step in which the vehicle has left its route"),
     ("control", "1", False, "Minus the squared length of the action"),
     ("time", "s", False, "Minus the time that has passed"),
+    ("radio", "kB", False,
+     "Minus the size of what was sent: a report by its estimator (`robust`: 172 bytes and 42 per correlation), a pose "
+     "56 bytes; a broadcast counts once, with `action.radio` every receiver"),
     ("position_error", "m", True, "Minus the position error"),
     ("orientation_error", "rad", True, "Minus the orientation error"),
     ("position_uncertainty", "m^2", False,

@@ -77,8 +77,8 @@ def possible(plan: TrainingPlan) -> Scenario:
             needs to see.
     """
     scenario = open_simulation(plan.environment, plan.all_overrides)
-    if not scenario.driven:
-        raise CoopenvError(f"{plan.environment}: all motion here is prescribed, there is nothing to learn")
+    if not any(scenario.acting):
+        raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
     for each, _ in plan.scenarios():
         if plan.settings.clone is not None:
             load_agent(plan.settings.clone.agent, each)
@@ -280,6 +280,9 @@ def restore(checkpoint: Checkpoint, trainer: Trainer) -> None:
                 raise ValueError(f"statistics/{name} has shape {found.shape}")
             setattr(statistics, name, found)
         statistics.count = float(arrays["statistics"]["count"])
+        spread = arrays["statistics"]["spread"]
+        trainer.env.spread.mean, trainer.env.spread.var, trainer.env.spread.count = spread
+        trainer.env.returns[...] = arrays["statistics"]["returns"]
         torch.set_rng_state(torch.from_numpy(arrays["random"]["torch"]))
         key, position = np.split(arrays["random"]["numpy"], [-1])
         np.random.set_state({"bit_generator": "MT19937", "state": {"key": key, "pos": int(position[0])}})
@@ -300,7 +303,11 @@ def _arrays(trainer: Trainer) -> Arrays:
     groups: dict[str, Mapping[str, Any]] = {
         "policy": {name: values.numpy() for name, values in policy.state_dict().items()},
         "optimiser": {f"{index}/{name}": values.numpy() for index, row in moments for name, values in row.items()},
-        "statistics": {name: getattr(statistics, name) for name in ("mean", "var", "count")},
+        "statistics": {
+            **{name: getattr(statistics, name) for name in ("mean", "var", "count")},
+            "spread": np.array([getattr(trainer.env.spread, name) for name in ("mean", "var", "count")], dtype=float),
+            "returns": trainer.env.returns,
+        },
         "random": {"torch": torch.get_rng_state().numpy(), "numpy": np.append(key, np.uint32(position))},
         "world": _worlds(trainer),
     }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -66,8 +66,9 @@ class Ppo(Section):
     """Weight of the value loss."""
     max_gradient: Positive = 0.5
     """Norm at which gradients are clipped."""
-    reward_scale: Positive = 0.1
-    """Factor of rewards, for values of order one."""
+    reward_scale: Positive | Literal["spread"] = 0.1
+    """Factor of rewards, for values of order one; `spread`: 1 / the running standard deviation of discounted returns,
+    for rewards of another size, such as those of a team."""
     initial_std: Positive = 0.5
     """Initial standard deviation of the exploration; actions reach from -1 to 1."""
     hidden: tuple[Count, ...] = Field(default=(128, 128), min_length=1)

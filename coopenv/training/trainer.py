@@ -21,11 +21,10 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
-from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
-from coopenv.training.settings import Clone, TrainingPlan
+from coopenv.training.settings import Clone, Ppo, TrainingPlan
 
 EPISODES = 200
 """Last episodes of vehicles over which is averaged."""
@@ -162,12 +161,18 @@ class NormalisedEnv(VecEnvWrapper):
 
     venv: CooperativeSB3VecEnv
 
-    def __init__(self, venv: CooperativeSB3VecEnv, clip: float, reward_scale: float) -> None:
-        """Wrap a batch; `clip` in standard deviations."""
+    def __init__(self, venv: CooperativeSB3VecEnv, ppo: Ppo) -> None:
+        """Wrap a batch."""
         shape = venv.observation_space.shape
-        super().__init__(venv, observation_space=spaces.Box(-clip, clip, shape=shape, dtype=np.float32))
+        super().__init__(
+            venv,
+            observation_space=spaces.Box(-ppo.observation_clip, ppo.observation_clip, shape=shape, dtype=np.float32),
+        )
         self.statistics = RunningMeanStd(shape=shape or ())
-        self._clip, self._reward_scale = clip, reward_scale
+        self._clip, self._scale, self._gamma = ppo.observation_clip, ppo.reward_scale, ppo.gamma
+        self.spread = RunningMeanStd(shape=())
+        """Of discounted returns, in the units of the scenario."""
+        self.returns = np.zeros(venv.num_envs)
         self.looked_at: deque[np.ndarray] = deque(maxlen=SEEN)
         self._present: np.ndarray | None = None
 
@@ -188,6 +193,11 @@ class NormalisedEnv(VecEnvWrapper):
     def std(self) -> np.ndarray:
         """Standard deviations by which observations are divided, (D,)."""
         return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
+
+    @property
+    def reward_scale(self) -> float:
+        """By which rewards are multiplied now."""
+        return float(1.0 / np.sqrt(self.spread.var + 1e-8)) if self._scale == "spread" else self._scale
 
     def seen(self, columns: slice) -> tuple[float, float]:
         """Return between which values nearly all of some entries of the last observations lay."""
@@ -214,7 +224,11 @@ class NormalisedEnv(VecEnvWrapper):
             self.looked_at.append(observations[self.venv.acted])
         for row in np.flatnonzero(dones):
             infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
-        return self.normalise(observations), rewards * self._reward_scale, dones, infos
+        self.returns = self._gamma * self.returns + rewards
+        if self.venv.acted.any():
+            self.spread.update(self.returns[self.venv.acted])
+        self.returns[dones] = 0.0
+        return self.normalise(observations), rewards * self.reward_scale, dones, infos
 
 
 BATCH = 512  # rows per gradient step
@@ -234,11 +248,11 @@ def watch(
     driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     restart(driver, np.ones(env.num_envs, dtype=bool))
-    under_way = np.ones(env.num_envs, dtype=bool)
+    under_way = np.tile(scenario.acting, worlds)
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
         report(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
-        action = decide(driver, observation, scenario.action.size)
+        action = decide(driver, observation, scenario.action_size)
         tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way
         observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
@@ -274,13 +288,13 @@ class Trainer:
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
         self.plan, self.scenario = plan, scenario
         ppo = plan.settings.ppo
-        self._scenarios = plan.scenarios(max(1, ppo.vehicles // len(driven_vehicles(scenario))))
+        self._scenarios = plan.scenarios(max(1, ppo.vehicles // sum(scenario.acting)))
         built = partial(CooperativeVectorEnv, autoreset="same_step", arrays="numpy", threads=threads)
         parts = [
             CooperativeSB3VecEnv(built(each, plan.environment, num_worlds=count)) for each, count in self._scenarios
         ]
         self.batch = parts[0] if len(parts) == 1 else MixedWorlds(parts)
-        self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
+        self.env = NormalisedEnv(self.batch, ppo)
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
         widths = list(ppo.hidden)
@@ -333,7 +347,8 @@ class Trainer:
         self.env.looked_at.append(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
-        values = torch.from_numpy((ppo.reward_scale * returns).astype(np.float32))
+        self.env.spread.update(returns)
+        values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32))
         optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
         shuffle = torch.Generator().manual_seed(seed)
         for epoch in range(clone.epochs):
@@ -385,7 +400,7 @@ class Trainer:
 
     def _diverged(self) -> DivergedError:
         names = ("learning_rate", "initial_std", "reward_scale", "max_gradient")
-        values = [f"ppo.{name} = {getattr(self.plan.settings.ppo, name):g}" for name in names]
+        values = [f"ppo.{name} = {getattr(self.plan.settings.ppo, name)}" for name in names]
         when = f"after {self.model.num_timesteps} steps the policy is not finite"
         return DivergedError(f"the training diverged: {when}; look at {', '.join(values)}")
 

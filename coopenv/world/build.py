@@ -264,7 +264,8 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "odometry_period": 1.0 / rates.odometry,
         "samples_per_tick": math.ceil(rates.odometry / rates.camera - 1e-9) + 1,
         "ticks_per_decision": scenario.ticks_per_decision,
-        "action_size": scenario.action.size,
+        "action_size": scenario.action_size,
+        "pans": scenario.action.pan is not None,
         "horizon_ticks": scenario.horizon_ticks,
         "last_outcome": max(Outcome) + len(scenario.termination.own),
         "map_size": scenario.observation.map_size,
@@ -363,6 +364,7 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
 def _radio(scenario: Scenario) -> dict[str, Any]:
     v = scenario.v2x
     return {
+        "entry": (2 if scenario.action.pan is None else 3) if scenario.action.radio else 0,
         "to_all": v.links == "all",
         "slots": max(v.delay, 1) + 1 + scenario.replay_ticks,
         "range": math.inf if v.range is None else v.range,

@@ -195,11 +195,12 @@ def gradually(d: Any, command: Any, before: Any, duration: Any):
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision into commands; a vehicle whose episode has ended stops."""
     for vehicle in range(model.vehicles):
+        state.bytes_sent[world, vehicle] = 0
         for k in range(model.action_size):
             state.action[world, vehicle, k] = sanitised(actions[world, vehicle, k])
         first = state.action[world, vehicle, 0]
         pan = type(first)(0.0)
-        if model.action_size > 2:
+        if model.pans == 1:
             pan = state.action[world, vehicle, 2]
         command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
         if model.dynamics[vehicle].gated == 1:

@@ -243,6 +243,7 @@ def model_struct(p: Precision) -> Any:
     class Radio:
         """V2X."""
 
+        entry: wp.int32  # place of an action's first number for the radio; 0: everything is broadcast
         to_all: wp.int32  # whether messages reach all vehicles, not only those that may measure their sender
         delay: wp.int32  # ticks
         period: wp.int32  # ticks
@@ -335,6 +336,7 @@ def model_struct(p: Precision) -> Any:
         samples_per_tick: wp.int32  # odometry samples that may fall into one camera tick
         ticks_per_decision: wp.int32
         action_size: wp.int32  # numbers of an action
+        pans: wp.int32  # whether the third is the camera's angle
         horizon_ticks: wp.int32
         last_outcome: wp.int32  # largest value of `ended`
         map_size: wp.int32  # landmarks of the map in an observation

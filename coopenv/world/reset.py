@@ -31,7 +31,7 @@ from coopenv.world.random import (
     unit_vector,
 )
 from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
-from coopenv.world.v2x import draw_faults, transmit
+from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, transmit
 
 ABSENT = wp.constant(-1)
 """Value of `ended` of a vehicle that is not there in this episode."""
@@ -176,6 +176,10 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.action[world, vehicle, 0] = level
     for k in range(1, model.action_size):
         state.action[world, vehicle, k] = o[0]
+        if model.radio.entry > 0 and k >= model.radio.entry:
+            state.action[world, vehicle, k] = o.dtype(1.0)
+    state.report_size[world, vehicle] = POSE_BYTES
+    state.bytes_sent[world, vehicle] = 0
     state.pan[world, vehicle] = o[0]
     state.command[world, vehicle] = command
     state.last_command[world, vehicle] = command
@@ -201,9 +205,14 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.outbox_tick[world, vehicle, slot] = -1
         state.outbox_position[world, vehicle, slot] = o
         state.outbox_rotation[world, vehicle, slot] = identity3(o)
+        for other in range(model.vehicles):
+            state.outbox_seen[world, vehicle, slot, other] = -1
+            state.outbox_content[world, vehicle, slot, other] = NOTHING
     for sender in range(model.vehicles):
         state.inbox_tick[world, vehicle, sender] = -1
         state.inbox_stamp[world, vehicle, sender] = -1
+        state.inbox_seen[world, vehicle, sender] = -1
+        state.inbox_pose_only[world, vehicle, sender] = 0
         state.inbox_position[world, vehicle, sender] = o
         state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):

@@ -300,11 +300,17 @@ def state_struct(p: Precision) -> Any:
         outbox_rotation: array("WNS", mat33, ROTATION)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
         outbox_tick: array("WNS", wp.int32, TICK)  # -1: nothing sent in this slot
+        outbox_seen: array("WNSN", wp.int32, TICK)  # ticks at which it last measured each vehicle, as sent; -1: never
+        outbox_content: array("WNSN", wp.int32, whole(0, 2))  # per receiver: nothing, the pose alone, the whole report
+        report_size: array("WN", wp.int32, whole(0, 10**6))  # bytes of the last report
+        bytes_sent: array("WN", wp.int32, whole(0, 10**9))  # since the last decision
         arriving: array("WNN", wp.int32, TICK)  # per receiver and sender: tick of sending of what arrives; -1: nothing
         inbox_rotation: array("WNN", mat33, ROTATION)  # per receiver and sender
         inbox_position: array("WNN", vec3)  # map
         inbox_tick: array("WNN", wp.int32, TICK)  # tick of sending; -1: nothing received
         inbox_stamp: array("WNN", wp.int32, TICK)  # the same by the receiver's clock
+        inbox_pose_only: array("WNN", wp.int32, FLAG)  # whether the last message was the pose alone
+        inbox_seen: array("WNN", wp.int32, TICK)  # likewise: when the sender last measured the receiver; -1: never
 
         estimate_rotation: array("WN", mat33, ROTATION)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame

@@ -17,7 +17,7 @@ from coopenv.world.model import Precision, model_struct
 from coopenv.world.quality import sample_gramian
 from coopenv.world.state import state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
-from coopenv.world.v2x import deliver, forget_everything
+from coopenv.world.v2x import count_bytes, deliver, forget_everything
 from coopenv.world.warp_internals import device_function
 
 Kernels = dict[str, wp.Kernel]
@@ -55,6 +55,7 @@ def _follow_tick(observer: Embedded) -> Any:
             sample_gramian(model, state, world, vehicle, tick)
             broadcast_estimate(model, state, world, vehicle, tick)
             send(model, state, memory, world, vehicle, tick)
+            count_bytes(model, state, world, vehicle, tick)
         finish_tick(model, state, world, tick)
 
     return follow_tick

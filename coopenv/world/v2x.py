@@ -11,7 +11,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6
 from coopenv.estimation.outcomes import COLLUDE, HONEST, REPLAY
-from coopenv.world.camera import mapped_position
+from coopenv.world.camera import VISIBLE, mapped_position
 from coopenv.world.random import (
     CLOCK,
     CORRUPTION,
@@ -30,6 +30,12 @@ from coopenv.world.random import (
 from coopenv.world.warp_internals import device_function
 
 NEVER = wp.constant(-1)
+NOTHING = wp.constant(0)
+POSE = wp.constant(1)
+REPORT = wp.constant(2)
+"""What a message holds for a receiver."""
+POSE_BYTES = wp.constant(56)
+"""Three numbers of 8 bytes, and a quaternion."""
 MOST_CLOCK_TICKS = wp.constant(1.0e8)
 
 
@@ -263,7 +269,10 @@ def start_covariance(model: Any, state: Any, world: int, vehicle: int):
 
 @device_function
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Broadcast a vehicle's estimate (Rhat, Rhat phat) if a message is due and the vehicle is present."""
+    """Broadcast a vehicle's estimate (Rhat, Rhat phat), and when it last measured each vehicle.
+
+    It does so if a message is due and the vehicle is present.
+    """
     slot = tick % model.radio.slots
     sent = int(-1)
     if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
@@ -273,7 +282,41 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
         sent_R, sent_position = as_broadcast(model, state, world, vehicle, R, position)
         state.outbox_rotation[world, vehicle, slot] = sent_R
         state.outbox_position[world, vehicle, slot] = sent_position
+        for other in range(model.vehicles):
+            target = model.landmarks + other
+            measured = state.bearing_tick[world, vehicle, target]
+            if state.sight[world, vehicle, target] == VISIBLE:
+                measured = tick  # where a frame was exposed earlier, this message is the first with it
+            state.outbox_seen[world, vehicle, slot, other] = measured
+            state.outbox_content[world, vehicle, slot, other] = chosen_content(model, state, world, vehicle, other)
     state.outbox_tick[world, vehicle, slot] = sent
+
+
+@device_function
+def chosen_content(model: Any, state: Any, world: int, vehicle: int, receiver: int) -> int:
+    """Return what a vehicle sends to a receiver by its action; without `action.radio` the whole report."""
+    if receiver == vehicle:
+        return NOTHING
+    content = REPORT
+    if model.radio.entry > 0:
+        entry = state.action[world, vehicle, model.radio.entry + wp.where(receiver > vehicle, receiver - 1, receiver)]
+        if entry <= type(entry)(0.5):
+            content = wp.where(entry > type(entry)(0.0), POSE, NOTHING)
+    return content
+
+
+@device_function
+def count_bytes(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Count what a vehicle has sent at a tick, after its estimator has said how large its report is."""
+    slot = tick % model.radio.slots
+    if state.outbox_tick[world, vehicle, slot] != tick:
+        return
+    sent = int(0)
+    for receiver in range(model.vehicles):
+        content = state.outbox_content[world, vehicle, slot, receiver]
+        size = wp.where(content == POSE, POSE_BYTES, wp.where(content == REPORT, state.report_size[world, vehicle], 0))
+        sent = wp.where(model.radio.entry > 0, sent + size, wp.max(sent, size))
+    state.bytes_sent[world, vehicle] += sent
 
 
 @device_function
@@ -285,11 +328,16 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: in
     stamped = stamp(model, state, world, receiver, sender, sent, tick)
     if model.clocks == 1 and stamped <= state.inbox_stamp[world, receiver, sender]:
         return
-    slot = content_tick(model, state, world, sender, sent) % model.radio.slots
+    made = content_tick(model, state, world, sender, sent)
+    slot = made % model.radio.slots
     state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
     state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
     state.inbox_tick[world, receiver, sender] = sent
     state.inbox_stamp[world, receiver, sender] = stamped
+    seen = state.outbox_seen[world, sender, slot, receiver]
+    content = state.outbox_content[world, sender, sent % model.radio.slots, receiver]
+    state.inbox_pose_only[world, receiver, sender] = wp.where(content == POSE, 1, 0)
+    state.inbox_seen[world, receiver, sender] = wp.where(seen < 0, -1, wp.max(seen + stamped - made, 0))
 
 
 @device_function
@@ -357,7 +405,9 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     alter(model, state, world, receiver, tick)
     for sender in range(model.vehicles):
         sent = state.arriving[world, receiver, sender]
-        if sent >= 0 and state.outbox_tick[world, sender, sent % model.radio.slots] == sent:
+        slot = wp.max(sent, 0) % model.radio.slots
+        addressed = state.outbox_content[world, sender, slot, receiver] != NOTHING
+        if sent >= 0 and addressed and state.outbox_tick[world, sender, slot] == sent:
             put_into_inbox(model, state, world, receiver, sender, sent, tick)
 
 

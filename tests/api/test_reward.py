@@ -270,9 +270,9 @@ def test_standing_still_earns_least(name: str) -> None:
     assert all(run(name, driver, times=times_of[driver]).total > still for driver in times_of)
 
 
-def returns_of(team: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def returns_of(team: str, own_share: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rewards, flags of termination and of being alive, (steps, 2, 4), of worlds that `peek` drives."""
-    scenario = load_scenario("open_square", {"reward.team": team, "horizon": 30.0})
+    scenario = load_scenario("open_square", {"reward.team": team, "reward.own_share": own_share, "horizon": 30.0})
     env = coopenv.make_vec(scenario, num_worlds=2, autoreset="disabled")
     policy, (observation, _) = load_agent("peek", scenario), env.reset(seed=1)
     steps = []
@@ -302,6 +302,13 @@ def test_a_team_has_one_reward_and_one_end(team: str) -> None:
     assert not under_way[count:].any() and (alive.sum(axis=0) == last[:, None] + 1).all()
 
 
+def test_a_share_of_the_reward_is_the_vehicles_own() -> None:
+    (own, *_), (team, *_), (mixed, *_) = returns_of("own"), returns_of("mean"), returns_of("mean", 0.25)
+    np.testing.assert_allclose(mixed, 0.25 * own[: len(mixed)] + 0.75 * team, atol=1e-5)
+
+
 def test_a_team_reward_needs_a_team() -> None:
+    with pytest.raises(coopenv.CoopenvError, match=r"reward\.own_share: only with reward\.team = 'mean' or 'min'"):
+        load_scenario("open_square", {"reward.own_share": 0.5})
     with pytest.raises(coopenv.CoopenvError, match=r"reward\.team: 'mean' needs at least two driven vehicles, got 1"):
         load_scenario("facade", {"reward.team": "mean"})

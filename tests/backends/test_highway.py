@@ -15,6 +15,7 @@ from coopenv.estimation.outcomes import Sight
 
 pytest.importorskip("highway_env", reason="needs the extra highway")
 
+UNCONNECTED = {"highway.most_vehicles": 40, "highway.config.spawn_probability": 0.02}
 CROSSING, ROUNDABOUT = "highway_intersection", "highway_roundabout"
 EXACT = {"noise.enabled": False, "vehicles.*.initial_estimate": {"position_radius": 0.0, "orientation_angle": 0.0}}
 
@@ -29,7 +30,7 @@ def road_of(engine: Engine, world: int = 0) -> Any:
 
 
 def test_cars_are_where_highway_env_has_them_with_y_up() -> None:
-    engine = engine_of(CROSSING)
+    engine = engine_of(CROSSING, **UNCONNECTED)
     engine.reset([5])
     vehicles = engine.view("actions").shape[1]
     engine.set_actions(np.full((1, vehicles, 2), [0.6, 0.1]))
@@ -146,7 +147,14 @@ def test_other_traffic_hides_what_is_behind_it() -> None:
     }
     seen = []
     for hidden in (False, True):
-        engine = engine_of(ROUNDABOUT, camera__range=200.0, obstacles=[], camera__miss_probability=0.0, **overrides)
+        engine = engine_of(
+            ROUNDABOUT,
+            camera__range=200.0,
+            obstacles=[],
+            camera__miss_probability=0.0,
+            **overrides,
+            highway__most_vehicles=40,
+        )
         engine.reset([1])
         if hidden:
             put_a_car(engine, *(engine.view("position")[0, 3 + 3, :2] + (0.0, 8.0)))
@@ -157,7 +165,7 @@ def test_other_traffic_hides_what_is_behind_it() -> None:
 
 
 def test_to_touch_other_traffic_is_a_collision() -> None:
-    engine = engine_of(ROUNDABOUT)
+    engine = engine_of(ROUNDABOUT, highway__most_vehicles=40)
     engine.reset([1])
     L = engine.world.model.landmarks
     put_a_car(engine, *(engine.view("position")[0, L + 3, :2] + (0.0, 12.0)))
@@ -247,15 +255,22 @@ def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str)
 def test_what_is_missing_shows_when_it_begins() -> None:
     two = [{"motion": {"kind": "driven"}}] * 2
     crowd = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 9
-    many = {"highway.config.initial_vehicle_count": 14}
     for name, overrides, why in (
         (ROUNDABOUT, {"vehicles": two}, "vehicles: 2 are driven, but highway-env drives 1 there"),
         (ROUNDABOUT, {"vehicles": crowd}, "vehicles: 9 are in traffic, but highway-env has fewer there"),
-        (CROSSING, {"highway.most_vehicles": 0, **many}, r"highway\.most_vehicles: 0 are too few"),
     ):
         env = coopenv.parallel_env(name, overrides=overrides)
         with pytest.raises(CoopenvError, match=why):
             env.reset(seed=5)
+
+
+def test_surplus_traffic_leaves_at_the_start_and_is_an_error_later() -> None:
+    engine = engine_of(CROSSING, **{"highway.most_vehicles": 0, "highway.config.spawn_probability": 1.0})
+    engine.reset([5])
+    assert len(road_of(engine).vehicles) == 6
+    with pytest.raises(CoopenvError, match=r"highway\.most_vehicles: 0 are too few"):
+        for _ in range(50):
+            engine.step()
 
 
 def test_other_environments_know_no_traffic() -> None:

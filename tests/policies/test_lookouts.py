@@ -10,9 +10,10 @@ import pytest
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
+from coopenv.policies.giving_way import discs_along, nearest
 from coopenv.policies.look_ahead import LookAhead, Peek
 from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
-from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost, nearest
+from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.oracles.geometry import is_occluded
 
@@ -282,7 +283,8 @@ def test_distances_fit_the_car() -> None:
     small, large = RouteFollower(SCENARIO), RouteFollower(load_scenario("highway_intersection"))
     assert (small.clearance, small.closest, small.look_ahead, small.foresight) == (0.9, 0.75, 1.0, 6.0)
     assert small.paces == (1.0,)
-    assert large.clearance == large.closest == pytest.approx((5.0 + 2.0) / 2.0 + 0.25)
+    assert large.closest == pytest.approx(math.hypot(5.0 / 2, 2.0) + 0.25)  # two discs along it
+    assert large.clearance == pytest.approx(large.closest + 0.15 * 5.0 / 0.586)
     assert large.look_ahead == pytest.approx(10.0)  # five decisions at 10 m/s
     assert large.foresight == pytest.approx(2.5)  # 2 s to stop from 10 m/s, and half a second
     assert Peek(load_scenario("highway_intersection")).ahead == pytest.approx(0.4 * 5.0 / 0.586)
@@ -301,7 +303,7 @@ def test_it_steers_cars_of_highway_env_on_the_circle_that_it_pursues() -> None:
 @pytest.mark.parametrize(("brakes", "speed"), [(5.0, -1.0), (20.0, 1.0)])
 def test_who_stops_slowly_stops_for_one_across_its_way_that_may_stand(brakes: float, speed: float) -> None:
     """Driving at full speed the other would be gone in time."""
-    scenario = load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes})
+    scenario = load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes, "v2x.links": "neighbours"})
     first = np.arange(len(scenario.vehicles) - 1) == 0
     place, forward = (np.outer(first, vector) for vector in ((12.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     row = observation(scenario, message_mask=first, message_position=place, message_forward=forward)
@@ -374,3 +376,11 @@ def test_what_the_truck_hides_is_worth_nothing() -> None:
     assert abs(straight) < 0.3 and aside > 0.6  # to the left
     free, hidden = LookAhead(scenario).costs(rows, np.zeros(2, int), [])[:, 0]  # of the plan straight on
     assert hidden > free + 1.0
+
+
+def test_discs_cover_a_long_car() -> None:
+    for length, width in ((5.0, 2.0), (12.0, 2.5), (2.0, 2.0)):
+        centres = discs_along(length, width)
+        edge = np.linspace(-length / 2, length / 2, 101)
+        far = np.hypot(edge[:, None] - centres, width / 2).min(axis=1)
+        assert far.max() <= np.hypot(length / len(centres), width) / 2 + 1e-9

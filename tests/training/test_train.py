@@ -271,7 +271,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train", "overtaking"], "all motion here is prescribed, there is nothing to learn"),
+        (["train", "overtaking"], "all motion is prescribed or has a driver, there is nothing to learn"),
         (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "--steps and --minutes: give one of them"),
         (
             ["train", "urban_crossing", "--agent", "route_follower"],

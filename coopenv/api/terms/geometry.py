@@ -161,10 +161,11 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     first = wp.float32(state.action[world, vehicle, 0])
     second = wp.float32(state.action[world, vehicle, 1])
     third = float(0.0)
-    if model.action_size > 2:
+    if model.pans == 1:
         third = wp.float32(state.action[world, vehicle, 2])
     ego.action = wp.vec3(first, second, third)
     ego.effort = wp.length_sq(ego.action)
+    ego.bytes_sent = state.bytes_sent[world, vehicle]
     command = state.command[world, vehicle]
     ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
     ego.pan = wp.float32(state.pan[world, vehicle])
@@ -230,6 +231,9 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
         neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
     target = model.landmarks + sender
     neighbour.precedes = neighbour.received and (sender < vehicle or model.motion.kind[target] != DRIVEN)
+    seen = state.inbox_seen[world, vehicle, sender]
+    neighbour.sees = neighbour.received and seen == state.inbox_stamp[world, vehicle, sender]
+    neighbour.seen_age = seconds_since(now, seen, model.camera_rate)
     neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
     neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
     neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)

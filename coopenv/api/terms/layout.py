@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from gymnasium import spaces
 
 
+RADIO = "radio_"
+"""Beginning of the names of an action's entries for the radio; a number follows, that of the other vehicle."""
+
+
 @dataclass(frozen=True)
 class Field:
     """One named part of the flat observation; every entry is (value - center) / scale, clipped to [low, 1]."""
@@ -107,7 +111,7 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
 def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
     """Return which entries of a field's value a scenario's observation holds."""
     if row is OBSERVATION_FIELDS.built_in["last_action"]:
-        return tuple(range(scenario.action.size))
+        return tuple(range(2 if scenario.action.pan is None else 3))
     if scenario.observation.planar and row.planar is not None:
         return row.planar
     return tuple(range(row.size))
@@ -150,7 +154,7 @@ def _scale(row: ObservationField, scenario: Scenario) -> float:
 
 
 def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
-    """Return what the entries of an action mean: speed or acceleration, steering (positive turns left), and pan.
+    """Return what the entries of an action mean: speed or acceleration, steering (positive turns left), pan and radio.
 
     `limits` are a vehicle's; None: the first one's.
     """
@@ -160,9 +164,11 @@ def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[A
         first = ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)
     else:
         first = ActionField("speed", "m/s", -limits.max_speed if limits.reverse else 0.0, limits.max_speed)
-    entries = first, ActionField("steering", "rad", -steering, steering)
-    pan = scenario.action.pan
-    return entries if pan is None else (*entries, ActionField("pan", "rad", -pan.limit, pan.limit))
+    entries: tuple[ActionField, ...] = first, ActionField("steering", "rad", -steering, steering)
+    if (pan := scenario.action.pan) is not None:
+        entries = (*entries, ActionField("pan", "rad", -pan.limit, pan.limit))
+    others = len(scenario.vehicles) - 1 if scenario.action.radio else 0
+    return (*entries, *(ActionField(f"{RADIO}{n + 1}", "1", -1.0, 1.0) for n in range(others)))
 
 
 def settings_of_meaning(scenario: Scenario, fields: Iterable[str]) -> dict[str, float]:
@@ -199,7 +205,7 @@ def observation_space(layout: Mapping[str, Field], kind: str = "flat") -> spaces
 
 
 def action_space(scenario: Scenario) -> spaces.Box:
-    """Return the action: (speed or acceleration, steering; positive turns left), and pan if any, each in [-1, 1]."""
+    """Return the action: speed or acceleration, steering (positive: left), pan and radio if any, each in [-1, 1]."""
     from gymnasium import spaces
 
-    return spaces.Box(-1.0, 1.0, shape=(scenario.action.size,), dtype=np.float32)
+    return spaces.Box(-1.0, 1.0, shape=(scenario.action_size,), dtype=np.float32)

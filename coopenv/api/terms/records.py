@@ -54,7 +54,8 @@ class Ego:
     angular_velocity: wp.vec3  # rad/s, last odometry sample, body
     odometry_age: wp.float32  # s
     action: wp.vec3  # of this decision, [-1, 1]; the third entry is 0 where cameras do not pan
-    effort: wp.float32  # |action|^2
+    effort: wp.float32  # |action|^2, without the radio's entries
+    bytes_sent: wp.int32  # in this decision
     command: wp.vec3  # the action as speed m/s, steering rad, acceleration m/s^2
     steering: wp.float32  # rad, positive to the left
     pan: wp.float32  # of the camera, rad, positive to the left
@@ -109,6 +110,8 @@ class Neighbour:
     in_view: wp.bool  # measured in this frame
     bearing_age: wp.float32  # s since measured
     precedes: wp.bool  # it was heard and has the right of way
+    sees: wp.bool  # by its message at hand, it measured this vehicle in the frame of the sending
+    seen_age: wp.float32  # s since it measured this vehicle, by its last message
 
 
 @wp.struct
@@ -246,6 +249,8 @@ def neighbour_values(ego: Ego, neighbour: Neighbour, clearance: bool) -> Neighbo
         sighting[0], sighting[1], sighting[2],
         wp.float32(neighbour.in_view),  # sighting_mask
         neighbour.bearing_age,  # sighting_age
+        wp.float32(neighbour.sees),  # seen_mask
+        neighbour.seen_age,
     )  # fmt: skip
 
 
@@ -281,6 +286,7 @@ def reward_values(ego: Ego, truth: TruthRecord) -> RewardValues:
         wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0),  # off_route
         -ego.effort,  # control
         -ego.elapsed,  # time
+        -0.001 * wp.float32(ego.bytes_sent),  # radio
         -truth.position_error,
         -(truth.orientation_error / DEGREES),
         per_metre(ego, ego.position_std - threshold, cap),  # position_uncertainty

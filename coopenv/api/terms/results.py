@@ -303,10 +303,13 @@ def step_results(
             records.landmark[world, vehicle, n] = landmark
 
 
-def team_results(model: Any, state: Any, results: Any, least: int, chosen: wp.array(dtype=wp.int32)):
+def team_results(
+    model: Any, state: Any, results: Any, least: int, own_share: wp.float32, chosen: wp.array(dtype=wp.int32)
+):
     """Give every driven vehicle the team's reward, and an episode that ends with the world; one thread per world.
 
-    The reward is the mean over the driven vehicles that are there or, if `least` is 1, the least of those under way.
+    The reward is the mean over the driven vehicles that are there or, if `least` is 1, the least of those under way,
+    but for `own_share` of it, which is the vehicle's own.
     """
     world = wp.tid()
     if chosen[world] == 0:
@@ -324,7 +327,9 @@ def team_results(model: Any, state: Any, results: Any, least: int, chosen: wp.ar
         return
     for vehicle in range(model.vehicles):
         if is_of_team(model, state, world, vehicle):
-            results.reward[world, vehicle] = wp.where(least == 1, smallest, total / float(there))
+            team = wp.where(least == 1, smallest, total / float(there))
+            own = results.reward[world, vehicle]
+            results.reward[world, vehicle] = own_share * own + (1.0 - own_share) * team
             results.alive[world, vehicle] = True
             results.terminated[world, vehicle] = results.over[world] != 0 and not at_end(model, state, world)
             results.truncated[world, vehicle] = at_end(model, state, world)

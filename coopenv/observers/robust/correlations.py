@@ -35,6 +35,10 @@ from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
 
+REPORT_BYTES = wp.constant(172)
+CORRELATION_BYTES = wp.constant(42)
+"""Sizes of a message, see `coopenv.observers.robust.messages.write`."""
+
 
 @wp.func
 def factor(P: Any):
@@ -127,9 +131,14 @@ def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick
         turn = vec3d(wp.vec3f(algebra.log_so3(report.odometry.R)))  # in single precision
         report.odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(report.odometry.p)))
         memory.outbox[world, i, slot] = report
+        size = wp.where(report.valid == 1, REPORT_BYTES, 0)
         if report.valid == 1:
             if start_news_interval(model, memory, world, i, tick):
                 broadcast_correlations(model, memory, world, i, slot)
+                for c in range(memory.correlation.shape[3]):
+                    if memory.outbox_correlation[world, i, slot, c].vehicle >= 0:
+                        size += CORRELATION_BYTES
+        state.report_size[world, i] = size
 
 
 @device_function
@@ -158,7 +167,8 @@ def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
         if sender >= 0:
             sent = state.inbox_tick[world, i, sender]
             stamp = state.inbox_stamp[world, i, sender]
-            if sent >= 0 and stamp != memory.inbox[world, i, sender].tick:
+            whole = state.inbox_pose_only[world, i, sender] == 0
+            if sent >= 0 and whole and stamp != memory.inbox[world, i, sender].tick:
                 content = content_tick(model, state, world, sender, sent)
                 slot = content % model.radio.slots
                 copy_correlations(memory, world, i, sender, slot, stamp - content)

@@ -336,3 +336,26 @@ def test_who_has_the_right_of_way_is_heard_and_earlier_or_not_driven() -> None:
         assert not layout["message_precedence"].values(engine.view("observation")).any(), "nothing heard yet"
         engine.step(np.zeros(engine.view("actions").shape))
         np.testing.assert_array_equal(layout["message_precedence"].values(engine.view("observation"))[0], expected)
+
+
+def test_a_vehicle_knows_by_messages_who_measures_it() -> None:
+    radio = {"v2x.delay": 3, "v2x.period": 2, "v2x.loss": 0.3, "v2x.links": "all", "v2x.staleness": 0.5}
+    options = {"observation.include": ["seen"], "observation.age_scale": 1000.0}
+    scenario = load_scenario("scout_platoon", {**radio, **options})
+    engine, first = Engine(scenario, 3, "float64"), len(scenario.landmarks)
+    engine.reset([5, 6, 7])
+    frames = [engine.view("sight")[:, :, first:] == Sight.VISIBLE]
+    masks = 0
+    for now in range(1, 90):
+        engine.step(np.tile([0.5, 0.1], (3, 3, 1)), ticks=1)
+        frames.append(engine.view("sight")[:, :, first:] == Sight.VISIBLE)
+        mask, age = (seen(engine, scenario, name) for name in ("seen_mask", "seen_age"))
+        for w, i, n in np.ndindex(3, 3, 2):
+            sender = n + (n >= i)
+            sent = int(engine.view("inbox_tick")[w, i, sender])
+            measured = [k for k in range(sent + 1) if frames[k][w, sender, i]]
+            fresh = sent >= 0 and now - sent <= 15
+            assert mask[w, i, n] == (fresh and sent in measured)
+            assert age[w, i, n] == pytest.approx((now - measured[-1]) / 30 if measured else 1000.0, abs=1e-3)
+            masks += int(mask[w, i, n])
+    assert 100 < masks < 900

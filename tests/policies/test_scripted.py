@@ -1,0 +1,85 @@
+"""Vehicles with a driver in the scenario: as if the same policy chose their actions from outside."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.base.errors import CoopenvError
+from coopenv.policies import decide, load_agent, restart
+from coopenv.scenario import load_scenario
+
+DRIVER = "stop_when_lost"  # it has a memory
+FOLLOWERS = {f"vehicles.vehicle_{i}.motion.driver": DRIVER for i in (2, 3)}
+SHORT = {"horizon": 6.0, "v2x.loss": 0.3}
+
+
+def test_followers_of_the_scenario_drive_as_the_same_policy_from_outside() -> None:
+    ours = coopenv.make_vec("scout_platoon", num_worlds=3, overrides={**FOLLOWERS, **SHORT})
+    theirs = coopenv.make_vec("scout_platoon", num_worlds=3, overrides=SHORT)
+    policy, rng = load_agent(DRIVER, theirs.scenario), np.random.default_rng(0)
+    observed, _ = theirs.reset(seed=4)
+    assert np.array_equal(observed, ours.reset(seed=4)[0])
+    restart(policy, np.ones(9, dtype=bool))
+    over = np.zeros(9, dtype=bool)
+    for _ in range(150):  # two episodes and a half
+        restart(policy, over)
+        actions = decide(policy, observed)
+        actions[::3] = rng.uniform([0.0, -0.3], [1.0, 0.3], (3, 2))
+        observed, reward, *_, infos = theirs.step(actions)
+        actions[1::3] = actions[2::3] = 0.7  # not theirs to choose
+        here = ours.step(actions)
+        assert np.array_equal(observed, here[0])
+        assert np.array_equal(reward, here[1])
+        over = infos["time"] == 0.0
+    assert np.ptp(observed[1::3], axis=0).any()
+
+
+def test_only_the_others_are_agents_and_a_state_holds_the_drivers() -> None:
+    env = coopenv.parallel_env("scout_platoon", overrides={**FOLLOWERS, **SHORT})
+    assert env.possible_agents == ["vehicle_1"]
+    env.reset(seed=1)
+    for _ in range(10):
+        observations, rewards, *_ = env.step({"vehicle_1": np.zeros(2)})
+    assert [*observations] == [*rewards] == ["vehicle_1"]
+    state, runs = env.get_state(), []
+    for _ in range(2):
+        env.set_state(state)
+        for _ in range(10):
+            env.step({"vehicle_1": np.zeros(2)})
+        runs.append(env.engine.view("position").copy())
+    assert np.array_equal(*runs)
+
+
+def test_rows_with_a_driver_are_not_learned_from() -> None:
+    pytest.importorskip("stable_baselines3")
+    from coopenv.api.trainers.sb3 import make_sb3_vec_env
+
+    env = make_sb3_vec_env("scout_platoon", num_worlds=2, overrides={**FOLLOWERS, **SHORT}, seed=0)
+    env.reset()
+    done = np.zeros(6, dtype=int)
+    for step in range(70):
+        _, _, dones, _ = env.step(np.zeros((6, 2), dtype=np.float32))
+        assert not env.acted.reshape(2, 3)[:, 1:].any()
+        assert env.acted[0] or step
+        done += dones
+    assert done.tolist() == [1, 0, 0, 1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"vehicles.vehicle_2.motion.driver": "peekk"}, "vehicles.1.motion.driver: unknown agent 'peekk'"),
+        ({"vehicles.*.motion.driver": "peek"}, "every vehicle has a driver, no agent is left"),
+    ],
+)
+def test_drivers_that_are_not_possible(changes: dict[str, str], message: str) -> None:
+    with pytest.raises(CoopenvError, match=message) as caught:
+        coopenv.parallel_env("scout_platoon", overrides=changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_prescribed_motion_takes_no_driver() -> None:
+    with pytest.raises(CoopenvError, match=r"vehicles\.0\.motion.*driver"):
+        load_scenario("overtaking", {"vehicles.vehicle_1.motion.driver": "peek"})
