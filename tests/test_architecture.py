@@ -87,7 +87,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 LINES_AND_FILES = {
     ".": (130, 2),
     "api": (3830, 19),
-    "backends": (3275, 17),
+    "backends": (3285, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
     "cars": (9110, 41),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3095, 12),
     "training": (1360, 5),
     "viz": (4500, 18),
-    "world": (4312, 17),
+    "world": (4480, 18),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -21,6 +21,7 @@ from coopenv.world.camera import (
     marker_position,
     sight_of,
 )
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.model import Precision
@@ -113,6 +114,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
                 state.bearing[world, vehicle, target] = bearing
                 state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):  # now that all poses are those of this tick
         explain(model, state, world, vehicle)
 

@@ -198,6 +198,11 @@ GRAMIAN_RATE = 20.0
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
+MOST_IN_ONE_CELL = 24  # bodies, or buildings, of a scene in which all pairs are tested
+CELLS_PER_RANGE, LONGEST_CELL = 2.0, 60.0
+"""Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m."""
+WIDER = 1.01  # factor of what a building reaches, against rounding in the kernels
+
 NOWHERE = (0.0, 0.0, 0.0)
 
 
@@ -209,6 +214,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.start, device, _start(scenario))
     _fill(model.motion, device, _motion(scenario))
     _fill(model.scene, device, _scene(scenario))
+    _fill(model.cells, device, _cells(scenario))
     _fill(model.routes, device, routes_of(scenario))
     _fill(model.drawn, device, drawn_of(scenario))
     _fill(model.radio, device, _radio(scenario), scenario.v2x)
@@ -357,6 +363,32 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "end_on_collision": scenario.termination.collision,
         "end_on_arrival": scenario.termination.arrival,
         "off_route": scenario.termination.off_route or 0.0,
+    }
+
+
+def _cells(scenario: Scenario) -> dict[str, Any]:
+    """Return the grid of the world; it has about as many cells as bodies."""
+    origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
+    everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
+    traffic = scenario.cosimulator.most_vehicles if scenario.cosimulator else 0
+    items = max(len(everyone) + traffic, len(obstacles))
+    across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
+    ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
+    edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE
+    cells: list[list[int]] = [[] for _ in range(across * across)]
+    for k, obstacle in enumerate(obstacles):
+        reach = np.abs(rotation_of(obstacle.yaw, None)) @ np.array(obstacle.size) / 2 * WIDER
+        spans = np.floor((obstacle.center - origin + np.outer((-1, 1), reach))[:, :2] / edge).astype(int).T
+        columns, rows = (np.unique(np.arange(a, min(b, a + across - 1) + 1) % across) for a, b in spans)
+        for cell in (rows[:, None] * across + columns).ravel():
+            cells[cell].append(k)
+    return {
+        "across": across,
+        "per_metre": 1.0 / edge,
+        "body_reach": max(reaches, default=0.0),
+        "first_building": np.cumsum([0, *map(len, cells)]),
+        "building": [k for cell in cells for k in cell],
     }
 
 

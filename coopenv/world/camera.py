@@ -10,6 +10,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3
 from coopenv.estimation.outcomes import Sight
+from coopenv.world.cells import body_of, cell_in, has_body, window_about
 from coopenv.world.model import BLIND, IDEAL
 from coopenv.world.random import (
     BEARING,
@@ -96,16 +97,20 @@ def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, c
 @wp.func
 def behind_building(model: Any, origin: Any, direction: Any, inverse_square: Any) -> bool:
     """Return whether a building occludes a line of sight; `inverse_square` is 1 / |direction|^2."""
-    for k in range(model.obstacles):
-        if segment_hits_box(
-            origin,
-            direction,
-            inverse_square,
-            model.scene.obstacle_rotation[k],
-            model.scene.obstacle_center[k],
-            model.scene.obstacle_half[k],
-        ):
-            return True
+    x, y, columns, rows = window_about(model, origin, origin + direction, direction.dtype(0.0))
+    for n in range(columns * rows):
+        cell = cell_in(model, x, y, columns, n)
+        for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
+            k = model.cells.building[entry]
+            if segment_hits_box(
+                origin,
+                direction,
+                inverse_square,
+                model.scene.obstacle_rotation[k],
+                model.scene.obstacle_center[k],
+                model.scene.obstacle_half[k],
+            ):
+                return True
     return False
 
 
@@ -121,20 +126,15 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
     inverse_square = inverse_square_of(direction)
     if behind_building(model, origin, direction, inverse_square):
         return OCCLUDED_BY_BUILDING
-    for agent in range(model.agents):
-        half = model.scene.body_half[agent]
-        if agent != observer and agent != target and half[0] > half.dtype(0.0) and state.present[world, agent] != 0:
-            R = state.rotation[world, agent]
-            center = state.position[world, agent] + R * model.scene.body_center[agent]
-            if segment_hits_box(origin, direction, inverse_square, R, center, half):
-                return OCCLUDED_BY_BODY
-    for k in range(model.traffic):
-        half = state.traffic_half[world, k]
-        if half[0] > half.dtype(0.0):
-            R = state.traffic_rotation[world, k]
-            center = state.traffic_position[world, k]
-            if segment_hits_box(origin, direction, inverse_square, R, center, half):
-                return OCCLUDED_BY_BODY
+    x, y, columns, rows = window_about(model, origin, origin + direction, state.body_reach[world])
+    for n in range(columns * rows):
+        item = state.first_item[world, cell_in(model, x, y, columns, n)]
+        while item >= 0:
+            if item != observer and item != target and has_body(model, item):
+                R, center, half = body_of(model, state, world, item)
+                if segment_hits_box(origin, direction, inverse_square, R, center, half):
+                    return OCCLUDED_BY_BODY
+            item = state.next_item[world, item]
     return VISIBLE
 
 

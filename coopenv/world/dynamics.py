@@ -14,6 +14,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
 from coopenv.estimation.outcomes import Outcome
+from coopenv.world.cells import body_of, cell_in, has_body, window_about
 from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
 from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
 from coopenv.world.warp_internals import device_function
@@ -51,43 +52,35 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
 
 @device_function
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building or another body."""
-    return touches_one_of(model, state, world, vehicle, model.agents)
-
-
-@device_function
-def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building or the body of another of the first `count` agents."""
+    """Return 1 when a vehicle's box overlaps a building or another body in the grid."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
         return 0
     R = state.rotation[world, agent]
     center = state.position[world, agent] + R * model.scene.body_center[agent]
-    for k in range(model.obstacles):
-        if boxes_touch(
-            center,
-            R,
-            half,
-            model.scene.obstacle_center[k],
-            model.scene.obstacle_rotation[k],
-            model.scene.obstacle_half[k],
-        ):
-            return 1
-    for other in range(count):
-        other_half = model.scene.body_half[other]
-        if other != agent and other_half[0] > half.dtype(0.0) and state.present[world, other] != 0:
-            other_R = state.rotation[world, other]
-            other_center = state.position[world, other] + other_R * model.scene.body_center[other]
-            if boxes_touch(center, R, half, other_center, other_R, other_half):
-                return 1
-    for k in range(model.traffic):
-        other_half = state.traffic_half[world, k]
-        if other_half[0] > half.dtype(0.0):
+    own = wp.length(half)
+    x, y, columns, rows = window_about(model, center, center, own + state.body_reach[world])
+    for n in range(columns * rows):
+        cell = cell_in(model, x, y, columns, n)
+        for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
+            k = model.cells.building[entry]
             if boxes_touch(
-                center, R, half, state.traffic_position[world, k], state.traffic_rotation[world, k], other_half
+                center,
+                R,
+                half,
+                model.scene.obstacle_center[k],
+                model.scene.obstacle_rotation[k],
+                model.scene.obstacle_half[k],
             ):
                 return 1
+        item = state.first_item[world, cell]
+        while item >= 0:
+            if item != agent and has_body(model, item):
+                other_R, other_center, other_half = body_of(model, state, world, item)
+                if boxes_touch(center, R, half, other_center, other_R, other_half):
+                    return 1
+            item = state.next_item[world, item]
     return 0
 
 

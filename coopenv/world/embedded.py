@@ -11,6 +11,7 @@ import warp as wp
 
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, move, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
@@ -159,6 +160,7 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
     move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
     for vehicle in range(model.vehicles):

@@ -155,6 +155,16 @@ def model_struct(p: Precision) -> Any:
         off_route: scalar  # m from the route that end an episode; 0: none do
 
     @wp.struct
+    class Cells:
+        """The grid in which bodies are found, see `coopenv.world.cells`."""
+
+        across: wp.int32  # cells along each axis, a power of two; 1: all pairs are tested
+        per_metre: scalar  # 1 / edge of a cell
+        body_reach: scalar  # m, the farthest point of an agent's box from the agent
+        first_building: wp.array(dtype=wp.int32)  # (across^2 + 1,) of those that reach a cell
+        building: wp.array(dtype=wp.int32)
+
+    @wp.struct
     class Routes:
         """Where vehicles go: vehicle i draws one of the routes choice[first[i]] .. choice[first[i + 1] - 1].
 
@@ -347,6 +357,7 @@ def model_struct(p: Precision) -> Any:
         motion: Motion
         dynamics: wp.array(dtype=DynamicsValues)  # (N,)
         scene: SceneValues
+        cells: Cells
         routes: Routes
         drawn: DrawRanges
         camera: wp.array(dtype=CameraValues)  # (N,)

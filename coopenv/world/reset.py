@@ -9,7 +9,8 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
 from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
-from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
+from coopenv.world.cells import clear_cells, put_into_cell, sort_into_cells
+from coopenv.world.dynamics import command_of, prescribe, touches_anything
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.odometry import draw_errors
 from coopenv.world.quality import empty_block
@@ -101,7 +102,7 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
         s = draw_route(model, state, world, vehicle, attempt)
         position, R = start_on_route(model, state, world, vehicle, s)
         place_at(model, state, world, agent, position, R, attempt)
-        if touches_one_of(model, state, world, vehicle, agent) == 0:
+        if touches_anything(model, state, world, vehicle) == 0:
             break
 
 
@@ -271,8 +272,11 @@ def place_everybody(model: Any, state: Any, world: int):
     state.exhausted[world] = 0
     draw_parameters(model, state, world)
     draw_presence(model, state, world)
+    clear_cells(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
+        if state.present[world, agent] != 0:
+            put_into_cell(model, state, world, agent, state.position[world, agent])
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
 
@@ -280,6 +284,7 @@ def place_everybody(model: Any, state: Any, world: int):
 @wp.func
 def begin_sensing(model: Any, state: Any, world: int):
     """Draw initial estimates and lasting errors, look for contact, take the first frame."""
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         set_initial_estimate(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)

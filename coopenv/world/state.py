@@ -2,7 +2,7 @@
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic.
+of the traffic, G cells of the grid, I items in it.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It states the rule of what a saved
 state may hold there, too; all rules are checked before anything is restored.
@@ -266,6 +266,10 @@ def state_struct(p: Precision) -> Any:
         traffic_rotation: array("WZ", mat33, ROTATION)  # body to map
         traffic_half: array("WZ", vec3)  # half of their edges, m; zero: not there
 
+        first_item: array("WG", wp.int32, ANYTHING)  # of each cell; scratch, like the next, see `coopenv.world.cells`
+        next_item: array("WI", wp.int32, ANYTHING)  # in the same cell; -1: none
+        body_reach: array("W", scalar)  # m, the farthest point of a box from its item
+
         sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
         sampled_angular_velocity: array("WNM", vec3)  # likewise, rad/s; of driven vehicles
 
@@ -332,9 +336,10 @@ FAULTS = ("clock", "restart_tick", "lie_tick", "jammer_tick", "map_tick", "map_e
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
+    grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
-    return {"W": worlds, "A": model.agents, "N": model.vehicles, **draws, **ticks}
+    return {"W": worlds, "A": model.agents, "N": model.vehicles, **draws, **ticks, **grid}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
