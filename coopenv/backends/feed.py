@@ -14,7 +14,6 @@ from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.camera import (
     MISSED,
-    NOT_A_NEIGHBOUR,
     OUT_OF_VIEW,
     VISIBLE,
     camera_to_body,
@@ -25,6 +24,7 @@ from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.model import Precision
+from coopenv.world.nearby import NOT_A_NEIGHBOUR
 from coopenv.world.random import COUNT as PARAMETER_COUNT
 from coopenv.world.reset import place_everybody, set_initial_estimate
 from coopenv.world.state import allocate, array, fields

@@ -234,7 +234,7 @@ def sense_cosimulation(model: Any, state: Any, motion: Any, world: int, tick: in
     transmit(model, state, world, tick)
 
 
-COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct)
+COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct, keeps_nearby=True)
 """Ticks of vehicles that a program on the host moves."""
 
 

@@ -101,7 +101,7 @@ class Scenario(Section):
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
     landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
-    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=1_000)
+    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=4_096)
     camera: Camera = Camera()
     rates: Rates = Rates()
     noise: Noise = Noise()
@@ -207,8 +207,9 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         vehicles, targets = len(self.vehicles), len(self.target_names)
-        if vehicles * targets > MOST_PAIRS:
-            raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
+        if vehicles * targets > MOST_PAIRS and self.topology.most_nearby is None:
+            pairs = f"{vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs"
+            raise ValueError(f"vehicles: {pairs}; set topology.most_nearby")
         neighbours = neighbour_sets(self)
         processing_order(self, neighbours)
         for problem in (*_misplaced(self), *_problems(self)):
@@ -273,6 +274,8 @@ def _problems(s: Scenario) -> Iterator[str]:
             for name in [name for name in getattr(vehicle, key) if name not in names]:
                 yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
     yield from _problems_of_draws(s)
+    if s.topology.most_nearby is not None:
+        yield from _problems_of_nearby(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
@@ -284,6 +287,23 @@ def _problems(s: Scenario) -> Iterator[str]:
             unknown = f"unknown landmark {shown(mark)}{suggest(mark, marks)}"
             yield f"{where}.map_error.landmark: {unknown}; known: {listed(marks)}"
     yield from _problems_of_driving(s)
+
+
+def _problems_of_nearby(s: Scenario) -> Iterator[str]:
+    """Yield why what is in range of a vehicle is not limited."""
+    key, listed = "topology.most_nearby", [vehicle.neighbours for vehicle in s.vehicles]
+    if None not in listed:
+        for i in [i for i, names in enumerate(listed) if names and len(names) > (s.topology.most_nearby or 0)][:1]:
+            yield f"vehicles.{i}.neighbours: more than {key}"
+        if s.v2x.links == "all":
+            yield f"v2x.links: must be 'neighbours' where they are listed, with {key}"
+        return
+    if s.topology.mode != "sensed" or s.sensing == "ideal" or any(listed):
+        yield f"{key}: needs topology.mode = 'sensed' and sensing other than 'ideal', or neighbours of all vehicles"
+    if s.v2x.range is None:
+        yield f"v2x.range: needed with {key}"
+    for i in [i for i, camera in enumerate(s.cameras) if camera.range is None][:1]:
+        yield f"camera.range: needed with {key}, not there for vehicle_{i + 1}"
 
 
 def _problems_of_driving(s: Scenario) -> Iterator[str]:
@@ -388,8 +408,8 @@ def _check_room(s: Scenario) -> None:
     if not fixed:
         return
     starts = np.array([start_of(s.vehicles[i], s.routes)[0] for i in fixed])
-    near = np.linalg.norm(starts[:, None] - starts, axis=-1) <= SAME_PLACE
-    for second, first in np.argwhere(np.tril(near, -1))[:1].tolist():
+    points = Boxes(starts, np.tile(np.eye(3), (len(starts), 1, 1)), np.full_like(starts, SAME_PLACE / 2))
+    for second, first in overlapping_pairs(points, points)[:1].tolist():
         raise ValueError(_in_place(fixed[second], fixed[first]))
     nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*(boxes[i] for i in fixed), strict=True)))
     overlaps = overlapping_pairs(nominal, nominal)
@@ -404,14 +424,16 @@ def _in_place(second: int, first: int) -> str:
 
 
 def neighbour_sets(scenario: Scenario) -> list[list[int]]:
-    """Return, per vehicle, the indices of the targets that it may measure.
+    """Return, per vehicle, the indices of the targets that it may measure; nothing where they are those nearby.
 
     Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
     (paper, Assumption 1: N_i within {1, ..., i-1}), otherwise all other vehicles.
     """
     landmarks, vehicles = len(scenario.landmarks), len(scenario.vehicles)
     index = {name: target for target, name in enumerate(scenario.target_names)}
-    result = []
+    result: list[list[int]] = []
+    if scenario.topology.most_nearby is not None and scenario.vehicles[0].neighbours is None:
+        return result
     for i, vehicle in enumerate(scenario.vehicles):
         own = landmarks + i
         if vehicle.neighbours is None:
@@ -434,8 +456,8 @@ def processing_order(scenario: Scenario, neighbours: Sequence[Sequence[int]]) ->
         ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.
     """
     landmarks = len(scenario.landmarks)
-    if not scenario.topology.acyclic:
-        return list(range(len(neighbours)))
+    if not scenario.topology.acyclic or not neighbours:
+        return list(range(len(scenario.vehicles)))
     leaders = [[j - landmarks for j in targets if j >= landmarks] for targets in neighbours]
     sorter = TopologicalSorter(dict(enumerate(leaders)))
     try:

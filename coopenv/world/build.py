@@ -199,7 +199,7 @@ GRAMIAN_RATE = 20.0
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
 MOST_IN_ONE_CELL = 24  # bodies, or buildings, of a scene in which all pairs are tested
-CELLS_PER_RANGE, LONGEST_CELL = 2.0, 60.0
+CELLS_PER_RANGE, LONGEST_CELL = 3.0, 60.0
 """Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m."""
 WIDER = 1.01  # factor of what a building reaches, against rounding in the kernels
 
@@ -255,7 +255,8 @@ def _world(scenario: Scenario) -> dict[str, Any]:
     rates, vehicles, faults = scenario.rates, len(scenario.vehicles), scenario.all_faults
     agents = len(scenario.landmarks) + vehicles
     sets = neighbour_sets(scenario)
-    order = processing_order(scenario, sets)
+    order, kept = processing_order(scenario, sets), scenario.topology.most_nearby or 0
+    everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     return {
         "landmarks": len(scenario.landmarks),
         "vehicles": vehicles,
@@ -272,10 +273,15 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "ticks_per_decision": scenario.ticks_per_decision,
         "action_size": scenario.action.size,
         "horizon_ticks": scenario.horizon_ticks,
+        "kept": kept,
+        "listed": len(sets) > 0,
+        "before_boxes": 0 if kept else len(scenario.landmarks),
+        "acyclic": scenario.topology.acyclic,
+        "marker_reach": max(math.hypot(*agent.marker) for agent in everyone),
         "last_outcome": max(Outcome) + len(scenario.termination.own),
         "map_size": scenario.observation.map_size,
         "route_step": scenario.observation.route_step,
-        "targets": [targets + [-1] * (agents - len(targets)) for targets in sets],
+        "targets": [targets + [-1] * ((kept or agents) - len(targets)) for targets in sets],
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),

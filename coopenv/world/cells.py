@@ -17,26 +17,28 @@ WIDER, ROUNDING = wp.constant(1.01), wp.constant(0.01)
 """Factor of the reach of a window, and m that are added to it, so that rounding leaves nothing out."""
 
 
-@wp.func
+@device_function
 def cell_of(model: Any, x: Any) -> int:
     """Return the number of the cell of a coordinate, m; without the repetition."""
     far = type(x)(FAR)
     return int(wp.floor(wp.clamp(x * model.cells.per_metre, -far, far)))
 
 
-@wp.func
+@device_function
 def cell_at(model: Any, x: int, y: int) -> int:
     """Return the index of a cell in the grid, which repeats."""
     return (x & (model.cells.across - 1)) + model.cells.across * (y & (model.cells.across - 1))
 
 
-@wp.func
+@device_function
 def window_about(model: Any, first: Any, second: Any, reach: Any):
     """Return the window of cells within `reach`, m, of the rectangle between two points.
 
     Returns:
         Numbers (x, y) of its first cell, and how many cells it has along each axis.
     """
+    if model.cells.across == 1:
+        return 0, 0, 1, 1
     more = reach * type(reach)(WIDER) + type(reach)(ROUNDING)
     x = cell_of(model, wp.min(first[0], second[0]) - more)
     y = cell_of(model, wp.min(first[1], second[1]) - more)
@@ -45,13 +47,23 @@ def window_about(model: Any, first: Any, second: Any, reach: Any):
     return x, y, columns, rows
 
 
-@wp.func
-def cell_in(model: Any, x: int, y: int, columns: int, n: int) -> int:
-    """Return the index of the n-th cell of a window."""
-    return cell_at(model, x + n % columns, y + n // columns)
+@device_function
+def first_in(model: Any, state: Any, world: int, cell: int) -> int:
+    """Return the first item of a cell; -1: none."""
+    if model.cells.across == 1:
+        return 0
+    return state.first_item[world, cell]
 
 
-@wp.func
+@device_function
+def next_in(model: Any, state: Any, world: int, item: int) -> int:
+    """Return the item that follows one in its cell; -1: none."""
+    if model.cells.across == 1:
+        return wp.where(item + 1 < model.agents + model.traffic, item + 1, -1)
+    return state.next_item[world, item]
+
+
+@device_function
 def put_into_cell(model: Any, state: Any, world: int, item: int, position: Any):
     """Put an item into the grid, in front of those that are in its cell."""
     cell = cell_at(model, cell_of(model, position[0]), cell_of(model, position[1]))
@@ -59,39 +71,38 @@ def put_into_cell(model: Any, state: Any, world: int, item: int, position: Any):
     state.first_item[world, cell] = item
 
 
-@wp.func
+@device_function
 def clear_cells(model: Any, state: Any, world: int):
-    """Empty the grid of a world but for the traffic."""
+    """Empty the grid of a world but for the traffic; a single cell always has all items."""
     reach = model.cells.body_reach
     for cell in range(model.cells.across * model.cells.across):
         state.first_item[world, cell] = -1
     for k in range(model.traffic):
-        half = state.traffic_half[world, k]
-        if half[0] > half.dtype(0.0):
-            reach = wp.max(reach, wp.length(half))
-            put_into_cell(model, state, world, model.agents + k, state.traffic_position[world, k])
+        reach = wp.max(reach, wp.length(state.traffic_half[world, k]))
+        put_into_cell(model, state, world, model.agents + k, state.traffic_position[world, k])
     state.body_reach[world] = reach
 
 
 @device_function
 def sort_into_cells(model: Any, state: Any, world: int):
-    """Fill the grid of a world with what is there now."""
-    clear_cells(model, state, world)
-    for agent in range(model.agents):
-        if state.present[world, agent] != 0:
+    """Fill the grid of a world with where everything is now."""
+    if model.cells.across > 1:
+        clear_cells(model, state, world)
+        for agent in range(model.agents):
             put_into_cell(model, state, world, agent, state.position[world, agent])
 
 
-@wp.func
-def has_body(model: Any, item: int) -> bool:
-    """Return whether an item of the grid is a box, not a point."""
+@device_function
+def has_body(model: Any, state: Any, world: int, item: int) -> bool:
+    """Return whether an item is there and is a box, not a point."""
     if item >= model.agents:
-        return True
+        edges = state.traffic_half[world, item - model.agents]
+        return edges[0] > edges.dtype(0.0)
     half = model.scene.body_half[item]
-    return half[0] > half.dtype(0.0)
+    return half[0] > half.dtype(0.0) and state.present[world, item] != 0
 
 
-@wp.func
+@device_function
 def body_of(model: Any, state: Any, world: int, item: int):
     """Return rotation, centre and half edges (m) of the box of an item of the grid that has one."""
     if item >= model.agents:

@@ -14,7 +14,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
 from coopenv.estimation.outcomes import Outcome
-from coopenv.world.cells import body_of, cell_in, has_body, window_about
+from coopenv.world.cells import body_of, cell_at, first_in, has_body, next_in, window_about
 from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
 from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
 from coopenv.world.warp_internals import device_function
@@ -51,8 +51,25 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
 
 
 @device_function
+def touches_building_of(model: Any, cell: int, center: Any, R: Any, half: Any) -> bool:
+    """Return whether a box overlaps one of the buildings of a cell."""
+    for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
+        k = model.cells.building[entry]
+        building_R = model.scene.obstacle_rotation[k]
+        if boxes_touch(center, R, half, model.scene.obstacle_center[k], building_R, model.scene.obstacle_half[k]):
+            return True
+    return False
+
+
+@device_function
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building or another body in the grid."""
+    """Return 1 when a vehicle's box overlaps a building or another body."""
+    return touches_one_of(model, state, world, vehicle, model.agents)
+
+
+@device_function
+def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
+    """Return 1 when a vehicle's box overlaps a building, the traffic, or another of the first `count` agents."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
@@ -61,26 +78,19 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     center = state.position[world, agent] + R * model.scene.body_center[agent]
     own = wp.length(half)
     x, y, columns, rows = window_about(model, center, center, own + state.body_reach[world])
-    for n in range(columns * rows):
-        cell = cell_in(model, x, y, columns, n)
-        for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
-            k = model.cells.building[entry]
-            if boxes_touch(
-                center,
-                R,
-                half,
-                model.scene.obstacle_center[k],
-                model.scene.obstacle_rotation[k],
-                model.scene.obstacle_half[k],
-            ):
+    for row in range(rows):
+        for column in range(columns):
+            cell = cell_at(model, x + column, y + row)
+            if touches_building_of(model, cell, center, R, half):
                 return 1
-        item = state.first_item[world, cell]
-        while item >= 0:
-            if item != agent and has_body(model, item):
-                other_R, other_center, other_half = body_of(model, state, world, item)
-                if boxes_touch(center, R, half, other_center, other_R, other_half):
-                    return 1
-            item = state.next_item[world, item]
+            item = first_in(model, state, world, cell)
+            while item >= 0:
+                counts = item < count or item >= model.agents
+                if counts and item != agent and has_body(model, state, world, item):
+                    other_R, other_center, other_half = body_of(model, state, world, item)
+                    if boxes_touch(center, R, half, other_center, other_R, other_half):
+                        return 1
+                item = next_in(model, state, world, item)
     return 0
 
 

@@ -124,6 +124,7 @@ class Source:
     arrive at whom (`state.arriving`, see `coopenv.world.v2x`); `begin` does so for the first frame."""
     record: Callable[[Precision], Any]  # returns the Warp struct of the record that both read
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
+    keeps_nearby: bool = False  # whether `topology.most_nearby` may limit what a vehicle keeps
     fused: bool = False  # whether small observers run in one kernel with it, see `Embedded.fused`
 
 
@@ -168,5 +169,5 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
     transmit(model, state, world, tick)
 
 
-SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, fused=True)
+SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, keeps_nearby=True, fused=True)
 """Ticks that are computed."""

@@ -346,6 +346,11 @@ def model_struct(p: Precision) -> Any:
         ticks_per_decision: wp.int32
         action_size: wp.int32  # numbers of an action
         horizon_ticks: wp.int32
+        kept: wp.int32  # agents that a vehicle keeps at a time, see `coopenv.world.nearby`; 0: all
+        before_boxes: wp.int32  # entries before that of the first box: all landmarks, or none where some are kept
+        listed: wp.int32  # where some are kept: 1: those in `targets`, which has as many columns, 0: those in range
+        acyclic: wp.int32  # where some are kept: 1: a vehicle measures the vehicles before it alone
+        marker_reach: scalar  # m, the farthest visible point of an agent from the agent
         last_outcome: wp.int32  # largest value of `ended`
         map_size: wp.int32  # landmarks of the map in an observation
         route_step: scalar  # m ahead on the route of the points in an observation: 1, 2, 4 and 8 times
@@ -357,7 +362,6 @@ def model_struct(p: Precision) -> Any:
         motion: Motion
         dynamics: wp.array(dtype=DynamicsValues)  # (N,)
         scene: SceneValues
-        cells: Cells
         routes: Routes
         drawn: DrawRanges
         camera: wp.array(dtype=CameraValues)  # (N,)
@@ -371,6 +375,7 @@ def model_struct(p: Precision) -> Any:
         radio: Radio
         observer: ObserverValues
         judgement: Judgement
+        cells: Cells
 
     return Model
 

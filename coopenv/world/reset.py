@@ -8,10 +8,11 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
-from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
+from coopenv.world.camera import observe
 from coopenv.world.cells import clear_cells, put_into_cell, sort_into_cells
-from coopenv.world.dynamics import command_of, prescribe, touches_anything
+from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
 from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.nearby import clear_entries
 from coopenv.world.odometry import draw_errors
 from coopenv.world.quality import empty_block
 from coopenv.world.random import (
@@ -102,7 +103,7 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
         s = draw_route(model, state, world, vehicle, attempt)
         position, R = start_on_route(model, state, world, vehicle, s)
         place_at(model, state, world, agent, position, R, attempt)
-        if touches_anything(model, state, world, vehicle) == 0:
+        if touches_one_of(model, state, world, vehicle, agent) == 0:
             break
 
 
@@ -194,19 +195,11 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     for sample in range(model.samples_per_tick):
         state.sampled_velocity[world, vehicle, sample] = o
         state.sampled_angular_velocity[world, vehicle, sample] = o
-    for target in range(model.agents):
-        state.bearing[world, vehicle, target] = o
-        state.bearing_tick[world, vehicle, target] = -1
-        state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
+    clear_entries(model, state, world, vehicle)
     for slot in range(model.radio.slots):
         state.outbox_tick[world, vehicle, slot] = -1
         state.outbox_position[world, vehicle, slot] = o
         state.outbox_rotation[world, vehicle, slot] = identity3(o)
-    for sender in range(model.vehicles):
-        state.inbox_tick[world, vehicle, sender] = -1
-        state.inbox_stamp[world, vehicle, sender] = -1
-        state.inbox_position[world, vehicle, sender] = o
-        state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):
         empty_block(state, world, vehicle, block)
     state.gramian_distance_at[world, vehicle] = o[0]
@@ -275,8 +268,7 @@ def place_everybody(model: Any, state: Any, world: int):
     clear_cells(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
-        if state.present[world, agent] != 0:
-            put_into_cell(model, state, world, agent, state.position[world, agent])
+        put_into_cell(model, state, world, agent, state.position[world, agent])
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
 

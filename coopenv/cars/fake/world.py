@@ -55,7 +55,12 @@ class CarWorld(World):
         Args:
             scenario: what it is a world of.
             agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
+
+        Raises:
+            CoopenvError: the scenario limits what vehicles keep.
         """
+        if scenario.topology.most_nearby is not None:
+            raise CoopenvError("topology.most_nearby: cars keep all; leave it out")
         super().__init__(scenario, 1, "float64", threads=1)
         self.agent, self.vehicle = agent, agent - self.model.landmarks
         self._acceleration = scenario.limits[self.vehicle].max_acceleration if self.vehicle >= 0 else 0.0

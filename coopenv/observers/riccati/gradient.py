@@ -385,6 +385,7 @@ def check_differentiable(scenario: Scenario) -> None:
         "dynamics.latency must be the same for every vehicle": len({limits.latency for limits in scenario.limits}) == 1,
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
         "dynamics.gated must be false": not any(limits.gated for limits in scenario.limits),
+        "topology.most_nearby must not be there": scenario.topology.most_nearby is None,
         "action.pan must not be there": scenario.action.pan is None,
         "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
     }

@@ -39,6 +39,7 @@ from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.world.camera import body_bearing
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
+from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.quality import known_position, usable
 from coopenv.world.v2x import start_covariance
 
@@ -167,13 +168,15 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
     M22 = type(R)()
     r1 = type(p)()
     r2 = type(p)()
-    for n in range(model.target_count[vehicle]):
-        target = model.targets[vehicle, n]
-        if usable(model, state, world, vehicle, target, tick):
-            b = body_bearing(model, state, world, vehicle, target)
-            a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
+    for n in range(entry_count(model, state, world, vehicle)):
+        entry = entry_at(model, state, world, vehicle, n)
+        target = agent_of(model, state, world, vehicle, entry)
+        if usable(model, state, world, vehicle, entry, target, tick):
+            b = body_bearing(model, state, world, vehicle, entry)
+            a = wp.transpose(R) * known_position(model, state, world, vehicle, entry, target)
             e = a - model.camera[vehicle].position - p
-            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], M11, M12, M22, r1, r2)
+            q = model.observer.q[target]
+            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, q, M11, M12, M22, r1, r2)
     return M11, M12, M22, r1, r2
 
 
