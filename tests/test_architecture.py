@@ -86,7 +86,7 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (130, 2),
-    "api": (3830, 19),
+    "api": (3870, 19),
     "backends": (3285, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
@@ -94,13 +94,13 @@ LINES_AND_FILES = {
     "cli": (2230, 8),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (11835, 49),
+    "observers": (11855, 49),
     "policies": (1570, 8),
     "runs": (3060, 13),
-    "scenario": (3095, 12),
+    "scenario": (3125, 12),
     "training": (1360, 5),
     "viz": (4500, 18),
-    "world": (4480, 18),
+    "world": (4790, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -373,6 +373,7 @@ def robust_rules() -> dict[str, Rule]:
         **dict.fromkeys(("search.attempts", "belief.news_interval"), whole(0, 10**9)),
         "source.target": whole(-1, "agents"),
         "source.exclusions": whole(0, 10**9),
+        "inbox_sender": VEHICLE,
         "block_member": whole(0, members - 1),
         "belief.members": whole(1, members),
         "belief.first_sender": whole(1, MOUNTING + 1),
