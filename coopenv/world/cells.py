@@ -17,14 +17,14 @@ WIDER, ROUNDING = wp.constant(1.01), wp.constant(0.01)
 """Factor of the reach of a window, and m that are added to it, so that rounding leaves nothing out."""
 
 
-@device_function
+@wp.func
 def cell_of(model: Any, x: Any) -> int:
     """Return the number of the cell of a coordinate, m; without the repetition."""
     far = type(x)(FAR)
     return int(wp.floor(wp.clamp(x * model.cells.per_metre, -far, far)))
 
 
-@device_function
+@wp.func
 def cell_at(model: Any, x: int, y: int) -> int:
     """Return the index of a cell in the grid, which repeats."""
     return (x & (model.cells.across - 1)) + model.cells.across * (y & (model.cells.across - 1))
@@ -47,19 +47,25 @@ def window_about(model: Any, first: Any, second: Any, reach: Any):
     return x, y, columns, rows
 
 
-@device_function
-def first_in(model: Any, state: Any, world: int, cell: int) -> int:
-    """Return the first item of a cell; -1: none."""
-    if model.cells.across == 1:
+@wp.func
+def last_of_all(model: Any) -> int:
+    """Return the last item of a single cell; -1: there are several cells."""
+    return wp.where(model.cells.across == 1, model.agents + model.traffic - 1, -1)
+
+
+@wp.func
+def first_in(state: Any, world: int, cell: int, last: int) -> int:
+    """Return the first item of a cell; -1: none. `last` is that of all, read once per window."""
+    if last >= 0:
         return 0
     return state.first_item[world, cell]
 
 
-@device_function
-def next_in(model: Any, state: Any, world: int, item: int) -> int:
-    """Return the item that follows one in its cell; -1: none."""
-    if model.cells.across == 1:
-        return wp.where(item + 1 < model.agents + model.traffic, item + 1, -1)
+@wp.func
+def next_in(state: Any, world: int, item: int, last: int) -> int:
+    """Return the item that follows one in its cell; -1: none. `last` as for `first_in`."""
+    if last >= 0:
+        return wp.where(item < last, item + 1, -1)
     return state.next_item[world, item]
 
 

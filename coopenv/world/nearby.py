@@ -13,14 +13,14 @@ import warp as wp
 
 from coopenv.estimation.linalg import identity3
 from coopenv.estimation.outcomes import Sight
-from coopenv.world.cells import cell_at, first_in, next_in, window_about
+from coopenv.world.cells import cell_at, first_in, last_of_all, next_in, window_about
 from coopenv.world.random import CAMERA_RANGE
 from coopenv.world.warp_internals import device_function
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
 
 
-@device_function
+@wp.func
 def entry_count(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return how many entries there are with targets, and in worlds with `kept` with senders that are no targets."""
     if model.kept == 0:
@@ -28,23 +28,23 @@ def entry_count(model: Any, state: Any, world: int, vehicle: int) -> int:
     return state.kept_count[world, vehicle]
 
 
-@device_function
-def entry_at(model: Any, state: Any, world: int, vehicle: int, n: int) -> int:
-    """Return the n-th of these entries, in the order of the agents."""
-    if model.kept == 0:
+@wp.func
+def entry_at(model: Any, state: Any, kept: int, world: int, vehicle: int, n: int) -> int:
+    """Return the n-th of these entries, in the order of the agents; `kept` is that of the model, read once per loop."""
+    if kept == 0:
         return model.targets[vehicle, n]
     return state.kept_order[world, vehicle, n]
 
 
-@device_function
-def agent_of(model: Any, state: Any, world: int, vehicle: int, entry: int) -> int:
-    """Return the agent of an entry."""
-    if model.kept == 0:
+@wp.func
+def agent_of(state: Any, kept: int, world: int, vehicle: int, entry: int) -> int:
+    """Return the agent of an entry; `kept` as for `entry_at`."""
+    if kept == 0:
         return entry
     return state.kept_agent[world, vehicle, entry]
 
 
-@device_function
+@wp.func
 def box_of_entry(model: Any, entry: int) -> int:
     """Return the box of messages of an entry; below 0 for a landmark of worlds that keep all."""
     return entry - model.before_boxes
@@ -96,7 +96,7 @@ def box_of(model: Any, state: Any, world: int, vehicle: int, sender: int) -> int
     return wp.where(entry < 0, model.kept, entry)
 
 
-@device_function
+@wp.func
 def is_target(model: Any, vehicle: int, agent: int) -> bool:
     """Return whether a vehicle may measure an agent that it keeps."""
     return model.listed == 1 or model.acyclic == 0 or agent < model.landmarks + vehicle
@@ -213,13 +213,14 @@ def keep_those_in_range(model: Any, state: Any, world: int, vehicle: int):
         return
     here = state.position[world, own]
     seen = camera_reach(model, state, world, vehicle)
+    last = last_of_all(model)
     x, y, columns, rows = window_about(model, here, here, wp.max(seen, model.radio.range))
     for row in range(rows):
         for column in range(columns):
-            agent = first_in(model, state, world, cell_at(model, x + column, y + row))
+            agent = first_in(state, world, cell_at(model, x + column, y + row), last)
             while agent >= 0:
                 if agent < model.agents and agent != own:
                     if is_target(model, vehicle, agent) or model.radio.to_all == 1:
                         if beyond(model, state, world, vehicle, agent, seen) <= seen - seen:
                             keep(model, state, world, vehicle, agent, seen)
-                agent = next_in(model, state, world, agent)
+                agent = next_in(state, world, agent, last)

@@ -94,9 +94,10 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     G12 = state.gramian_12[world, vehicle, block]
     G22 = state.gramian_22[world, vehicle, block]
     i3 = identity3(p)
+    kept = model.kept
     for n in range(entry_count(model, state, world, vehicle)):
-        entry = entry_at(model, state, world, vehicle, n)
-        target = agent_of(model, state, world, vehicle, entry)
+        entry = entry_at(model, state, kept, world, vehicle, n)
+        target = agent_of(state, kept, world, vehicle, entry)
         if usable(model, state, world, vehicle, entry, target, tick):
             b = R * body_bearing(model, state, world, vehicle, entry)
             z = known_position(model, state, world, vehicle, entry, target)
@@ -190,7 +191,8 @@ def cholesky_of(P: Any):
 def targets_in_view(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return how many targets the vehicle measures in this frame."""
     count = int(0)
+    kept = model.kept
     for n in range(entry_count(model, state, world, vehicle)):
-        if state.sight[world, vehicle, entry_at(model, state, world, vehicle, n)] == VISIBLE:
+        if state.sight[world, vehicle, entry_at(model, state, kept, world, vehicle, n)] == VISIBLE:
             count += 1
     return count

@@ -306,14 +306,13 @@ def transmit(model: Any, state: Any, world: int, tick: int):
             state.arriving[world, receiver, box] = -1
         if is_jammed(model, state, world, here, tick):
             continue
-        every = model.radio.to_all == 1 and model.kept == 0
+        kept = model.kept
+        every = model.radio.to_all == 1 and kept == 0
         for n in range(wp.where(every, model.vehicles, entry_count(model, state, world, receiver))):
-            box = n
-            sender = n
+            entry = model.landmarks + n
             if not every:
-                entry = entry_at(model, state, world, receiver, n)
-                box = box_of_entry(model, entry)
-                sender = agent_of(model, state, world, receiver, entry) - model.landmarks
+                entry = entry_at(model, state, kept, world, receiver, n)
+            sender = agent_of(state, kept, world, receiver, entry) - model.landmarks
             if sender >= 0 and sender != receiver:
                 lag = model.radio.delay
                 if lag == 0 and model.rank[sender] > model.rank[receiver]:
@@ -322,7 +321,7 @@ def transmit(model: Any, state: Any, world: int, tick: int):
                 there = state.position[world, model.landmarks + sender]
                 if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
                     if not is_lost(model, state, world, receiver, sender, tick):
-                        state.arriving[world, receiver, box] = due
+                        state.arriving[world, receiver, box_of_entry(model, entry)] = due
 
 
 @device_function
@@ -363,7 +362,9 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     for box in range(state.arriving.shape[2]):
         sent = state.arriving[world, receiver, box]
         if sent >= 0:
-            sender = sender_of(model, state, world, receiver, box)
+            sender = box
+            if model.kept > 0:
+                sender = sender_of(model, state, world, receiver, box)
             if state.outbox_tick[world, sender, sent % model.radio.slots] == sent:
                 put_into_inbox(model, state, world, receiver, box, sender, sent, tick)
 

@@ -230,7 +230,7 @@ def target_record(model: Any, state: Any, world: int, vehicle: int, n: int) -> T
         target.index = -1
         target.age = wp.float32(NEVER)
     else:
-        target.index = agent_of(model, state, world, vehicle, entry)
+        target.index = agent_of(state, model.kept, world, vehicle, entry)
         target.bearing = wp.vec3(state.bearing[world, vehicle, entry])
         target.in_view = state.sight[world, vehicle, entry] == VISIBLE
         target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, entry], model.camera_rate)
@@ -256,7 +256,7 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, entry: in
         neighbour.bearing_age = wp.float32(NEVER)
         return neighbour
     box = box_of_entry(model, entry)
-    target = agent_of(model, state, world, vehicle, entry)
+    target = agent_of(state, model.kept, world, vehicle, entry)
     sender = target - model.landmarks
     neighbour.index = sender
     neighbour.received = fresh(model, state, world, vehicle, box, now)

@@ -42,6 +42,7 @@ from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.quality import known_position, usable
 from coopenv.world.v2x import start_covariance
+from coopenv.world.warp_internals import device_function
 
 
 @wp.func
@@ -160,7 +161,7 @@ def covariance_modes(h: Any, T: Any, spectrum: Any):
 MOST_SUBSTEPS = wp.constant(200)  # re-linearisations per tick; the last one takes what remains of the tick
 
 
-@wp.func
+@device_function
 def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: Any, p: Any):
     """Return the blocks of M = C^T Q C and r = C^T Q (y - C_2 phat) over all usable targets at (Rhat, phat)."""
     M11 = type(R)()
@@ -168,9 +169,10 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
     M22 = type(R)()
     r1 = type(p)()
     r2 = type(p)()
+    kept = model.kept
     for n in range(entry_count(model, state, world, vehicle)):
-        entry = entry_at(model, state, world, vehicle, n)
-        target = agent_of(model, state, world, vehicle, entry)
+        entry = entry_at(model, state, kept, world, vehicle, n)
+        target = agent_of(state, kept, world, vehicle, entry)
         if usable(model, state, world, vehicle, entry, target, tick):
             b = body_bearing(model, state, world, vehicle, entry)
             a = wp.transpose(R) * known_position(model, state, world, vehicle, entry, target)
@@ -257,7 +259,7 @@ def gain_step(
 def make_estimate(step: Any) -> Any:
     """Return the Warp function of one tick of the observer, whose corrections are made of `step`s."""
 
-    @wp.func
+    @device_function
     def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duration: Any):
         """Let the bearings act for `duration`, re-linearising whenever the attitude has turned by max_turn."""
         R = state.estimate_rotation[world, vehicle]
@@ -285,7 +287,7 @@ def make_estimate(step: Any) -> Any:
             state.estimate_position[world, vehicle] = p
             state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
 
-    @wp.func
+    @device_function
     def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
         """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
         dt = type(model.observer.max_turn)(now.period)

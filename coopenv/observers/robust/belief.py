@@ -172,9 +172,10 @@ def remove_member(memory: Any, world: int, i: int, n: int):
 @device_function
 def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Note which members are in view."""
+    kept = model.kept
     for n in range(entry_count(model, state, world, i)):
-        entry = entry_at(model, state, world, i, n)
-        target = agent_of(model, state, world, i, entry)
+        entry = entry_at(model, state, kept, world, i, n)
+        target = agent_of(state, kept, world, i, entry)
         if target >= model.landmarks and state.sight[world, i, entry] == VISIBLE:
             member = index_of(memory, world, i, target - model.landmarks)
             if member > 0:

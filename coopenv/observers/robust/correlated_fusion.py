@@ -288,8 +288,9 @@ def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, las
     The vehicle is the rank modulo the number of vehicles.
     """
     best = int(-1)
+    kept = model.kept
     for n in range(entry_count(model, state, world, i)):
-        entry = entry_at(model, state, world, i, n)
+        entry = entry_at(model, state, kept, world, i, n)
         box = box_of_entry(model, entry)
         if state.sight[world, i, entry] == VISIBLE and is_received(model, state, memory, world, i, box, tick):
             sender = sender_of(model, state, world, i, box)

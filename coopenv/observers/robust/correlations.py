@@ -163,9 +163,10 @@ def clear_box_of_another(model: Any, memory: Any, world: int, i: int, box: int, 
 @device_function
 def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
     """Receive the messages that the radio delivers at this tick."""
+    kept = model.kept
     for n in range(entry_count(model, state, world, i)):
-        entry = entry_at(model, state, world, i, n)
-        target = agent_of(model, state, world, i, entry)
+        entry = entry_at(model, state, kept, world, i, n)
+        target = agent_of(state, kept, world, i, entry)
         sender = target - model.landmarks
         if sender >= 0 and is_target(model, i, target):
             box = box_of_entry(model, entry)

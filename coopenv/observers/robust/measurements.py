@@ -142,7 +142,7 @@ def set_measurement_of_target(
 ) -> bool:
     """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, entry))
-    target = agent_of(model, state, world, i, entry)
+    target = agent_of(state, model.kept, world, i, entry)
     sender = target - model.landmarks
     if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
         return False
@@ -193,8 +193,9 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
         frame.mounting = mounting_of(memory, world, i)
     else:
         frame.variance += mounting_variances(model, i)[0]
+    kept = model.kept
     for n in range(entry_count(model, state, world, i)):
-        entry = entry_at(model, state, world, i, n)
+        entry = entry_at(model, state, kept, world, i, n)
         if state.sight[world, i, entry] == VISIBLE:
             if set_measurement_of_target(model, state, memory, world, i, frame, entry):
                 frame.bearings += 1
