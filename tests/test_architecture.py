@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3125, 12),
     "training": (1360, 5),
     "viz": (4500, 18),
-    "world": (4790, 19),
+    "world": (4810, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -139,6 +139,11 @@ class Scenario(Section):
         return [landmark.name for landmark in self.landmarks] + self.vehicle_names
 
     @property
+    def keeps_those_in_range(self) -> bool:
+        """Whether vehicles keep what is in range, and no lists of all that they may measure are made."""
+        return self.topology.most_nearby is not None and self.vehicles[0].neighbours is None
+
+    @property
     def driven(self) -> bool:
         """Whether any vehicle is driven by actions."""
         return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
@@ -210,7 +215,7 @@ class Scenario(Section):
         if vehicles * targets > MOST_PAIRS and self.topology.most_nearby is None:
             pairs = f"{vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs"
             raise ValueError(f"vehicles: {pairs}; set topology.most_nearby")
-        neighbours = neighbour_sets(self)
+        neighbours = [] if self.keeps_those_in_range else neighbour_sets(self)
         processing_order(self, neighbours)
         for problem in (*_misplaced(self), *_problems(self)):
             raise ValueError(problem)
@@ -424,16 +429,14 @@ def _in_place(second: int, first: int) -> str:
 
 
 def neighbour_sets(scenario: Scenario) -> list[list[int]]:
-    """Return, per vehicle, the indices of the targets that it may measure; nothing where they are those nearby.
+    """Return, per vehicle, the indices of the targets that it may measure.
 
     Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
     (paper, Assumption 1: N_i within {1, ..., i-1}), otherwise all other vehicles.
     """
     landmarks, vehicles = len(scenario.landmarks), len(scenario.vehicles)
     index = {name: target for target, name in enumerate(scenario.target_names)}
-    result: list[list[int]] = []
-    if scenario.topology.most_nearby is not None and scenario.vehicles[0].neighbours is None:
-        return result
+    result = []
     for i, vehicle in enumerate(scenario.vehicles):
         own = landmarks + i
         if vehicle.neighbours is None:
@@ -456,8 +459,8 @@ def processing_order(scenario: Scenario, neighbours: Sequence[Sequence[int]]) ->
         ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.
     """
     landmarks = len(scenario.landmarks)
-    if not scenario.topology.acyclic or not neighbours:
-        return list(range(len(scenario.vehicles)))
+    if not scenario.topology.acyclic:
+        return list(range(len(neighbours)))
     leaders = [[j - landmarks for j in targets if j >= landmarks] for targets in neighbours]
     sorter = TopologicalSorter(dict(enumerate(leaders)))
     try:

@@ -198,9 +198,12 @@ GRAMIAN_RATE = 20.0
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
-MOST_IN_ONE_CELL = 24  # bodies, or buildings, of a scene in which all pairs are tested
+MOST_IN_ONE_CELL = 12
+"""Bodies, or buildings, of a scene in which all pairs are tested. Sensing of a vehicle takes 0.71 us so, and 0.84 us in
+a grid, with 8 items; 1.42 and 1.28 us with 16; 3.16 and 2.13 us with 32 (half of them vehicles, 12 m apart)."""
 CELLS_PER_RANGE, LONGEST_CELL = 3.0, 60.0
-"""Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m."""
+"""Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m. With 1, 2,
+3, 4 and 6 cells sensing takes 9.2, 7.4, 6.5, 7.2 and 10.9 us for each of 1,024 vehicles that are 12 m apart."""
 WIDER = 1.01  # factor of what a building reaches, against rounding in the kernels
 
 NOWHERE = (0.0, 0.0, 0.0)
@@ -254,8 +257,9 @@ def _fill(struct: Any, device: str, values: Mapping[str, Any], section: Any = No
 def _world(scenario: Scenario) -> dict[str, Any]:
     rates, vehicles, faults = scenario.rates, len(scenario.vehicles), scenario.all_faults
     agents = len(scenario.landmarks) + vehicles
-    sets = neighbour_sets(scenario)
-    order, kept = processing_order(scenario, sets), scenario.topology.most_nearby or 0
+    sets = [] if scenario.keeps_those_in_range else neighbour_sets(scenario)
+    order = processing_order(scenario, sets) or list(range(vehicles))
+    kept = scenario.topology.most_nearby or 0
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     return {
         "landmarks": len(scenario.landmarks),
