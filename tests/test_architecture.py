@@ -87,20 +87,20 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 LINES_AND_FILES = {
     ".": (130, 2),
     "api": (3875, 19),
-    "backends": (3280, 17),
+    "backends": (3285, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
     "cars": (9110, 41),
     "cli": (2230, 8),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
-    "observers": (11835, 49),
+    "observers": (11855, 49),
     "policies": (1730, 10),
     "runs": (3060, 13),
     "scenario": (3135, 12),
     "training": (1380, 5),
     "viz": (4500, 18),
-    "world": (4390, 17),
+    "world": (4810, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -20,7 +20,11 @@ PEER_LOOKS = {
     "VMAS road_traffic": (style.GREEN, "^"),
     "mpe2 simple_spread": (style.ORANGE, "v"),
 }
-GROWTH_LOOKS = {True: (style.BLUE, "o"), False: (style.VERMILION, "s")}
+GROWTH_LOOKS = {
+    "sensed": (style.BLUE, "o"),
+    "three neighbours": (style.VERMILION, "s"),
+    "nearby": (style.GREEN, "^"),
+}
 
 
 def draw_speed(results: list[Result], path: Path) -> Path:
@@ -97,8 +101,8 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
 
 
 def _growth_curve(ax: Axes, g: Growth) -> None:
-    colour, marker = GROWTH_LOOKS[g.sweep.sensed]
-    kind = "sensed" if g.sweep.sensed else "three neighbours"
+    colour, marker = GROWTH_LOOKS[g.sweep.kind]
+    kind = f"{g.sweep.kind}, one world" if g.sweep.nearby else g.sweep.kind
     label = f"{kind}: $n^{{{g.large.exponent:.2f}}}$ (dotted)"
     ax.plot(
         g.sizes, 1e3 * np.array(g.costs), color=colour, marker=marker, markersize=4, linewidth=style.LINE, label=label

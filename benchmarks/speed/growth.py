@@ -18,16 +18,24 @@ from coopenv.scenario.files import apply_vehicle_defaults
 BASE = "busy_intersection"
 VEHICLES, LANDMARKS = 5, 3
 """Held while something else grows."""
-GAP = 3.0
-"""m between vehicles that follow one another."""
+GAP, SPACING = 3.0, 15.0
+"""m between vehicles that follow one another, and between those on a grid."""
 WORLDS = 64
 """Worlds while vehicles or landmarks grow: enough for the arithmetic to outweigh the call."""
+RANGE, MOST_NEARBY = 30.0, 64
+"""m of cameras and radio, and the vehicles and landmarks within it at most, where vehicles keep those nearby alone."""
 SIZES: dict[str, tuple[int, ...]] = {
     "vehicles": (2, 4, 8, 16, 32, 64),
+    "nearby": (64, 128, 256, 512, 1024, 2048, 4096),
     "landmarks": (3, 6, 12, 24, 48, 64),
     "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384, 65536),
 }
-QUICK_SIZES: dict[str, tuple[int, ...]] = {"vehicles": (2, 8, 32), "landmarks": (3, 12, 48), "worlds": (1, 64, 4096)}
+QUICK_SIZES: dict[str, tuple[int, ...]] = {
+    "vehicles": (2, 8, 32),
+    "nearby": (64, 256),
+    "landmarks": (3, 12, 48),
+    "worlds": (1, 64, 4096),
+}
 
 
 @dataclass(frozen=True)
@@ -39,19 +47,28 @@ class Sweep:
     sensed: bool
     """Everyone looks for everyone before it; or else each measures three fixed neighbours."""
     sizes: tuple[int, ...]
+    nearby: bool = False
+    """A grid of vehicles and landmarks with ranges, in one world: its density stays the same."""
+
+    @property
+    def kind(self) -> str:
+        """What vehicles measure."""
+        return "three neighbours" if not self.sensed else "nearby" if self.nearby else "sensed"
 
     @property
     def label(self) -> str:
         """Name for people."""
-        return f"{self.quantity}, {'sensed' if self.sensed else 'three neighbours'}"
+        return f"{self.quantity}, {self.kind}"
 
     def cases(self) -> list[Case]:
         """Return one case per size, on one thread."""
         cases = []
         for size in self.sizes:
             shape = {"vehicles": VEHICLES, "landmarks": LANDMARKS, "worlds": WORLDS, self.quantity: size}
-            worlds = shape.pop("worlds")
-            options = {"growth": {**shape, "sensed": self.sensed}}
+            worlds = 1 if self.nearby else shape.pop("worlds")
+            options: dict[str, dict[str, object]] = {"growth": {**shape, "sensed": self.sensed}}
+            if self.nearby:
+                options = {"growth": {"vehicles": size, "landmarks": size, "sensed": True, "nearby": True}}
             cases.append(Case(self.label, COOPENV.name, worlds, shape["vehicles"], options=options))
         return cases
 
@@ -62,13 +79,17 @@ def sweeps(quick: bool = False) -> list[Sweep]:
     return [
         Sweep("vehicles", True, sizes["vehicles"]),
         Sweep("vehicles", False, sizes["vehicles"]),
+        Sweep("vehicles", True, sizes["nearby"], nearby=True),
         Sweep("landmarks", True, sizes["landmarks"]),
         Sweep("worlds", True, sizes["worlds"]),
     ]
 
 
-def growth_scenario(vehicles: int, landmarks: int, sensed: bool) -> Scenario:
-    """Return the busy intersection with other numbers of vehicles (two columns) and landmarks (on a circle)."""
+def growth_scenario(vehicles: int, landmarks: int, sensed: bool, nearby: bool = False) -> Scenario:
+    """Return the busy intersection with other numbers of vehicles (two columns) and landmarks (on a circle).
+
+    With `nearby` both stand on a grid and have ranges, and vehicles drive in circles.
+    """
     raw = apply_vehicle_defaults(tomllib.loads(scenario_path(BASE).read_text(encoding="utf-8")))
     names = [f"L{i}" for i in range(1, landmarks + 1)]
     angles = [2 * math.pi * i / landmarks for i in range(landmarks)]
@@ -92,6 +113,16 @@ def growth_scenario(vehicles: int, landmarks: int, sensed: bool) -> Scenario:
         if not sensed:
             vehicle["neighbours"] = names[:3] if i == 0 else [*names[:2], f"vehicle_{i}"]
         raw["vehicles"].append(vehicle)
+    if nearby:
+        raw["topology"] |= {"most_nearby": MOST_NEARBY, "acyclic": False}
+        raw["camera"]["range"], raw["v2x"] = RANGE, {"range": RANGE, "delay": 1}
+        columns = math.ceil(math.sqrt(vehicles))
+        for i, (mark, vehicle) in enumerate(zip(raw["landmarks"], raw["vehicles"], strict=True)):
+            x, y = SPACING * (i % columns - columns // 2), SPACING * (i // columns - columns // 2)
+            mark["position"] = [x + SPACING / 2, y + SPACING / 2, 3.0]
+            vehicle["initial_pose"] = {"position": [x, y, 0.5], "yaw": 2.4 * i % 6.0 - 3.0}
+            vehicle["initial_estimate"] = {"position": [x + 0.5, y, 0.5]}
+            vehicle["motion"] = {"kind": "constant", "linear": [1.0, 0.0, 0.0], "angular": [0.0, 0.0, 0.5]}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ScenarioWarning)
         return parse_scenario(raw, f"{BASE} with {vehicles} vehicles and {landmarks} landmarks")

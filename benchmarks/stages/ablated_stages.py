@@ -14,6 +14,7 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.kernels import DEAD_RECKONING
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import move, referee
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, sense_simulation
 from coopenv.world.odometry import measure_odometry
@@ -30,6 +31,7 @@ def without_camera(model: Any, state: Any, record: Any, world: int, tick: int) -
     move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
     transmit(model, state, world, tick)
@@ -48,6 +50,7 @@ def without_contact(model: Any, state: Any, record: Any, world: int, tick: int) 
 def without_odometry(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Move and look for contact."""
     without_contact(model, state, record, world, tick)
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
 

@@ -241,6 +241,8 @@ class Engine:
         """Return a field of the results, the state or the actions on the host."""
         view = self._views.get(name)
         if view is None:
+            if not hasattr(self.results, name) and name != "actions":
+                return self.world.view(name)
             view = self.array(name).numpy()
             if self.world.device == "cpu":
                 self._views[name] = view
@@ -371,6 +373,8 @@ class PlugIns:
             CoopenvError: no such observer, or the world is not on the CPU.
         """
         factory = find(name)
+        if world.scenario.topology.most_nearby is not None:
+            raise CoopenvError(f"topology.most_nearby: observer '{name}' runs on the host and keeps all; leave it out")
         if world.device != "cpu":
             raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
         self.name, self._world = name, world

@@ -14,16 +14,17 @@ from coopenv.observers.recording import MEASURED, Recording, Sensed, Truth
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.camera import (
     MISSED,
-    NOT_A_NEIGHBOUR,
     OUT_OF_VIEW,
     VISIBLE,
     camera_to_body,
     marker_position,
     sight_of,
 )
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.model import Precision
+from coopenv.world.nearby import NOT_A_NEIGHBOUR
 from coopenv.world.random import COUNT as PARAMETER_COUNT
 from coopenv.world.reset import place_everybody, set_initial_estimate
 from coopenv.world.state import allocate, array, fields
@@ -113,6 +114,7 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
                 state.bearing[world, vehicle, target] = bearing
                 state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):  # now that all poses are those of this tick
         explain(model, state, world, vehicle)
 

@@ -19,6 +19,7 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario
 from coopenv.world.camera import observe
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import ARRIVED, COLLIDED, UNDER_WAY, depart, prescribe, referee
 from coopenv.world.embedded import HOST, Source
 from coopenv.world.launch import PerWorld
@@ -225,6 +226,7 @@ def sense_cosimulation(model: Any, state: Any, motion: Any, world: int, tick: in
     take_poses(model, state, motion, world)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         judge(model, state, motion, world, vehicle)
     for vehicle in range(model.vehicles):
@@ -232,7 +234,7 @@ def sense_cosimulation(model: Any, state: Any, motion: Any, world: int, tick: in
     transmit(model, state, world, tick)
 
 
-COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct)
+COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct, keeps_nearby=True)
 """Ticks of vehicles that a program on the host moves."""
 
 

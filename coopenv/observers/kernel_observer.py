@@ -36,7 +36,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     """Return the model of the world from a vehicle's setup."""
     L, T = setup.landmarks, len(setup.target_names)
     N, model = T - L, model_struct(p)()
-    model.landmarks, model.vehicles, model.agents = L, N, T
+    model.landmarks, model.vehicles, model.agents, model.before_boxes = L, N, T, L
+    model.listed, model.kept, model.traffic, model.cells.across = 1, 0, 0, 0
     model.samples_per_tick = model.observer.blocks = model.ticks_per_decision = 1
     model.action_size = 2
     model.horizon_ticks = 2**31 - 1

@@ -23,6 +23,7 @@ from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedE
 from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
+from coopenv.scenario.schema import neighbour_sets
 
 OBJECTS = 100_000
 """New objects after which Python collects garbage while observers run."""
@@ -181,6 +182,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
     s, L, places = scenario, len(scenario.landmarks), scenario.cameras
     cameras, noises = model.camera.numpy(), model.noise.numpy()
     targets, counts = model.targets.numpy(), model.target_count.numpy()
+    sets = neighbour_sets(s) if s.keeps_those_in_range else [targets[i, :n] for i, n in enumerate(counts)]
     k, q = model.observer.k.numpy(), model.observer.q.numpy().astype(float)
     setups = tuple(
         Setup(
@@ -188,7 +190,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
             name=name,
             target_names=tuple(s.target_names),
             landmarks=L,
-            targets=targets[i, : counts[i]].astype(np.int64),
+            targets=np.array(sets[i], dtype=np.int64),
             lever_arm=np.array(places[i].position, float),
             marker=np.array(s.vehicles[i].marker, float),
             noise=_noise_of(scenario, i, cameras[i], noises[i]),

@@ -57,11 +57,11 @@ def tree(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
 def random_graph(vehicles: int, seen: int, seed: int) -> Iterator[PlacedVehicle]:
     """Yield vehicles in random places of a square, on circles of 3 to 8 m, each measuring random ones before it."""
     random, half = np.random.default_rng(seed), 3.0 * math.sqrt(vehicles) + 5.0
-    places: list[np.ndarray] = []
+    places = np.empty((0, 2))
     while len(places) < vehicles:
         place = random.uniform(-half, half, 2)
-        if all(np.linalg.norm(place - other) > 3.0 for other in places):
-            places.append(place)
+        if (np.linalg.norm(places - place, axis=1) > 3.0).all():
+            places = np.vstack([places, place])
     for i, (x, y) in enumerate(places):
         pool = [*LANDMARKS, *(f"vehicle_{j + 1}" for j in range(i))]
         drawn = random.choice(len(pool), min(len(pool), max(seen, TARGETS if i == 0 else 1)), replace=False)
@@ -81,8 +81,8 @@ def ring(vehicles: int, seen: int) -> Iterator[PlacedVehicle]:
         yield PlacedVehicle(position, angle + math.pi / 2, (0.5, 0.0), 0.5 / radius, _filled(leaders, i))
 
 
-MOST_VEHICLES = 64
-"""Identities fit the 64 bits of the dependence mask in messages of `robust`."""
+MOST_VEHICLES, MOST_SENSED = 4096, 64
+"""Of scenes whose neighbours are listed, and of the others."""
 
 
 class Option(NamedTuple):
@@ -141,12 +141,12 @@ SCENES: Mapping[str, Scene] = {
     "road": Scene(
         "A road at speed, with posts and signs.",
         road,
-        {"vehicles": Option(2, MOST_VEHICLES, 8), "speed": Option(1, 50, 25.0), "lanes": Option(1, 2, 2)},
+        {"vehicles": Option(2, MOST_SENSED, 8), "speed": Option(1, 50, 25.0), "lanes": Option(1, 2, 2)},
     ),
     "crossroad": Scene(
         "Two roads that cross between buildings.",
         crossroad,
-        {"vehicles": Option(2, MOST_VEHICLES, 8), "speed": Option(1, 50, 10.0)},
+        {"vehicles": Option(2, MOST_SENSED, 8), "speed": Option(1, 50, 10.0)},
     ),
 }
 """By name."""
@@ -204,7 +204,7 @@ bearing.rate = "sample"
 
 [topology]
 mode = "{mode}"
-acyclic = {acyclic}
+acyclic = {acyclic}{nearby}
 
 [observer]
 k = 1.0
@@ -257,6 +257,7 @@ def scene_text(name: str) -> str:
     check_one_of("unknown scene", kind, SCENES, UnknownEnvironmentError)
     scene, options = SCENES[kind], _options(kind, rest)
     site = site_of(scene.build(**options))
+    listed = [len(vehicle.neighbours) for vehicle in site.vehicles]
     given = ",".join(f"{key}={value:g}" for key, value in options.items())
     head = HEAD.format(
         title=f"{kind.capitalize()}: {given.replace('=', ' ').replace(',', ', ')}",
@@ -269,6 +270,7 @@ def scene_text(name: str) -> str:
         sensors=FIXED if site.range is None else SENSED.format(range=site.range),
         mode="fixed" if site.range is None else "sensed",
         acyclic=str(kind != "ring").lower(),
+        nearby=f"\nmost_nearby = {max(listed)}" if len(listed) > MOST_SENSED else "",
         scale=max(40.0, *(abs(x) for vehicle in site.vehicles for x in vehicle.position)),
         velocity=max(2.0, *(math.hypot(*vehicle.velocity) for vehicle in site.vehicles)),
     )

@@ -101,7 +101,7 @@ class Scenario(Section):
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
     landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
-    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=1_000)
+    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=4_096)
     camera: Camera = Camera()
     rates: Rates = Rates()
     noise: Noise = Noise()
@@ -137,6 +137,11 @@ class Scenario(Section):
     def target_names(self) -> list[str]:
         """Landmarks first, then vehicles: the order of the paper's agents and of every target axis."""
         return [landmark.name for landmark in self.landmarks] + self.vehicle_names
+
+    @property
+    def keeps_those_in_range(self) -> bool:
+        """Whether vehicles keep what is in range, and no lists of all that they may measure are made."""
+        return self.topology.most_nearby is not None and self.vehicles[0].neighbours is None
 
     @property
     def driven(self) -> bool:
@@ -224,9 +229,10 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
         vehicles, targets = len(self.vehicles), len(self.target_names)
-        if vehicles * targets > MOST_PAIRS:
-            raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
-        neighbours = neighbour_sets(self)
+        if vehicles * targets > MOST_PAIRS and self.topology.most_nearby is None:
+            pairs = f"{vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs"
+            raise ValueError(f"vehicles: {pairs}; set topology.most_nearby")
+        neighbours = [] if self.keeps_those_in_range else neighbour_sets(self)
         processing_order(self, neighbours)
         for problem in (*_misplaced(self), *_problems(self)):
             raise ValueError(problem)
@@ -290,6 +296,8 @@ def _problems(s: Scenario) -> Iterator[str]:
             for name in [name for name in getattr(vehicle, key) if name not in names]:
                 yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
     yield from _problems_of_draws(s)
+    if s.topology.most_nearby is not None:
+        yield from _problems_of_nearby(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
@@ -301,6 +309,25 @@ def _problems(s: Scenario) -> Iterator[str]:
             unknown = f"unknown landmark {shown(mark)}{suggest(mark, marks)}"
             yield f"{where}.map_error.landmark: {unknown}; known: {listed(marks)}"
     yield from _problems_of_driving(s)
+
+
+def _problems_of_nearby(s: Scenario) -> Iterator[str]:
+    """Yield why what is in range of a vehicle is not limited."""
+    key, listed = "topology.most_nearby", [vehicle.neighbours for vehicle in s.vehicles]
+    if s.action.radio or "seen" in s.observation.include:
+        yield f"action.radio, observation.include: neither a radio action nor 'seen' with {key}"
+    if None not in listed:
+        for i in [i for i, names in enumerate(listed) if names and len(names) > (s.topology.most_nearby or 0)][:1]:
+            yield f"vehicles.{i}.neighbours: more than {key}"
+        if s.v2x.links == "all":
+            yield f"v2x.links: must be 'neighbours' where they are listed, with {key}"
+        return
+    if s.topology.mode != "sensed" or s.sensing == "ideal" or any(listed):
+        yield f"{key}: needs topology.mode = 'sensed' and sensing other than 'ideal', or neighbours of all vehicles"
+    if s.v2x.range is None:
+        yield f"v2x.range: needed with {key}"
+    for i in [i for i, camera in enumerate(s.cameras) if camera.range is None][:1]:
+        yield f"camera.range: needed with {key}, not there for vehicle_{i + 1}"
 
 
 def _problems_of_driving(s: Scenario) -> Iterator[str]:
@@ -411,8 +438,8 @@ def _check_room(s: Scenario) -> None:
     if not fixed:
         return
     starts = np.array([start_of(s.vehicles[i], s.routes)[0] for i in fixed])
-    near = np.linalg.norm(starts[:, None] - starts, axis=-1) <= SAME_PLACE
-    for second, first in np.argwhere(np.tril(near, -1))[:1].tolist():
+    points = Boxes(starts, np.tile(np.eye(3), (len(starts), 1, 1)), np.full_like(starts, SAME_PLACE / 2))
+    for second, first in overlapping_pairs(points, points)[:1].tolist():
         raise ValueError(_in_place(fixed[second], fixed[first]))
     nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*(boxes[i] for i in fixed), strict=True)))
     overlaps = overlapping_pairs(nominal, nominal)

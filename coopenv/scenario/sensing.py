@@ -181,6 +181,10 @@ class Topology(Section):
     """`fixed`: every neighbour at every tick; `sensed`: those in the field of view and not occluded."""
     acyclic: bool = True
     """Restrict to the directed acyclic leader-follower order of the paper's Assumption 1."""
+    most_nearby: int | None = Field(default=None, ge=1, le=4_096)
+    """Most landmarks and vehicles within the ranges of a vehicle's camera and radio, or in its list of neighbours, for
+    scenes of hundreds of vehicles (none: no limit). Time and memory then grow with the number of vehicles, not with its
+    square; the group `map` of observations still looks at all landmarks."""
 
 
 class V2x(Section):

@@ -198,6 +198,14 @@ GRAMIAN_RATE = 20.0
 
 GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
+MOST_IN_ONE_CELL = 12
+"""Bodies, or buildings, of a scene in which all pairs are tested. Sensing of a vehicle takes 0.71 us so, and 0.84 us in
+a grid, with 8 items; 1.42 and 1.28 us with 16; 3.16 and 2.13 us with 32 (half of them vehicles, 12 m apart)."""
+CELLS_PER_RANGE, LONGEST_CELL = 3.0, 60.0
+"""Cells of the grid within the shortest range of a camera; the range that counts where all are unlimited, m. With 1, 2,
+3, 4 and 6 cells sensing takes 9.2, 7.4, 6.5, 7.2 and 10.9 us for each of 1,024 vehicles that are 12 m apart."""
+WIDER = 1.01  # factor of what a building reaches, against rounding in the kernels
+
 NOWHERE = (0.0, 0.0, 0.0)
 
 
@@ -209,6 +217,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.start, device, _start(scenario))
     _fill(model.motion, device, _motion(scenario))
     _fill(model.scene, device, _scene(scenario))
+    _fill(model.cells, device, _cells(scenario))
     _fill(model.routes, device, routes_of(scenario))
     _fill(model.drawn, device, drawn_of(scenario))
     _fill(model.radio, device, _radio(scenario), scenario.v2x)
@@ -248,8 +257,10 @@ def _fill(struct: Any, device: str, values: Mapping[str, Any], section: Any = No
 def _world(scenario: Scenario) -> dict[str, Any]:
     rates, vehicles, faults = scenario.rates, len(scenario.vehicles), scenario.all_faults
     agents = len(scenario.landmarks) + vehicles
-    sets = neighbour_sets(scenario)
-    order = processing_order(scenario, sets)
+    sets = [] if scenario.keeps_those_in_range else neighbour_sets(scenario)
+    order = processing_order(scenario, sets) or list(range(vehicles))
+    kept = scenario.topology.most_nearby or 0
+    everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     return {
         "landmarks": len(scenario.landmarks),
         "vehicles": vehicles,
@@ -267,10 +278,15 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "action_size": scenario.action_size,
         "pans": scenario.action.pan is not None,
         "horizon_ticks": scenario.horizon_ticks,
+        "kept": kept,
+        "listed": len(sets) > 0,
+        "before_boxes": 0 if kept else len(scenario.landmarks),
+        "acyclic": scenario.topology.acyclic,
+        "marker_reach": max(math.hypot(*agent.marker) for agent in everyone),
         "last_outcome": max(Outcome) + len(scenario.termination.own),
         "map_size": scenario.observation.map_size,
         "route_step": scenario.observation.route_step,
-        "targets": [targets + [-1] * (agents - len(targets)) for targets in sets],
+        "targets": [targets + [-1] * ((kept or agents) - len(targets)) for targets in sets],
         "target_count": [len(targets) for targets in sets],
         "order": order,
         "rank": np.argsort(order),
@@ -358,6 +374,32 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "end_on_collision": scenario.termination.collision,
         "end_on_arrival": scenario.termination.arrival,
         "off_route": scenario.termination.off_route or 0.0,
+    }
+
+
+def _cells(scenario: Scenario) -> dict[str, Any]:
+    """Return the grid of the world; it has about as many cells as bodies."""
+    origin, obstacles = np.array(scenario.map.origin), scenario.obstacles
+    everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    reaches = [math.hypot(*agent.body.center) + math.hypot(*agent.body.size) / 2 for agent in everyone if agent.body]
+    traffic = scenario.cosimulator.most_vehicles if scenario.cosimulator else 0
+    items = max(len(everyone) + traffic, len(obstacles))
+    across = 1 if items <= MOST_IN_ONE_CELL else 1 << math.ceil(math.log2(items) / 2)
+    ranges = [camera.range for camera in scenario.cameras if camera.range is not None]
+    edge = min(ranges, default=LONGEST_CELL) / CELLS_PER_RANGE
+    cells: list[list[int]] = [[] for _ in range(across * across)]
+    for k, obstacle in enumerate(obstacles):
+        reach = np.abs(rotation_of(obstacle.yaw, None)) @ np.array(obstacle.size) / 2 * WIDER
+        spans = np.floor((obstacle.center - origin + np.outer((-1, 1), reach))[:, :2] / edge).astype(int).T
+        columns, rows = (np.unique(np.arange(a, min(b, a + across - 1) + 1) % across) for a, b in spans)
+        for cell in (rows[:, None] * across + columns).ravel():
+            cells[cell].append(k)
+    return {
+        "across": across,
+        "per_metre": 1.0 / edge,
+        "body_reach": max(reaches, default=0.0),
+        "first_building": np.cumsum([0, *map(len, cells)]),
+        "building": [k for cell in cells for k in cell],
     }
 
 

@@ -10,7 +10,9 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3
 from coopenv.estimation.outcomes import Sight
+from coopenv.world.cells import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.model import BLIND, IDEAL
+from coopenv.world.nearby import agent_of, entry_at, entry_count, is_target, keep_those_in_range
 from coopenv.world.random import (
     BEARING,
     BEARING_NOISE,
@@ -21,8 +23,8 @@ from coopenv.world.random import (
     signed_uniform,
     uniform,
 )
+from coopenv.world.warp_internals import device_function
 
-NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
 VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))
 OUT_OF_VIEW = wp.constant(wp.uint8(Sight.OUT_OF_VIEW))
 OCCLUDED_BY_BUILDING = wp.constant(wp.uint8(Sight.OCCLUDED_BY_BUILDING))
@@ -59,9 +61,9 @@ def camera_to_body(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
-def body_bearing(model: Any, state: Any, world: int, vehicle: int, target: int):
-    """Return the last measured unit bearing of a target in the body frame."""
-    return model.camera[vehicle].rotation * state.bearing[world, vehicle, target]
+def body_bearing(model: Any, state: Any, world: int, vehicle: int, entry: int):
+    """Return the last measured unit bearing of an entry's agent in the body frame."""
+    return model.camera[vehicle].rotation * state.bearing[world, vehicle, entry]
 
 
 @wp.func
@@ -93,19 +95,24 @@ def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, c
     return enter < leave
 
 
-@wp.func
+@device_function
 def behind_building(model: Any, origin: Any, direction: Any, inverse_square: Any) -> bool:
     """Return whether a building occludes a line of sight; `inverse_square` is 1 / |direction|^2."""
-    for k in range(model.obstacles):
-        if segment_hits_box(
-            origin,
-            direction,
-            inverse_square,
-            model.scene.obstacle_rotation[k],
-            model.scene.obstacle_center[k],
-            model.scene.obstacle_half[k],
-        ):
-            return True
+    x, y, columns, rows = window_about(model, origin, origin + direction, direction.dtype(0.0))
+    for row in range(rows):
+        for column in range(columns):
+            cell = cell_at(model, x + column, y + row)
+            for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
+                k = model.cells.building[entry]
+                if segment_hits_box(
+                    origin,
+                    direction,
+                    inverse_square,
+                    model.scene.obstacle_rotation[k],
+                    model.scene.obstacle_center[k],
+                    model.scene.obstacle_half[k],
+                ):
+                    return True
     return False
 
 
@@ -115,26 +122,23 @@ def inverse_square_of(direction: Any):
     return direction.dtype(1.0) / wp.max(wp.dot(direction, direction), direction.dtype(1.0e-12))
 
 
-@wp.func
+@device_function
 def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
     """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
     inverse_square = inverse_square_of(direction)
     if behind_building(model, origin, direction, inverse_square):
         return OCCLUDED_BY_BUILDING
-    for agent in range(model.agents):
-        half = model.scene.body_half[agent]
-        if agent != observer and agent != target and half[0] > half.dtype(0.0) and state.present[world, agent] != 0:
-            R = state.rotation[world, agent]
-            center = state.position[world, agent] + R * model.scene.body_center[agent]
-            if segment_hits_box(origin, direction, inverse_square, R, center, half):
-                return OCCLUDED_BY_BODY
-    for k in range(model.traffic):
-        half = state.traffic_half[world, k]
-        if half[0] > half.dtype(0.0):
-            R = state.traffic_rotation[world, k]
-            center = state.traffic_position[world, k]
-            if segment_hits_box(origin, direction, inverse_square, R, center, half):
-                return OCCLUDED_BY_BODY
+    last = last_of_all(model)
+    x, y, columns, rows = window_about(model, origin, origin + direction, state.body_reach[world])
+    for row in range(rows):
+        for column in range(columns):
+            item = first_in(state, world, cell_at(model, x + column, y + row), last)
+            while item >= 0:
+                if item != observer and item != target and has_body(model, state, world, item):
+                    R, center, half = body_of(model, state, world, item)
+                    if segment_hits_box(origin, direction, inverse_square, R, center, half):
+                        return OCCLUDED_BY_BODY
+                item = next_in(state, world, item, last)
     return VISIBLE
 
 
@@ -240,7 +244,7 @@ def noisy_bearing(noise: Any, level: Any, bearing: Any, words: Any):
     return wp.normalize(bearing + level * (n1 * first + n2 * second))
 
 
-@wp.func
+@device_function
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
     """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame.
 
@@ -265,9 +269,10 @@ def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, orig
     return VISIBLE
 
 
-@wp.func
+@device_function
 def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Take one camera frame of one vehicle; the truth of this tick is already in place."""
+    """Take one camera frame of one vehicle; the truth of this tick and the grid are already in place."""
+    keep_those_in_range(model, state, world, vehicle)
     agent = model.landmarks + vehicle
     camera = model.camera[vehicle]
     noise = model.noise[vehicle]
@@ -286,8 +291,12 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         wider = zero + place.dtype(1.0) + state.camera_focal[world, vehicle]
         to_camera = wp.diag(type(place)(wider, wider, place.dtype(1.0))) * to_camera
     random = camera.miss > zero or level > zero
-    for n in range(model.target_count[vehicle]):
-        target = model.targets[vehicle, n]
+    kept = model.kept
+    for n in range(entry_count(model, state, world, vehicle)):
+        entry = entry_at(model, state, kept, world, vehicle, n)
+        target = agent_of(state, kept, world, vehicle, entry)
+        if kept > 0 and not is_target(model, vehicle, target):
+            continue
         line = marker_position(model, state, world, target) - origin
         ray = to_camera * line
         sight = sight_of(model, state, world, vehicle, target, origin, line, ray)
@@ -305,6 +314,6 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
                 b = through_pixels(camera, b)
             if state.pan[world, vehicle] != zero:
                 b = to_rest * b
-            state.bearing[world, vehicle, target] = b
-            state.bearing_tick[world, vehicle, target] = tick
-        state.sight[world, vehicle, target] = sight
+            state.bearing[world, vehicle, entry] = b
+            state.bearing_tick[world, vehicle, entry] = tick
+        state.sight[world, vehicle, entry] = sight

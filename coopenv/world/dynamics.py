@@ -14,6 +14,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
 from coopenv.estimation.outcomes import Outcome
+from coopenv.world.cells import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
 from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
 from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
 from coopenv.world.warp_internals import device_function
@@ -50,6 +51,17 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
 
 
 @device_function
+def touches_building_of(model: Any, cell: int, center: Any, R: Any, half: Any) -> bool:
+    """Return whether a box overlaps one of the buildings of a cell."""
+    for entry in range(model.cells.first_building[cell], model.cells.first_building[cell + 1]):
+        k = model.cells.building[entry]
+        building_R = model.scene.obstacle_rotation[k]
+        if boxes_touch(center, R, half, model.scene.obstacle_center[k], building_R, model.scene.obstacle_half[k]):
+            return True
+    return False
+
+
+@device_function
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or another body."""
     return touches_one_of(model, state, world, vehicle, model.agents)
@@ -57,37 +69,29 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
 
 @device_function
 def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building or the body of another of the first `count` agents."""
+    """Return 1 when a vehicle's box overlaps a building, the traffic, or another of the first `count` agents."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
         return 0
     R = state.rotation[world, agent]
     center = state.position[world, agent] + R * model.scene.body_center[agent]
-    for k in range(model.obstacles):
-        if boxes_touch(
-            center,
-            R,
-            half,
-            model.scene.obstacle_center[k],
-            model.scene.obstacle_rotation[k],
-            model.scene.obstacle_half[k],
-        ):
-            return 1
-    for other in range(count):
-        other_half = model.scene.body_half[other]
-        if other != agent and other_half[0] > half.dtype(0.0) and state.present[world, other] != 0:
-            other_R = state.rotation[world, other]
-            other_center = state.position[world, other] + other_R * model.scene.body_center[other]
-            if boxes_touch(center, R, half, other_center, other_R, other_half):
+    own = wp.length(half)
+    last = last_of_all(model)
+    x, y, columns, rows = window_about(model, center, center, own + state.body_reach[world])
+    for row in range(rows):
+        for column in range(columns):
+            cell = cell_at(model, x + column, y + row)
+            if touches_building_of(model, cell, center, R, half):
                 return 1
-    for k in range(model.traffic):
-        other_half = state.traffic_half[world, k]
-        if other_half[0] > half.dtype(0.0):
-            if boxes_touch(
-                center, R, half, state.traffic_position[world, k], state.traffic_rotation[world, k], other_half
-            ):
-                return 1
+            item = first_in(state, world, cell, last)
+            while item >= 0:
+                counts = item < count or item >= model.agents
+                if counts and item != agent and has_body(model, state, world, item):
+                    other_R, other_center, other_half = body_of(model, state, world, item)
+                    if boxes_touch(center, R, half, other_center, other_R, other_half):
+                        return 1
+                item = next_in(state, world, item, last)
     return 0
 
 
@@ -191,7 +195,7 @@ def gradually(d: Any, command: Any, before: Any, duration: Any):
     return command
 
 
-@wp.func
+@device_function
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision into commands; a vehicle whose episode has ended stops."""
     for vehicle in range(model.vehicles):
@@ -212,7 +216,7 @@ def decide(model: Any, state: Any, actions: Any, world: int):
         state.command[world, vehicle] = command
 
 
-@wp.func
+@device_function
 def command_in_force(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
     if (tick - 1) % model.ticks_per_decision < model.dynamics[vehicle].latency_ticks:
@@ -237,7 +241,7 @@ def segment_at(model: Any, agent: int, t: wp.float64) -> int:
     return low
 
 
-@wp.func
+@device_function
 def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
     """Set an agent's pose and twist to its prescribed motion at time t, at the pace that has been drawn."""
     pace = state.pace[world, agent]
@@ -297,7 +301,7 @@ def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, comma
     return new_R, new_position, new_speed, new_steering
 
 
-@wp.func
+@device_function
 def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
     """Advance a driven vehicle in short steps; a vehicle whose episode has ended stands still."""
     agent = model.landmarks + vehicle
@@ -326,7 +330,7 @@ def yaw_rate(d: Any, speed: Any, steering: Any):
     return speed * wp.tan(steering) / d.wheelbase
 
 
-@wp.func
+@device_function
 def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any, tick: int):
     """Drive a vehicle through one camera tick, keeping its true twist at every odometry sample.
 
@@ -348,7 +352,7 @@ def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any
     drive(model, state, world, vehicle, command, wp.max(tick_end - now, wp.float64(0.0)))
 
 
-@wp.func
+@device_function
 def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
     """Turn a vehicle's camera through one camera tick towards the angle that is asked for."""
     limits = model.dynamics[vehicle]
@@ -359,7 +363,7 @@ def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
         state.pan[world, vehicle] = pan + wp.clamp(wanted - pan, -step, step)
 
 
-@wp.func
+@device_function
 def move(model: Any, state: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end."""
     t = wp.float64(tick) * model.camera_period

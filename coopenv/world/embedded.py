@@ -11,6 +11,7 @@ import warp as wp
 
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, move, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
@@ -123,6 +124,7 @@ class Source:
     arrive at whom (`state.arriving`, see `coopenv.world.v2x`); `begin` does so for the first frame."""
     record: Callable[[Precision], Any]  # returns the Warp struct of the record that both read
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
+    keeps_nearby: bool = False  # whether `topology.most_nearby` may limit what a vehicle keeps
     fused: bool = False  # whether small observers run in one kernel with it, see `Embedded.fused`
 
 
@@ -159,6 +161,7 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
     move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
     for vehicle in range(model.vehicles):
@@ -166,5 +169,5 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
     transmit(model, state, world, tick)
 
 
-SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, fused=True)
+SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, keeps_nearby=True, fused=True)
 """Ticks that are computed."""

@@ -155,6 +155,16 @@ def model_struct(p: Precision) -> Any:
         off_route: scalar  # m from the route that end an episode; 0: none do
 
     @wp.struct
+    class Cells:
+        """The grid in which bodies are found, see `coopenv.world.cells`."""
+
+        across: wp.int32  # cells along each axis, a power of two; 1: all pairs are tested
+        per_metre: scalar  # 1 / edge of a cell
+        body_reach: scalar  # m, the farthest point of an agent's box from the agent
+        first_building: wp.array(dtype=wp.int32)  # (across^2 + 1,) of those that reach a cell
+        building: wp.array(dtype=wp.int32)
+
+    @wp.struct
     class Routes:
         """Where vehicles go: vehicle i draws one of the routes choice[first[i]] .. choice[first[i + 1] - 1].
 
@@ -338,6 +348,11 @@ def model_struct(p: Precision) -> Any:
         action_size: wp.int32  # numbers of an action
         pans: wp.int32  # whether the third is the camera's angle
         horizon_ticks: wp.int32
+        kept: wp.int32  # agents that a vehicle keeps at a time, see `coopenv.world.nearby`; 0: all
+        before_boxes: wp.int32  # entries before that of the first box: all landmarks, or none where some are kept
+        listed: wp.int32  # where some are kept: 1: those in `targets`, which has as many columns, 0: those in range
+        acyclic: wp.int32  # where some are kept: 1: a vehicle measures the vehicles before it alone
+        marker_reach: scalar  # m, the farthest visible point of an agent from the agent
         last_outcome: wp.int32  # largest value of `ended`
         map_size: wp.int32  # landmarks of the map in an observation
         route_step: scalar  # m ahead on the route of the points in an observation: 1, 2, 4 and 8 times
@@ -362,6 +377,7 @@ def model_struct(p: Precision) -> Any:
         radio: Radio
         observer: ObserverValues
         judgement: Judgement
+        cells: Cells
 
     return Model
 

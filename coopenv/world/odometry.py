@@ -33,12 +33,13 @@ from coopenv.world.random import (
     six_gaussians,
     uniform,
 )
+from coopenv.world.warp_internals import device_function
 
 SHORTEST = wp.constant(-0.9)
 """Least error of a focal length, relative: a lens stays a lens."""
 
 
-@wp.func
+@device_function
 def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     """Draw the errors of a vehicle's sensors for an episode; no wheel slips yet."""
     noise = model.noise[vehicle]
@@ -68,7 +69,7 @@ def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     state.camera_focal[world, vehicle] = wp.max(camera.focal_std * factor * focal, least)
 
 
-@wp.func
+@device_function
 def drift(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Carry the errors of a vehicle's odometry from one camera tick to the next."""
     noise = model.noise[vehicle]
@@ -96,7 +97,7 @@ def drift(model: Any, state: Any, world: int, vehicle: int, tick: int):
             state.slip[world, vehicle] = slip
 
 
-@wp.func
+@device_function
 def with_errors(model: Any, state: Any, world: int, vehicle: int, v: Any, w: Any):
     """Return what wheels and gyro read, free of noise, where the body's twist is (v, w)."""
     if model.noise[vehicle].lasting == 0:
@@ -110,7 +111,7 @@ def with_errors(model: Any, state: Any, world: int, vehicle: int, v: Any, w: Any
     return read, w + state.gyro_bias[world, vehicle]
 
 
-@wp.func
+@device_function
 def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, v: Any, w: Any):
     """Return the measured (v, omega) of one odometry sample."""
     noise = model.noise[vehicle]
@@ -122,7 +123,7 @@ def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, 
     return v, w
 
 
-@wp.func
+@device_function
 def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: wp.float64):
     """Return the true (v, omega) at the tick's sample number `taken`, which is due at time t."""
     agent = model.landmarks + vehicle
@@ -133,7 +134,7 @@ def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: 
     return model.motion.linear[segment] * pace, model.motion.angular[segment] * pace
 
 
-@wp.func
+@device_function
 def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take the odometry samples of one camera tick after its motion and sum them to its increment."""
     drift(model, state, world, vehicle, tick)

@@ -6,6 +6,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, identity3, join6, quaternion_vector, skew, smallest_eigenvalue6
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
+from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
@@ -61,23 +62,23 @@ def position_variance(P: Any, p_hat: Any):
 
 
 @device_function
-def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: int) -> bool:
-    """Return whether the observer can use this target now: seen, and its position known or received."""
-    if state.sight[world, vehicle, target] != VISIBLE:
+def usable(model: Any, state: Any, world: int, vehicle: int, entry: int, target: int, tick: int) -> bool:
+    """Return whether the observer can use an entry's agent now: seen, and its position known or received."""
+    if state.sight[world, vehicle, entry] != VISIBLE:
         return False
     if target < model.landmarks:
         return True
-    return fresh(model, state, world, vehicle, target - model.landmarks, tick)
+    return fresh(model, state, world, vehicle, box_of_entry(model, entry), tick)
 
 
 @device_function
-def known_position(model: Any, state: Any, world: int, vehicle: int, target: int):
-    """Return where a target is: a landmark's place on the map, or a neighbour's message (Rhat_j phat_j)."""
+def known_position(model: Any, state: Any, world: int, vehicle: int, entry: int, target: int):
+    """Return where an entry's agent is: a landmark's place on the map, or a neighbour's message (Rhat_j phat_j)."""
     if target < model.landmarks:
         return mapped_position(model, state, world, vehicle, target)
-    sender = target - model.landmarks
-    R = state.inbox_rotation[world, vehicle, sender]
-    return state.inbox_position[world, vehicle, sender] + R * model.scene.marker[target]
+    box = box_of_entry(model, entry)
+    R = state.inbox_rotation[world, vehicle, box]
+    return state.inbox_position[world, vehicle, box] + R * model.scene.marker[target]
 
 
 @device_function
@@ -93,11 +94,13 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     G12 = state.gramian_12[world, vehicle, block]
     G22 = state.gramian_22[world, vehicle, block]
     i3 = identity3(p)
-    for n in range(model.target_count[vehicle]):
-        target = model.targets[vehicle, n]
-        if usable(model, state, world, vehicle, target, tick):
-            b = R * body_bearing(model, state, world, vehicle, target)
-            z = known_position(model, state, world, vehicle, target)
+    kept = model.kept
+    for n in range(entry_count(model, state, world, vehicle)):
+        entry = entry_at(model, state, kept, world, vehicle, n)
+        target = agent_of(state, kept, world, vehicle, entry)
+        if usable(model, state, world, vehicle, entry, target, tick):
+            b = R * body_bearing(model, state, world, vehicle, entry)
+            z = known_position(model, state, world, vehicle, entry, target)
             m = wp.cross(z, b)
             G11 += dt * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))
             G12 += dt * (skew(z) - wp.outer(m, b))
@@ -188,7 +191,8 @@ def cholesky_of(P: Any):
 def targets_in_view(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return how many targets the vehicle measures in this frame."""
     count = int(0)
-    for n in range(model.target_count[vehicle]):
-        if state.sight[world, vehicle, model.targets[vehicle, n]] == VISIBLE:
+    kept = model.kept
+    for n in range(entry_count(model, state, world, vehicle)):
+        if state.sight[world, vehicle, entry_at(model, state, kept, world, vehicle, n)] == VISIBLE:
             count += 1
     return count

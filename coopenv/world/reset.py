@@ -8,9 +8,11 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, identity3, join6, orthonormalise
-from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
+from coopenv.world.camera import observe
+from coopenv.world.cells import clear_cells, put_into_cell, sort_into_cells
 from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
 from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.nearby import clear_entries
 from coopenv.world.odometry import draw_errors
 from coopenv.world.quality import empty_block
 from coopenv.world.random import (
@@ -197,24 +199,14 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     for sample in range(model.samples_per_tick):
         state.sampled_velocity[world, vehicle, sample] = o
         state.sampled_angular_velocity[world, vehicle, sample] = o
-    for target in range(model.agents):
-        state.bearing[world, vehicle, target] = o
-        state.bearing_tick[world, vehicle, target] = -1
-        state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
+    clear_entries(model, state, world, vehicle)
     for slot in range(model.radio.slots):
         state.outbox_tick[world, vehicle, slot] = -1
         state.outbox_position[world, vehicle, slot] = o
         state.outbox_rotation[world, vehicle, slot] = identity3(o)
-        for other in range(model.vehicles):
+        for other in range(state.outbox_seen.shape[3]):
             state.outbox_seen[world, vehicle, slot, other] = -1
             state.outbox_content[world, vehicle, slot, other] = NOTHING
-    for sender in range(model.vehicles):
-        state.inbox_tick[world, vehicle, sender] = -1
-        state.inbox_stamp[world, vehicle, sender] = -1
-        state.inbox_seen[world, vehicle, sender] = -1
-        state.inbox_pose_only[world, vehicle, sender] = 0
-        state.inbox_position[world, vehicle, sender] = o
-        state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):
         empty_block(state, world, vehicle, block)
     state.gramian_distance_at[world, vehicle] = o[0]
@@ -280,8 +272,10 @@ def place_everybody(model: Any, state: Any, world: int):
     state.exhausted[world] = 0
     draw_parameters(model, state, world)
     draw_presence(model, state, world)
+    clear_cells(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
+        put_into_cell(model, state, world, agent, state.position[world, agent])
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
 
@@ -289,6 +283,7 @@ def place_everybody(model: Any, state: Any, world: int):
 @wp.func
 def begin_sensing(model: Any, state: Any, world: int):
     """Draw initial estimates and lasting errors, look for contact, take the first frame."""
+    sort_into_cells(model, state, world)
     for vehicle in range(model.vehicles):
         set_initial_estimate(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)

@@ -2,7 +2,9 @@
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
-of the traffic.
+of the traffic, G cells of the grid, I items in it. What is measured and received has
+X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
+that may be off on maps.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It states the rule of what a saved
 state may hold there, too; all rules are checked before anything is restored.
@@ -165,6 +167,15 @@ ROUTE_DRAWN = Rule(
     "a number of a route, or -1",
     lambda values, fields, model: (values >= -1) & (values < max(model.routes.count.size, 1)),
 )
+KEPT_AGENT = Rule(
+    "an agent where one is kept, otherwise -1",
+    lambda values, fields, model: np.where(
+        np.arange(values.shape[-1]) < fields["kept_count"][..., None],
+        (values >= 0) & (values < model.agents),
+        values == -1,
+    ),
+)
+KEPT_ORDER = Rule("a number of an entry", lambda values, fields, model: (values >= 0) & (values < model.kept))
 DIRECTION = Rule(
     "a unit vector, or zero",
     lambda values, fields, model: are_unit_vectors(values, TOLERANCE[values.dtype]) | everywhere(values == 0.0, -1),
@@ -282,8 +293,8 @@ def state_struct(p: Precision) -> Any:
         lie_offset: array("WN", vec3)  # of its lie at that tick, m, map
         lie_velocity: array("WN", vec3)  # at which the offset grows from that tick on, m/s, map
         jammer_tick: array("WN", wp.int32, whole(-1, 2**31 - 1))  # from which on its jammer is on; -1: never
-        map_tick: array("WNA", wp.int32, whole(-1, 2**31 - 1))  # from which on its map is wrong there; -1: never
-        map_error: array("WNA", vec3)  # of a landmark's place on its map, m
+        map_tick: array("WNE", wp.int32, whole(-1, 2**31 - 1))  # from which on its map is wrong there; -1: never
+        map_error: array("WNE", vec3)  # of a landmark's place on its map, m
         broadcast_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
         broadcast_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
@@ -293,24 +304,24 @@ def state_struct(p: Precision) -> Any:
         increment_rotation: array("WN", mat33, ROTATION)  # odometry over the last tick
         increment_translation: array("WN", vec3)  # m, in the body frame at the tick's start
 
-        bearing: array("WNA", vec3, DIRECTION)  # camera to target, camera frame without pan, last measured
-        bearing_tick: array("WNA", wp.int32, TICK)  # tick of that bearing; -1: never
-        sight: array("WNA", wp.uint8, whole(min(Sight), max(Sight)))  # values of `Sight`
+        bearing: array("WNX", vec3, DIRECTION)  # camera to target, camera frame without pan, last measured
+        bearing_tick: array("WNX", wp.int32, TICK)  # tick of that bearing; -1: never
+        sight: array("WNX", wp.uint8, whole(min(Sight), max(Sight)))  # values of `Sight`
 
         outbox_rotation: array("WNS", mat33, ROTATION)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
         outbox_tick: array("WNS", wp.int32, TICK)  # -1: nothing sent in this slot
-        outbox_seen: array("WNSN", wp.int32, TICK)  # ticks at which it last measured each vehicle, as sent; -1: never
-        outbox_content: array("WNSN", wp.int32, whole(0, 2))  # per receiver: nothing, the pose alone, the whole report
+        outbox_seen: array("WNSH", wp.int32, TICK)  # ticks at which it last measured each vehicle, as sent; -1: never
+        outbox_content: array("WNSH", wp.int32, whole(0, 2))  # per receiver: nothing, the pose alone, the whole report
         report_size: array("WN", wp.int32, whole(0, 10**6))  # bytes of the last report
         bytes_sent: array("WN", wp.int32, whole(0, 10**9))  # since the last decision
-        arriving: array("WNN", wp.int32, TICK)  # per receiver and sender: tick of sending of what arrives; -1: nothing
-        inbox_rotation: array("WNN", mat33, ROTATION)  # per receiver and sender
-        inbox_position: array("WNN", vec3)  # map
-        inbox_tick: array("WNN", wp.int32, TICK)  # tick of sending; -1: nothing received
-        inbox_stamp: array("WNN", wp.int32, TICK)  # the same by the receiver's clock
-        inbox_pose_only: array("WNN", wp.int32, FLAG)  # whether the last message was the pose alone
-        inbox_seen: array("WNN", wp.int32, TICK)  # likewise: when the sender last measured the receiver; -1: never
+        arriving: array("WNY", wp.int32, TICK)  # per receiver and box: tick of sending of what arrives; -1: nothing
+        inbox_rotation: array("WNY", mat33, ROTATION)  # per receiver and box
+        inbox_position: array("WNY", vec3)  # map
+        inbox_tick: array("WNY", wp.int32, TICK)  # tick of sending; -1: nothing received
+        inbox_stamp: array("WNY", wp.int32, TICK)  # the same by the receiver's clock
+        inbox_pose_only: array("WNY", wp.int32, FLAG)  # whether the last message was the pose alone
+        inbox_seen: array("WNY", wp.int32, TICK)  # likewise: when the sender last measured the receiver; -1: never
 
         estimate_rotation: array("WN", mat33, ROTATION)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame
@@ -327,6 +338,15 @@ def state_struct(p: Precision) -> Any:
         gramian_distance_at: array("WN", scalar)  # m, `distance_driven` at its last sample: the most so far
         distance_driven: array("WN", scalar)  # m forwards since the reset, by odometry; where the window is a distance
 
+        kept_count: array("WN", wp.int32, whole(0, "kept"))  # agents that are kept, see `coopenv.world.nearby`
+        kept_agent: array("WNV", wp.int32, KEPT_AGENT)  # of each entry; -1: none
+        kept_order: array("WNV", wp.int32, KEPT_ORDER)  # entries in the order of their agents
+        crowded: array("WN", wp.int32, whole(0, "agents"))  # agents in range for which there is no room
+
+        first_item: array("WG", wp.int32, ANYTHING)  # of each cell; scratch, like the next, see `coopenv.world.cells`
+        next_item: array("WI", wp.int32, ANYTHING)  # in the same cell; -1: none
+        body_reach: array("W", scalar)  # m, the farthest point of a box from its item
+
     return State
 
 
@@ -338,9 +358,18 @@ FAULTS = ("clock", "restart_tick", "lie_tick", "jammer_tick", "map_tick", "map_e
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
+    kept, A, N = model.kept, model.agents, model.vehicles
+    near = {
+        "V": kept,
+        "H": 0 if kept else N,
+        "X": kept or A,
+        "Y": kept + 1 if kept else N,
+        "E": 0 if kept and not model.map_errors else A,
+    }
+    grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
-    return {"W": worlds, "A": model.agents, "N": model.vehicles, **draws, **ticks}
+    return {"W": worlds, "A": A, "N": N, **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

@@ -12,6 +12,7 @@ import warp as wp
 from coopenv.estimation.linalg import exp_so3, identity3, join6
 from coopenv.estimation.outcomes import COLLUDE, HONEST, REPLAY
 from coopenv.world.camera import VISIBLE, mapped_position
+from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.random import (
     CLOCK,
     CORRUPTION,
@@ -59,7 +60,7 @@ def draw_faults(model: Any, state: Any, world: int, vehicle: int):
         draw_lie(model, state, world, vehicle, o)
     if model.jammers == 1:
         draw_jammer(model, state, world, vehicle, o)
-    for landmark in range(model.landmarks):
+    for landmark in range(wp.min(model.landmarks, state.map_tick.shape[2])):
         state.map_tick[world, vehicle, landmark] = NEVER
         state.map_error[world, vehicle, landmark] = o
         if model.map_errors == 1:
@@ -246,9 +247,9 @@ def forget_everything(model: Any, state: Any, world: int, vehicle: int):
     state.covariance[world, vehicle] = join6(model.observer.p1 * i3, none, none, model.observer.p2 * i3)
     state.corrected_tick[world, vehicle] = state.tick[world]
     state.nis_dof[world, vehicle] = 0
-    for sender in range(model.vehicles):
-        state.inbox_tick[world, vehicle, sender] = -1
-        state.inbox_stamp[world, vehicle, sender] = -1
+    for box in range(state.inbox_tick.shape[2]):
+        state.inbox_tick[world, vehicle, box] = -1
+        state.inbox_stamp[world, vehicle, box] = -1
 
 
 @wp.func
@@ -282,7 +283,7 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
         sent_R, sent_position = as_broadcast(model, state, world, vehicle, R, position)
         state.outbox_rotation[world, vehicle, slot] = sent_R
         state.outbox_position[world, vehicle, slot] = sent_position
-        for other in range(model.vehicles):
+        for other in range(state.outbox_seen.shape[3]):
             target = model.landmarks + other
             measured = state.bearing_tick[world, vehicle, target]
             if state.sight[world, vehicle, target] == VISIBLE:
@@ -311,8 +312,9 @@ def count_bytes(model: Any, state: Any, world: int, vehicle: int, tick: int):
     slot = tick % model.radio.slots
     if state.outbox_tick[world, vehicle, slot] != tick:
         return
-    sent = int(0)
-    for receiver in range(model.vehicles):
+    receivers = state.outbox_content.shape[3]
+    sent = wp.where(receivers == 0, state.report_size[world, vehicle], 0)
+    for receiver in range(receivers):
         content = state.outbox_content[world, vehicle, slot, receiver]
         size = wp.where(content == POSE, POSE_BYTES, wp.where(content == REPORT, state.report_size[world, vehicle], 0))
         sent = wp.where(model.radio.entry > 0, sent + size, wp.max(sent, size))
@@ -320,24 +322,25 @@ def count_bytes(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 
 @device_function
-def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int):
-    """Copy a sender's message into the receiver's inbox, unless the message there has a later stamp.
+def put_into_inbox(model: Any, state: Any, world: int, receiver: int, box: int, sender: int, sent: int, tick: int):
+    """Copy a sender's message into its box at the receiver, unless the message there has a later stamp.
 
     Stamps are by clocks that may be off.
     """
     stamped = stamp(model, state, world, receiver, sender, sent, tick)
-    if model.clocks == 1 and stamped <= state.inbox_stamp[world, receiver, sender]:
+    if model.clocks == 1 and stamped <= state.inbox_stamp[world, receiver, box]:
         return
     made = content_tick(model, state, world, sender, sent)
     slot = made % model.radio.slots
-    state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
-    state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
-    state.inbox_tick[world, receiver, sender] = sent
-    state.inbox_stamp[world, receiver, sender] = stamped
-    seen = state.outbox_seen[world, sender, slot, receiver]
-    content = state.outbox_content[world, sender, sent % model.radio.slots, receiver]
-    state.inbox_pose_only[world, receiver, sender] = wp.where(content == POSE, 1, 0)
-    state.inbox_seen[world, receiver, sender] = wp.where(seen < 0, -1, wp.max(seen + stamped - made, 0))
+    state.inbox_rotation[world, receiver, box] = state.outbox_rotation[world, sender, slot]
+    state.inbox_position[world, receiver, box] = state.outbox_position[world, sender, slot]
+    state.inbox_tick[world, receiver, box] = sent
+    state.inbox_stamp[world, receiver, box] = stamped
+    if model.kept == 0:
+        seen = state.outbox_seen[world, sender, slot, receiver]
+        content = state.outbox_content[world, sender, sent % model.radio.slots, receiver]
+        state.inbox_pose_only[world, receiver, box] = wp.where(content == POSE, 1, 0)
+        state.inbox_seen[world, receiver, box] = wp.where(seen < 0, -1, wp.max(seen + stamped - made, 0))
 
 
 @device_function
@@ -349,14 +352,17 @@ def transmit(model: Any, state: Any, world: int, tick: int):
     """
     for receiver in range(model.vehicles):
         here = state.position[world, model.landmarks + receiver]
-        for sender in range(model.vehicles):
-            state.arriving[world, receiver, sender] = -1
+        for box in range(state.arriving.shape[2]):
+            state.arriving[world, receiver, box] = -1
         if is_jammed(model, state, world, here, tick):
             continue
-        for n in range(wp.where(model.radio.to_all == 1, model.vehicles, model.target_count[receiver])):
-            sender = n
-            if model.radio.to_all == 0:
-                sender = model.targets[receiver, n] - model.landmarks
+        kept = model.kept
+        every = model.radio.to_all == 1 and kept == 0
+        for n in range(wp.where(every, model.vehicles, entry_count(model, state, world, receiver))):
+            entry = model.landmarks + n
+            if not every:
+                entry = entry_at(model, state, kept, world, receiver, n)
+            sender = agent_of(state, kept, world, receiver, entry) - model.landmarks
             if sender >= 0 and sender != receiver:
                 lag = model.radio.delay
                 if lag == 0 and model.rank[sender] > model.rank[receiver]:
@@ -365,7 +371,7 @@ def transmit(model: Any, state: Any, world: int, tick: int):
                 there = state.position[world, model.landmarks + sender]
                 if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
                     if not is_lost(model, state, world, receiver, sender, tick):
-                        state.arriving[world, receiver, sender] = due
+                        state.arriving[world, receiver, box_of_entry(model, entry)] = due
 
 
 @device_function
@@ -403,18 +409,24 @@ def is_lost(model: Any, state: Any, world: int, receiver: int, sender: int, tick
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Receive what arrives at this tick, where it has been sent, and decide what the own message claims."""
     alter(model, state, world, receiver, tick)
-    for sender in range(model.vehicles):
-        sent = state.arriving[world, receiver, sender]
-        slot = wp.max(sent, 0) % model.radio.slots
-        addressed = state.outbox_content[world, sender, slot, receiver] != NOTHING
-        if sent >= 0 and addressed and state.outbox_tick[world, sender, slot] == sent:
-            put_into_inbox(model, state, world, receiver, sender, sent, tick)
+    for box in range(state.arriving.shape[2]):
+        sent = state.arriving[world, receiver, box]
+        if sent >= 0:
+            slot = sent % model.radio.slots
+            sender = box
+            addressed = bool(True)
+            if model.kept > 0:
+                sender = sender_of(model, state, world, receiver, box)
+            else:
+                addressed = state.outbox_content[world, sender, slot, receiver] != NOTHING
+            if addressed and state.outbox_tick[world, sender, slot] == sent:
+                put_into_inbox(model, state, world, receiver, box, sender, sent, tick)
 
 
 @device_function
-def fresh(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
-    """Return whether a message has been received and is not older than the staleness limit."""
-    sent = state.inbox_stamp[world, receiver, sender]
+def fresh(model: Any, state: Any, world: int, receiver: int, box: int, tick: int) -> bool:
+    """Return whether a message has been received in a box and is not older than the staleness limit."""
+    sent = state.inbox_stamp[world, receiver, box]
     if sent < 0:
         return False
     return wp.float64(tick - sent) / model.camera_rate <= model.radio.staleness

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
-from coopenv.estimation.outcomes import UNKNOWN
+from coopenv.estimation.outcomes import UNKNOWN, Sight
 from coopenv.estimation.poses import Rule
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
@@ -30,6 +30,14 @@ from coopenv.world.state import (
 )
 from coopenv.world.step import Kernels, fused_kernels, host_kernels, observer_kernels, source_kernels
 
+BY_AGENT = {
+    "bearing": 0.0,
+    "bearing_tick": -1,
+    "sight": Sight.NOT_A_NEIGHBOUR,
+    **dict.fromkeys(("arriving", "inbox_tick", "inbox_stamp"), -1),
+    **dict.fromkeys(("inbox_rotation", "inbox_position"), 0.0),
+}
+"""Fields of what is measured and received, and their values for an agent that is not kept."""
 Keys = Sequence[int | None] | np.ndarray | None
 Options = Mapping[str, Any] | None
 
@@ -74,6 +82,8 @@ class World:
                 raise CoopenvError(f"{name} must be at least 1, whole and below 2^31, got {count!r}")
         self.scenario = scenario
         self.worlds = worlds = int(worlds)
+        if scenario.topology.most_nearby is not None and not self.source.keeps_nearby:
+            raise CoopenvError("topology.most_nearby: only where vehicles are simulated; leave it out")
         self.precision = precision(dtype)
         self.device = check_device(device)
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
@@ -172,6 +182,7 @@ class World:
         if self.observer.starts:
             start = observer_kernels(self.observer, self.precision)["start"]
             self._run("start", start, PerWorld(self.memory), PerWorld(self.mask))
+        self.check_room()
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon; of one decision at most."""
@@ -189,6 +200,19 @@ class World:
             sense = sensing["sense"], [*world, self._record, hold]
             follow = observer_kernels(self.observer, self.precision)["follow"], [*world, memory, hold]
             self.launch.decision(("advance", ticks), ticks, decide, sense, follow)
+        self.check_room()
+
+    def check_room(self) -> None:
+        """Make sure that a vehicle keeps all that is in range; on a GPU, that counts the others in `crowded`, no check.
+
+        Raises:
+            CoopenvError: the scenario's limit is too low.
+        """
+        if self.model.kept and self.device == "cpu" and self.view("crowded").any():
+            world, vehicle = np.argwhere(self.view("crowded"))[0].tolist()
+            count = self.model.kept + int(self.view("crowded")[world, vehicle])
+            found = f"{count} targets and senders are in range of vehicle_{vehicle + 1}"
+            raise CoopenvError(f"topology.most_nearby: {found}, not {self.model.kept} at most")
 
     def load(self) -> None:
         """Load the kernels, compiling those that this machine has not compiled yet; nothing moves."""
@@ -225,10 +249,25 @@ class World:
         self._run("finish", host_kernels(self.precision)["finish"], PerWorld(self.mask))
 
     def view(self, name: str) -> np.ndarray:
-        """Return a field of the state on the host, without a copy on the CPU."""
+        """Return a field of the state on the host, without a copy on the CPU.
+
+        Where vehicles keep those nearby, what is measured and received is copied: (W, N, A) or (W, N, N), as otherwise.
+        """
+        if name in BY_AGENT and self.model.kept:
+            return self._by_agent(name)
         if self.device != "cpu" or name not in self._views:
             self._views[name] = getattr(self.state, name).numpy()
         return self._views[name]
+
+    def _by_agent(self, name: str) -> np.ndarray:
+        """Return a field with entries or boxes as one with agents or senders."""
+        entries, agents = getattr(self.state, name).numpy(), self.view("kept_agent")
+        first = self.model.landmarks * (state_fields(self.precision)[name].axes[2] == "Y")
+        shape = (*agents.shape[:2], self.model.agents - first, *entries.shape[3:])
+        values = np.full(shape, BY_AGENT[name], entries.dtype)
+        w, i, entry = np.nonzero(agents >= first)
+        values[w, i, agents[w, i, entry] - first] = entries[w, i, entry]
+        return values
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""

@@ -17,7 +17,7 @@ from benchmarks.speed import run
 from benchmarks.speed.__main__ import command, main, parser
 from benchmarks.speed.cases import Case
 from benchmarks.speed.coopenv_cases import own_cases
-from benchmarks.speed.growth import Sweep, fit_power_law, growth_scenario, summarise
+from benchmarks.speed.growth import MOST_NEARBY, Sweep, fit_power_law, growth_scenario, summarise
 from benchmarks.speed.measure import Result, measure, units_of_work
 from benchmarks.speed.peer_cases import HIGHWAY, peer_cases
 from benchmarks.speed.report import BUSY
@@ -25,6 +25,7 @@ from benchmarks.speed.tables import (
     ratios,
 )
 from benchmarks.speed.workers import WorkerError, Workers
+from coopenv.api.engine import Engine
 from coopenv.scenario.schema import neighbour_sets
 from tests.helpers.commands import refused
 from tests.helpers.fake_library import FAKE, SHARE, STEP, fake_case
@@ -136,6 +137,14 @@ def test_scenarios_of_any_size_are_possible(vehicles: int, landmarks: int) -> No
     assert {len(targets) for targets in neighbour_sets(fixed)} == {3}
     sensed = growth_scenario(vehicles, landmarks, sensed=True)
     assert [len(targets) for targets in neighbour_sets(sensed)] == [landmarks + i for i in range(vehicles)]
+
+
+def test_vehicles_on_a_grid_keep_those_nearby() -> None:
+    world = Engine(growth_scenario(64, 64, sensed=True, nearby=True)).world
+    world.reset([0])
+    world.advance(6)
+    assert not world.view("collided").any()
+    assert 0 < world.view("kept_count").min() < world.view("kept_count").max() <= MOST_NEARBY
 
 
 def measured(case: Case, rate: float = 123456.0) -> Result:
@@ -258,6 +267,6 @@ def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert {case.name for case in peer_cases()} <= shown
     assert {row["worlds"] for row in document["rows"] if row["name"] == "make_vec"} == {1, 32, 1024}
     assert all(row["array_bytes_per_world"] > 1000 for row in document["rows"] if row["library"] == "coopenv")
-    assert len(document["growth"]) == 4
+    assert len(document["growth"]) == 5
     assert all(growth["costs"] for growth in document["growth"])
     assert "coopenv" in document["startup_s"]["imports"]

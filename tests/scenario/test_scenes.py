@@ -117,10 +117,10 @@ def test_a_ring_goes_round() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("lane:1", "scene lane: vehicles = '1', allowed are whole numbers 2 to 64"),
-        ("lane:many", "scene lane: vehicles = 'many', allowed are whole numbers 2 to 64"),
+        ("lane:1", "scene lane: vehicles = '1', allowed are whole numbers 2 to 4096"),
+        ("lane:many", "scene lane: vehicles = 'many', allowed are whole numbers 2 to 4096"),
         ("lane:8,seen=9", "scene lane: seen = '9', allowed are whole numbers 1 to 8"),
-        ("roots:8,seed=1", "scene roots: unknown option 'seed'; allowed: vehicles (3..64)"),
+        ("roots:8,seed=1", "scene roots: unknown option 'seed'; allowed: vehicles (3..4096)"),
         ("tree:8,9", "scene tree: unknown option '9'"),
         ("ring:8,seen=1,seen=2", "scene ring: seen is given twice"),
         ("lanes:8", "unknown environment 'lanes:8'"),
@@ -159,10 +159,14 @@ def test_the_text_is_a_file_of_its_own(tmp_path: Path) -> None:
 
 
 def test_as_many_vehicles_as_allowed_run() -> None:
-    """All of them are recorded, and the last of a lane is known to a few centimetres more than the one before."""
-    recording = record(made(f"ring:{MOST_VEHICLES}", horizon=0.2), 0)
-    assert recording.bearings.shape[1:3] == (MOST_VEHICLES, MOST_VEHICLES + 3)
+    """From 65 on they keep their neighbours alone, which changes nothing."""
+    recording = record(made("ring:65", horizon=0.2), 0)
+    assert recording.bearings.shape[1:3] == (65, 68)
     assert recording.visible[1:].sum(axis=2).min() == 3
+    everything = record(made("ring:65", horizon=0.2, **{"topology.most_nearby": None}), 0)
+    np.testing.assert_array_equal(recording.bearings, everything.bearings)
+    np.testing.assert_array_equal(recording.inbox_tick, everything.inbox_tick)
+    assert len(made(f"ring:{MOST_VEHICLES}").vehicles) == MOST_VEHICLES
 
 
 @pytest.mark.parametrize("name", ["lane:6", "roots:6", "tree:7", "random:6,seed=4", "ring:4", "road:5", "crossroad:5"])

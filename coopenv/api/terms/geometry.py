@@ -17,6 +17,14 @@ from coopenv.world.camera import (
 )
 from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING, UNDER_WAY
 from coopenv.world.model import DRIVEN
+from coopenv.world.nearby import (
+    agent_of,
+    box_of_entry,
+    entry_count,
+    entry_of,
+    kept_before,
+    sender_of,
+)
 from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance, place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
@@ -154,7 +162,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.observability_floor = log10(floor)
     ego.observability_level = wp.float32(model.judgement.observability_level)
     ego.targets_in_view = results.targets_in_view[world, vehicle]
-    ego.possible_targets = model.target_count[vehicle]
+    ego.possible_targets = entry_count(model, state, world, vehicle)
     ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
     ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
     ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
@@ -205,38 +213,67 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
 
 
 @device_function
-def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) -> Target:
-    """Return the record of a target."""
+def kept_entry(state: Any, world: int, vehicle: int, n: int) -> int:
+    """Return the n-th entry that is kept; -1: there are fewer."""
+    if n >= state.kept_count[world, vehicle]:
+        return -1
+    return state.kept_order[world, vehicle, n]
+
+
+@device_function
+def target_record(model: Any, state: Any, world: int, vehicle: int, n: int) -> Target:
+    """Return the record of the n-th agent, of those kept if not all are; behind the last one its index is -1."""
     target = Target()
-    target.index = index
-    target.bearing = wp.vec3(state.bearing[world, vehicle, index])
-    target.in_view = state.sight[world, vehicle, index] == VISIBLE
-    target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, index], model.camera_rate)
+    entry = n
+    if model.kept > 0:
+        entry = kept_entry(state, world, vehicle, n)
+    if entry < 0:
+        target.index = -1
+        target.age = wp.float32(NEVER)
+    else:
+        target.index = agent_of(state, model.kept, world, vehicle, entry)
+        target.bearing = wp.vec3(state.bearing[world, vehicle, entry])
+        target.in_view = state.sight[world, vehicle, entry] == VISIBLE
+        target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, entry], model.camera_rate)
     return target
 
 
 @device_function
-def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: int) -> Neighbour:
-    """Return the record of another vehicle."""
+def entry_of_neighbour(model: Any, state: Any, world: int, vehicle: int, n: int) -> int:
+    """Return the entry of the n-th other vehicle; of those that are kept, where not all are. -1: there is none."""
+    if model.kept == 0:
+        return model.landmarks + wp.where(n >= vehicle, n + 1, n)
+    return kept_entry(state, world, vehicle, kept_before(model, state, world, vehicle, model.landmarks) + n)
+
+
+@device_function
+def neighbour_record(model: Any, state: Any, world: int, vehicle: int, entry: int) -> Neighbour:
+    """Return the record of another vehicle; without an entry (-1) its index is -1."""
     neighbour = Neighbour()
     now = state.tick[world]
-    neighbour.index = sender
-    neighbour.received = fresh(model, state, world, vehicle, sender, now)
     neighbour.age = wp.float32(NEVER)
+    if entry < 0:
+        neighbour.index = -1
+        neighbour.bearing_age = wp.float32(NEVER)
+        return neighbour
+    box = box_of_entry(model, entry)
+    target = agent_of(state, model.kept, world, vehicle, entry)
+    sender = target - model.landmarks
+    neighbour.index = sender
+    neighbour.received = fresh(model, state, world, vehicle, box, now)
     if neighbour.received:
         Rt = wp.transpose(state.estimate_rotation[world, vehicle])
         p = state.estimate_position[world, vehicle]
-        neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
-        neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
-        neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
-    target = model.landmarks + sender
+        neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, box] - p)
+        neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, box])
+        neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, box], model.camera_rate)
     neighbour.precedes = neighbour.received and (sender < vehicle or model.motion.kind[target] != DRIVEN)
-    seen = state.inbox_seen[world, vehicle, sender]
-    neighbour.sees = neighbour.received and seen == state.inbox_stamp[world, vehicle, sender]
+    seen = state.inbox_seen[world, vehicle, box]
+    neighbour.sees = neighbour.received and seen == state.inbox_stamp[world, vehicle, box]
     neighbour.seen_age = seconds_since(now, seen, model.camera_rate)
-    neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
-    neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
-    neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)
+    neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, entry))
+    neighbour.in_view = state.sight[world, vehicle, entry] == VISIBLE
+    neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, entry], model.camera_rate)
     return neighbour
 
 
@@ -244,14 +281,16 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
 def behind_vehicle(model: Any, state: Any, world: int, vehicle: int, origin: Any, line: Any, inverse_square: Any):
     """Return whether another vehicle, at the pose of its last message, occludes a line of sight."""
     now = state.tick[world]
-    for sender in range(model.vehicles):
-        agent = model.landmarks + sender
-        half = model.scene.body_half[agent]
-        if sender != vehicle and half[0] > half.dtype(0.0) and fresh(model, state, world, vehicle, sender, now):
-            R = state.inbox_rotation[world, vehicle, sender]
-            center = state.inbox_position[world, vehicle, sender] + R * model.scene.body_center[agent]
-            if segment_hits_box(origin, line, inverse_square, R, center, half):
-                return True
+    for box in range(state.inbox_stamp.shape[2]):
+        sender = sender_of(model, state, world, vehicle, box)
+        if sender != vehicle and fresh(model, state, world, vehicle, box, now):
+            agent = model.landmarks + sender
+            half = model.scene.body_half[agent]
+            if half[0] > half.dtype(0.0):
+                R = state.inbox_rotation[world, vehicle, box]
+                center = state.inbox_position[world, vehicle, box] + R * model.scene.body_center[agent]
+                if segment_hits_box(origin, line, inverse_square, R, center, half):
+                    return True
     return False
 
 
@@ -305,8 +344,10 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
         landmark.exists = True
         landmark.position = wp.vec3(wp.transpose(R) * point - state.estimate_position[world, vehicle])
         landmark.expected = expected_in_view(model, state, world, vehicle, point)
-        landmark.in_view = state.sight[world, vehicle, landmark.index] == VISIBLE
-        landmark.bearing = wp.vec3(body_bearing(model, state, world, vehicle, landmark.index))
-        then = state.bearing_tick[world, vehicle, landmark.index]
-        landmark.age = seconds_since(state.tick[world], then, model.camera_rate)
+        entry = entry_of(model, state, world, vehicle, landmark.index)
+        if entry >= 0:
+            landmark.in_view = state.sight[world, vehicle, entry] == VISIBLE
+            landmark.bearing = wp.vec3(body_bearing(model, state, world, vehicle, entry))
+            then = state.bearing_tick[world, vehicle, entry]
+            landmark.age = seconds_since(state.tick[world], then, model.camera_rate)
     return landmark

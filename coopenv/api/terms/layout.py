@@ -117,18 +117,24 @@ def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
     return tuple(range(row.size))
 
 
+def row_counts(scenario: Scenario) -> dict[str, int]:
+    """Return how many rows an observation has of the records of each kind, in the order of `Records`."""
+    kept, others = scenario.topology.most_nearby, len(scenario.vehicles) - 1
+    return {
+        "target": kept or len(scenario.target_names),
+        "neighbour": min(kept or others, others),
+        "landmark": scenario.observation.map_size,
+    }
+
+
 def observation_layout(scenario: Scenario) -> Layout:
     """Return the fields in their order in the flat observation, the same for every vehicle.
 
     Other vehicles are listed in ascending order without the vehicle itself; targets are all landmarks, then all
-    vehicles, the vehicle itself included (always masked); landmarks of the map are those nearest, nearest first.
+    vehicles, the vehicle itself included (always masked); landmarks of the map are those nearest, nearest first. With
+    `topology.most_nearby` other vehicles and targets are those that are kept, in ascending order, then empty rows.
     """
-    observation = scenario.observation
-    counts = {
-        "target": len(scenario.target_names),
-        "neighbour": len(scenario.vehicles) - 1,
-        "landmark": observation.map_size,
-    }
+    observation, counts = scenario.observation, row_counts(scenario)
     layout, start = {}, 0
     for name, row in included_fields(scenario).items():
         size = len(entries_of(row, scenario))
@@ -145,7 +151,7 @@ def observation_layout(scenario: Scenario) -> Layout:
 
 def _scale(row: ObservationField, scenario: Scenario) -> float:
     if row.scale == "targets":
-        return float(len(scenario.target_names))
+        return float(scenario.topology.most_nearby or len(scenario.target_names))
     if row.scale == "steering":
         return float(max(scenario.action.steering or limits.max_steering for limits in scenario.limits))
     if row.scale == "pan":

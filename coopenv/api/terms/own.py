@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.arguments import check_finite
-from coopenv.api.terms.layout import Layout, entries_of, included_fields
+from coopenv.api.terms.layout import Layout, entries_of, included_fields, row_counts
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, TruthRecord
 from coopenv.api.terms.results import Records, write_records
 from coopenv.base import installation
@@ -72,7 +72,7 @@ class OwnTerms:
         self._terms = [term for term in terms if term.kernel is not condition_kernel]
         self._conditions = [term for term in terms if term.kernel is condition_kernel]
         needed = {term.per for term in terms if term.kernel is field_kernel and term.both}
-        many = {"target": model.agents, "neighbour": model.vehicles - 1, "landmark": model.map_size}
+        many = row_counts(scenario)
         self._many = {per: number if per in needed else 0 for per, number in many.items()}
         sizes = {"W": world.worlds, "N": model.vehicles if terms else 0}
         sizes.update(zip("TML", self._many.values(), strict=True))

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.terms.geometry import (
+    entry_of_neighbour,
     estimate_on_route,
     furthest_so_far,
     neighbour_record,
@@ -288,8 +289,8 @@ def step_results(
         if records.target.shape[2] > 0:
             records.target[world, vehicle, n] = target
     for n in range(table.neighbours):
-        sender = wp.where(n >= vehicle, n + 1, n)
-        neighbour = neighbour_record(model, state, world, vehicle, sender)
+        entry = entry_of_neighbour(model, state, world, vehicle, n)
+        neighbour = neighbour_record(model, state, world, vehicle, entry)
         values = neighbour_values(ego, neighbour, table.clearance)
         write_entries(results.observation, world, vehicle, n, table.neighbour, values)
         if records.neighbour.shape[2] > 0:

@@ -18,6 +18,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.world.camera import observe
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import drive, prescribe
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import PRESCRIBED
@@ -41,6 +42,7 @@ def look_once(model: Any, state: Any, frame: wp.array(dtype=wp.int32), vehicle: 
     """Carry the lasting errors of one vehicle to a camera frame and take it; frames count from the start."""
     world = wp.tid()
     drift(model, state, world, vehicle, frame[world])
+    sort_into_cells(model, state, world)
     observe(model, state, world, vehicle, frame[world])
 
 
@@ -53,7 +55,12 @@ class CarWorld(World):
         Args:
             scenario: what it is a world of.
             agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
+
+        Raises:
+            CoopenvError: the scenario limits what vehicles keep.
         """
+        if scenario.topology.most_nearby is not None:
+            raise CoopenvError("topology.most_nearby: cars keep all; leave it out")
         super().__init__(scenario, 1, "float64", threads=1)
         self.agent, self.vehicle = agent, agent - self.model.landmarks
         self._acceleration = scenario.limits[self.vehicle].max_acceleration if self.vehicle >= 0 else 0.0

@@ -23,7 +23,8 @@ from coopenv.observers.riccati.kernels import accumulate_information, correct_ka
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 from coopenv.world import launch
-from coopenv.world.camera import VISIBLE, sight_of
+from coopenv.world.camera import VISIBLE, marker_position, sight_of
+from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, command_of, prescribe, yaw_rate
 from coopenv.world.launch import kernel
 from coopenv.world.model import PRESCRIBED, precision
@@ -119,6 +120,21 @@ def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float6
     after[world, vehicle] = PoseBelief(R, p, join6(A, B, wp.transpose(B), D))
 
 
+def see_kernel(model: Any, state: Any):
+    """Write which targets are in view where the agents are shown. One thread per world."""
+    world = wp.tid()
+    sort_into_cells(model, state, world)
+    for vehicle in range(model.vehicles):
+        R = state.rotation[world, model.landmarks + vehicle]
+        origin = state.position[world, model.landmarks + vehicle] + R * model.camera[vehicle].position
+        to_camera = wp.transpose(R * model.camera[vehicle].rotation)
+        for n in range(model.target_count[vehicle]):
+            target = model.targets[vehicle, n]
+            line = marker_position(model, state, world, target) - origin
+            sight = sight_of(model, state, world, vehicle, target, origin, line, to_camera * line)
+            state.sight[world, vehicle, target] = sight
+
+
 def inform_kernel(
     model: Any,
     state: Any,
@@ -131,8 +147,8 @@ def inform_kernel(
 ):
     """Add the information of one target in view for one vehicle. Grid: (worlds, its targets).
 
-    That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. `state` holds the same truth, for visibility;
-    leaders have their corrected estimate of this tick already.
+    That is M = C^T Q C and r = C^T Q (y - C_2 phat) in two blocks. Leaders have their corrected estimate of this tick
+    already.
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
@@ -146,10 +162,8 @@ def inform_kernel(
         other = target - model.landmarks
         place = truth[world, other].position + truth[world, other].rotation * marker
         known = corrected[world, other].rotation * (corrected[world, other].position + marker)
-    line = place - origin
-    b = wp.transpose(own.rotation) * wp.normalize(line)
-    in_camera = wp.transpose(camera.rotation) * b
-    if sight_of(model, state, world, vehicle, target, origin, line, in_camera) == VISIBLE:
+    if state.sight[world, vehicle, target] == VISIBLE:
+        b = wp.transpose(own.rotation) * wp.normalize(place - origin)
         a = wp.transpose(predicted[world, vehicle].rotation) * known
         e = a - camera.position - predicted[world, vehicle].position
         o = type(own.rotation)()
@@ -320,6 +334,13 @@ class DifferentiableWorld:
             device=world.device,
             record_tape=False,
         )
+        launch.launch(
+            kernel(see_kernel, "float64"),
+            dim=world.worlds,
+            inputs=[world.model, world.state],
+            device=world.device,
+            record_tape=False,
+        )
         dt = wp.float64(1.0 / rate)
         predicted, after = self._make(PoseBelief), self._make(PoseBelief)
         sums = [self._make(mat66), self._make(mat23)]
@@ -365,6 +386,7 @@ def check_differentiable(scenario: Scenario) -> None:
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
         "dynamics.gated must be false": not any(limits.gated for limits in scenario.limits),
         "action.pan must not be there, action.radio be false": not (scenario.action.pan or scenario.action.radio),
+        "topology.most_nearby must not be there": scenario.topology.most_nearby is None,
         "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
     }
     for reason, holds in reasons.items():

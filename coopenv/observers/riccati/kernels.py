@@ -39,8 +39,10 @@ from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.world.camera import body_bearing
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
+from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.quality import known_position, usable
 from coopenv.world.v2x import start_covariance
+from coopenv.world.warp_internals import device_function
 
 
 @wp.func
@@ -159,7 +161,7 @@ def covariance_modes(h: Any, T: Any, spectrum: Any):
 MOST_SUBSTEPS = wp.constant(200)  # re-linearisations per tick; the last one takes what remains of the tick
 
 
-@wp.func
+@device_function
 def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: Any, p: Any):
     """Return the blocks of M = C^T Q C and r = C^T Q (y - C_2 phat) over all usable targets at (Rhat, phat)."""
     M11 = type(R)()
@@ -167,13 +169,16 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
     M22 = type(R)()
     r1 = type(p)()
     r2 = type(p)()
-    for n in range(model.target_count[vehicle]):
-        target = model.targets[vehicle, n]
-        if usable(model, state, world, vehicle, target, tick):
-            b = body_bearing(model, state, world, vehicle, target)
-            a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
+    kept = model.kept
+    for n in range(entry_count(model, state, world, vehicle)):
+        entry = entry_at(model, state, kept, world, vehicle, n)
+        target = agent_of(state, kept, world, vehicle, entry)
+        if usable(model, state, world, vehicle, entry, target, tick):
+            b = body_bearing(model, state, world, vehicle, entry)
+            a = wp.transpose(R) * known_position(model, state, world, vehicle, entry, target)
             e = a - model.camera[vehicle].position - p
-            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], M11, M12, M22, r1, r2)
+            q = model.observer.q[target]
+            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, q, M11, M12, M22, r1, r2)
     return M11, M12, M22, r1, r2
 
 
@@ -254,7 +259,7 @@ def gain_step(
 def make_estimate(step: Any) -> Any:
     """Return the Warp function of one tick of the observer, whose corrections are made of `step`s."""
 
-    @wp.func
+    @device_function
     def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duration: Any):
         """Let the bearings act for `duration`, re-linearising whenever the attitude has turned by max_turn."""
         R = state.estimate_rotation[world, vehicle]
@@ -282,7 +287,7 @@ def make_estimate(step: Any) -> Any:
             state.estimate_position[world, vehicle] = p
             state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
 
-    @wp.func
+    @device_function
     def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
         """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
         dt = type(model.observer.max_turn)(now.period)

@@ -23,6 +23,7 @@ from coopenv.observers.robust.algebra import (
 )
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Pose, PoseEstimate, mat66d
 from coopenv.world.camera import VISIBLE
+from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function
 
 MAX_UNSEEN_TIME = constants.MEAN_TIME + constants.SAME_TIME
@@ -171,9 +172,11 @@ def remove_member(memory: Any, world: int, i: int, n: int):
 @device_function
 def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Note which members are in view."""
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        if target >= model.landmarks and state.sight[world, i, target] == VISIBLE:
+    kept = model.kept
+    for n in range(entry_count(model, state, world, i)):
+        entry = entry_at(model, state, kept, world, i, n)
+        target = agent_of(state, kept, world, i, entry)
+        if target >= model.landmarks and state.sight[world, i, entry] == VISIBLE:
             member = index_of(memory, world, i, target - model.landmarks)
             if member > 0:
                 memory.member[world, i, member].seen_tick = tick

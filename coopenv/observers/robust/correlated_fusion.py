@@ -25,6 +25,7 @@ from coopenv.observers.robust.reports import bit_of, depends_on_own, includes, p
 from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE
+from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.warp_internals import device_function
 
 
@@ -75,14 +76,16 @@ def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
+def add_member(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Add a sender that is new to the belief, if there is room."""
     if make_room(model, memory, world, i, tick):
         n = memory.belief[world, i].members
-        report = memory.inbox[world, i, sender]
+        box = box_of(model, state, world, i, sender)
+        report = memory.inbox[world, i, box]
         append_member(memory, world, i, sender, report.pose, mat66d(report.P))
         q = take_slot(memory, world, i, model.landmarks + sender, tick, False, model.camera_period)
         memory.member[world, i, n].source = q
+        memory.member[world, i, n].box = box
         if not is_excluded(memory, world, i, q):
             clear_source(memory, world, i, q)
         memory.member[world, i, n].report = report
@@ -205,10 +208,10 @@ def unknown_covariance(model: Any, memory: Any, world: int, i: int, n: int, step
 
 
 @device_function
-def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
+def fuse_report(model: Any, memory: Any, world: int, i: int, n: int):
     """Propagate a member to its new report, and fuse it."""
     last = memory.member[world, i, n].report
-    report = memory.inbox[world, i, sender]
+    report = memory.inbox[world, i, memory.member[world, i, n].box]
     dt = wp.float64(report.tick - last.tick) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     white = algebra.odometry_noise(model, i, dt)
@@ -231,11 +234,11 @@ def fuse_report(model: Any, memory: Any, world: int, i: int, n: int, sender: int
 @device_function
 def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
     """Return whether a report of member n that carries correlations is received and not yet fused."""
-    sender = memory.member[world, i, n].vehicle
-    if not is_received(model, state, memory, world, i, sender, tick):
+    box = memory.member[world, i, n].box
+    if not is_received(model, state, memory, world, i, box, tick):
         return False
-    report = memory.inbox[world, i, sender].tick
-    return memory.inbox[world, i, sender].carries_correlations == 1 and report > memory.member[world, i, n].report.tick
+    report = memory.inbox[world, i, box].tick
+    return memory.inbox[world, i, box].carries_correlations == 1 and report > memory.member[world, i, n].report.tick
 
 
 @device_function
@@ -250,9 +253,12 @@ def should_follow_pending(model: Any, state: Any, memory: Any, world: int, i: in
         if k != n:
             if is_pending(model, state, memory, world, i, k, tick):
                 other = memory.member[world, i, k].vehicle
-                if correlated_tick(memory, world, i, sender, other) > memory.member[world, i, k].report.tick:
+                if (
+                    correlated_tick(memory, world, i, memory.member[world, i, n].box, other)
+                    > memory.member[world, i, k].report.tick
+                ):
                     return True
-                if correlated_tick(memory, world, i, other, sender) == before:
+                if correlated_tick(memory, world, i, memory.member[world, i, k].box, sender) == before:
                     return True
     return False
 
@@ -266,7 +272,7 @@ def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: i
     for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if is_pending(model, state, memory, world, i, n, tick):
             sender = memory.member[world, i, n].vehicle
-            at = rank(model, sender, memory.inbox[world, i, sender])
+            at = rank(model, sender, memory.inbox[world, i, memory.member[world, i, n].box])
             wait = should_follow_pending(model, state, memory, world, i, n, tick)
             if found == 0 or (waits and not wait) or (waits == wait and at < best):
                 found = n
@@ -282,12 +288,14 @@ def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, las
     The vehicle is the rank modulo the number of vehicles.
     """
     best = int(-1)
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        sender = target - model.landmarks
-        if state.sight[world, i, target] == VISIBLE and is_received(model, state, memory, world, i, sender, tick):
+    kept = model.kept
+    for n in range(entry_count(model, state, world, i)):
+        entry = entry_at(model, state, kept, world, i, n)
+        box = box_of_entry(model, entry)
+        if state.sight[world, i, entry] == VISIBLE and is_received(model, state, memory, world, i, box, tick):
+            sender = sender_of(model, state, world, i, box)
             if index_of(memory, world, i, sender) == 0:
-                at = rank(model, sender, memory.inbox[world, i, sender])
+                at = rank(model, sender, memory.inbox[world, i, box])
                 if at > last and (best < 0 or at < best):
                     best = at
     return best
@@ -301,10 +309,10 @@ def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick:
         n = next_member(model, state, memory, world, i, tick)
         if n == 0:
             break
-        fuse_report(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
+        fuse_report(model, memory, world, i, n)
     at = int(-1)
-    for _ in range(model.target_count[i]):
+    for _ in range(entry_count(model, state, world, i)):
         at = next_new_sender(model, state, memory, world, i, at, tick)
         if at < 0:
             break
-        add_member(model, memory, world, i, at % model.vehicles, tick)
+        add_member(model, state, memory, world, i, at % model.vehicles, tick)

@@ -32,6 +32,7 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.observers.robust.reports import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.observers.robust.sources import is_excluded
+from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick
 from coopenv.world.warp_internals import device_function
 
@@ -151,53 +152,69 @@ def clear_broadcasts(memory: Any, world: int, i: int):
 
 
 @device_function
-def copy_correlations(memory: Any, world: int, i: int, sender: int, slot: int, later: int):
+def copy_correlations(memory: Any, world: int, i: int, box: int, sender: int, slot: int, later: int):
     """Copy the correlations of a message, if it carries them, with ticks `later`: ages are broadcast, not ticks."""
     if memory.outbox[world, sender, slot].carries_correlations == 1:
         for c in range(memory.correlation.shape[3]):
-            memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
-            memory.correlation[world, i, sender, c].tick += later
+            memory.correlation[world, i, box, c] = memory.outbox_correlation[world, sender, slot, c]
+            memory.correlation[world, i, box, c].tick += later
+
+
+@device_function
+def clear_box_of_another(model: Any, memory: Any, world: int, i: int, box: int, sender: int):
+    """Clear a box that another sender had before."""
+    if model.kept > 0 and memory.inbox_sender[world, i, box] != sender:
+        memory.inbox_sender[world, i, box] = sender
+        memory.inbox[world, i, box].tick = -1
+        fill(memory.correlation[world, i, box], no_correlation())
 
 
 @device_function
 def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
     """Receive the messages that the radio delivers at this tick."""
-    for n in range(model.target_count[i]):
-        sender = model.targets[i, n] - model.landmarks
-        if sender >= 0:
-            sent = state.inbox_tick[world, i, sender]
-            stamp = state.inbox_stamp[world, i, sender]
-            whole = state.inbox_pose_only[world, i, sender] == 0
-            if sent >= 0 and whole and stamp != memory.inbox[world, i, sender].tick:
+    kept = model.kept
+    for n in range(entry_count(model, state, world, i)):
+        entry = entry_at(model, state, kept, world, i, n)
+        target = agent_of(state, kept, world, i, entry)
+        sender = target - model.landmarks
+        if sender >= 0 and is_target(model, i, target):
+            box = box_of_entry(model, entry)
+            clear_box_of_another(model, memory, world, i, box, sender)
+            sent = state.inbox_tick[world, i, box]
+            stamp = state.inbox_stamp[world, i, box]
+            whole = state.inbox_pose_only[world, i, box] == 0
+            if sent >= 0 and whole and stamp != memory.inbox[world, i, box].tick:
                 content = content_tick(model, state, world, sender, sent)
                 slot = content % model.radio.slots
-                copy_correlations(memory, world, i, sender, slot, stamp - content)
-                memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
-                memory.inbox[world, i, sender].tick = stamp
+                copy_correlations(memory, world, i, box, sender, slot, stamp - content)
+                memory.inbox[world, i, box] = memory.outbox[world, sender, slot]
+                memory.inbox[world, i, box].tick = stamp
+    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
+        memory.member[world, i, n].box = box_of(model, state, world, i, memory.member[world, i, n].vehicle)
 
 
 @device_function
-def correlation_index(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
-    """Return the index of a sender's correlation with a vehicle, -1 if there is none."""
+def correlation_index(memory: Any, world: int, i: int, box: int, vehicle: int) -> int:
+    """Return the index of the correlation with a vehicle in a box, -1 if there is none."""
     for c in range(memory.correlation.shape[3]):
-        if memory.correlation[world, i, sender, c].vehicle == vehicle:
+        if memory.correlation[world, i, box, c].vehicle == vehicle:
             return c
     return -1
 
 
 @device_function
-def correlated_tick(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
-    """Return the tick of the report of a vehicle that a sender's correlation with it refers to, -1 without one."""
-    c = correlation_index(memory, world, i, sender, vehicle)
+def correlated_tick(memory: Any, world: int, i: int, box: int, vehicle: int) -> int:
+    """Return the tick of the report of a vehicle that the correlation with it in a box refers to, -1 without one."""
+    c = correlation_index(memory, world, i, box, vehicle)
     if c < 0:
         return -1
-    return memory.correlation[world, i, sender, c].tick
+    return memory.correlation[world, i, box, c].tick
 
 
 @device_function
-def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
+def matrix_of(memory: Any, world: int, i: int, box: int, c: int):
     """Return a stored correlation."""
-    return mat66d(memory.correlation[world, i, sender, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
+    return mat66d(memory.correlation[world, i, box, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
 
 
 @wp.func
@@ -216,24 +233,26 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     """
     sender = memory.member[world, i, n].vehicle
     other = memory.member[world, i, k].vehicle
-    c = correlation_index(memory, world, i, sender, other)
+    box = memory.member[world, i, n].box
+    other_box = memory.member[world, i, k].box
+    c = correlation_index(memory, world, i, box, other)
     if c >= 0:
-        near = is_near(model, memory.correlation[world, i, sender, c].tick, memory.member[world, i, k].report.tick)
-        return near, True, matrix_of(memory, world, i, sender, c)
-    c = correlation_index(memory, world, i, other, sender)
+        near = is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, k].report.tick)
+        return near, True, matrix_of(memory, world, i, box, c)
+    c = correlation_index(memory, world, i, other_box, sender)
     if c >= 0:
-        near = is_near(model, memory.correlation[world, i, other, c].tick, memory.member[world, i, n].report.tick)
-        return use_reverse and near, True, wp.transpose(matrix_of(memory, world, i, other, c))
+        near = is_near(model, memory.correlation[world, i, other_box, c].tick, memory.member[world, i, n].report.tick)
+        return use_reverse and near, True, wp.transpose(matrix_of(memory, world, i, other_box, c))
     most = wp.float64(-1.0)
     shared = mat66d()
     for a in range(memory.correlation.shape[3]):
-        third = memory.correlation[world, i, sender, a].vehicle
+        third = memory.correlation[world, i, box, a].vehicle
         if third >= 0:
-            b = correlation_index(memory, world, i, other, third)
+            b = correlation_index(memory, world, i, other_box, third)
             if b >= 0:
-                tick = memory.correlation[world, i, other, b].tick
-                if is_near(model, memory.correlation[world, i, sender, a].tick, tick):
-                    X = matrix_of(memory, world, i, sender, a) * wp.transpose(matrix_of(memory, world, i, other, b))
+                tick = memory.correlation[world, i, other_box, b].tick
+                if is_near(model, memory.correlation[world, i, box, a].tick, tick):
+                    X = matrix_of(memory, world, i, box, a) * wp.transpose(matrix_of(memory, world, i, other_box, b))
                     size = wp.ddot(X, X)
                     if size > most:
                         most = size

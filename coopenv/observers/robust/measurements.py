@@ -24,6 +24,7 @@ from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.reports import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
+from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function
 
@@ -68,16 +69,16 @@ def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any
 
 
 @device_function
-def is_received(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether a fresh report of a sender is received and valid; False for a landmark, which is below 0.
+def is_received(model: Any, state: Any, memory: Any, world: int, i: int, box: int, tick: int) -> bool:
+    """Return whether a fresh report in a box is received and valid; False for a landmark, whose box is below 0.
 
     A vehicle whose pose is not known sends none, so that such a report is not from a correct one.
     """
-    if sender < 0:
+    if box < 0:
         return False
-    if not fresh(model, state, world, i, sender, tick) or memory.inbox[world, i, sender].valid == 0:
+    if not fresh(model, state, world, i, box, tick) or memory.inbox[world, i, box].valid == 0:
         return False
-    return is_known(mat66d(memory.inbox[world, i, sender].P))
+    return is_known(mat66d(memory.inbox[world, i, box].P))
 
 
 @device_function
@@ -87,13 +88,13 @@ def possible_speed(memory: Any, world: int, i: int):
 
 
 @device_function
-def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, frame: BearingFrame):
-    """Return the variance per axis, m^2, of a sender's reported position, as it counts in the search.
+def received_variance(model: Any, memory: Any, world: int, i: int, box: int, frame: BearingFrame):
+    """Return the variance per axis, m^2, of the reported position, as it counts in the search.
 
     Hypotheses are tracked through many frames, in all of which that error is nearly the same.
     """
-    variance = position_variance(memory.inbox[world, i, sender].P) * wp.float64(constants.THIRD)
-    age = wp.float64(frame.tick - memory.inbox[world, i, sender].tick) * model.camera_period
+    variance = position_variance(memory.inbox[world, i, box].P) * wp.float64(constants.THIRD)
+    age = wp.float64(frame.tick - memory.inbox[world, i, box].tick) * model.camera_period
     gone = possible_speed(memory, world, i) * age
     factor = wp.float64(constants.SQUARED_MARGIN)
     if memory.search[world, i].hypotheses > 0:
@@ -118,17 +119,17 @@ def set_measurement_of_member(
     function returns whether it is used. Errors that are the same in several frames count once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
-    sender = memory.member[world, i, member].vehicle
+    box = memory.member[world, i, member].box
     gone = vec3d()
     turned = wp.identity(3, wp.float64)
     variance = wp.float64(0.0)
-    if received and memory.inbox[world, i, sender].tick > stands:
-        step = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, sender].odometry)
+    if received and memory.inbox[world, i, box].tick > stands:
+        step = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, box].odometry)
         gone = step.p
         turned = step.R
-        passed = wp.float64(memory.inbox[world, i, sender].tick - stands) * model.camera_period
+        passed = wp.float64(memory.inbox[world, i, box].tick - stands) * model.camera_period
         variance = odometry_noise(model, i, passed)[1]
-        stands = memory.inbox[world, i, sender].tick
+        stands = memory.inbox[world, i, box].tick
     age = wp.float64(frame.tick - stands) * model.camera_period
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
@@ -149,10 +150,11 @@ def set_measurement_of_member(
 
 @device_function
 def set_measurement_of_target(
-    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, target: int
+    model: Any, state: Any, memory: Any, world: int, i: int, frame: BearingFrame, entry: int
 ) -> bool:
     """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
-    b = vec3d(body_bearing(model, state, world, i, target))
+    b = vec3d(body_bearing(model, state, world, i, entry))
+    target = agent_of(state, model.kept, world, i, entry)
     sender = target - model.landmarks
     if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):
         return False
@@ -163,11 +165,12 @@ def set_measurement_of_target(
             q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
             memory.measurement[world, frame.bearings].source = q
         return True
-    received = is_received(model, state, memory, world, i, sender, frame.tick)
+    box = box_of_entry(model, entry)
+    received = is_received(model, state, memory, world, i, box, frame.tick)
     if frame.purpose == SEARCH:
         if received:
-            variance = received_variance(model, memory, world, i, sender, frame)
-            point = memory.inbox[world, i, sender].pose.p
+            variance = received_variance(model, memory, world, i, box, frame)
+            point = memory.inbox[world, i, box].pose.p
             set_bearing_measurement(memory, world, frame.bearings, 0, b, point, variance)
         return received
     member = index_of(memory, world, i, sender)
@@ -202,10 +205,11 @@ def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i:
         frame.mounting = mounting_of(memory, world, i)
     else:
         frame.variance += mounting_variances(model, i)[0]
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        if state.sight[world, i, target] == VISIBLE:
-            if set_measurement_of_target(model, state, memory, world, i, frame, target):
+    kept = model.kept
+    for n in range(entry_count(model, state, world, i)):
+        entry = entry_at(model, state, kept, world, i, n)
+        if state.sight[world, i, entry] == VISIBLE:
+            if set_measurement_of_target(model, state, memory, world, i, frame, entry):
                 frame.bearings += 1
     return frame
 

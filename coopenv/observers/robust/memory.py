@@ -72,6 +72,7 @@ class Member:
     """One vehicle in a belief."""
 
     vehicle: wp.int32
+    box: wp.int32  # of its messages at this tick, see `coopenv.world.nearby`
     pose: Pose
     has_twist: wp.int32
     v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
@@ -251,13 +252,14 @@ class RobustMemory:
     block_member: array("WK", wp.int32)  # scratch: the members to which they belong
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", SenderReport)
-    inbox: array("WNN", SenderReport)  # per receiver and sender
+    inbox: array("WNY", SenderReport)  # per receiver and box
+    inbox_sender: array("WNY", wp.int32)  # whose report that is, where not all are kept; -1: none
     measurement: array("WA", BearingMeasurement)
     derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
     scratch: array("WK", Scratch)
     projection: array("WAK", mat26d)  # scratch: H P, of a bearing and a member, see correction.py
     outbox_correlation: array("WNSC", Correlation)
-    correlation: array("WNNC", Correlation)  # per receiver and sender
+    correlation: array("WNYC", Correlation)  # per receiver and box
     known: array("WK", Regressor)  # scratch
     factor: array("WKK", mat66d)  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
 
@@ -305,6 +307,7 @@ def clear(memory: Any, world: int, i: int):
     never = SenderReport()
     never.tick = -1
     fill(memory.inbox[world, i], never)
+    fill(memory.inbox_sender[world, i], -1)
     fill(memory.scratch[world], Scratch())
     fill(memory.measurement[world], BearingMeasurement())
     fill_rows(memory.derivative[world], Derivative())
@@ -343,6 +346,7 @@ def _of_senders(rule: Rule) -> Rule:
 
 
 VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+BOX = Rule("a box", lambda values, fields, model: (values >= 0) & (values <= (model.kept or model.vehicles - 1)))
 WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
 
 
@@ -369,6 +373,7 @@ def robust_rules() -> dict[str, Rule]:
         **dict.fromkeys(("search.attempts", "belief.news_interval"), whole(0, 10**9)),
         "source.target": whole(-1, "agents"),
         "source.exclusions": whole(0, 10**9),
+        "inbox_sender": VEHICLE,
         "block_member": whole(0, members - 1),
         "belief.members": whole(1, members),
         "belief.first_sender": whole(1, MOUNTING + 1),
@@ -380,7 +385,9 @@ def robust_rules() -> dict[str, Rule]:
         "measurement.source": whole(-1, SOURCES - 1),
         "derivative.member": whole(-1, members - 1),
         "known.member": whole(0, members - 1),
-        **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
+        **where(
+            "belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles"), "member.box": BOX}
+        ),
         **where("belief.members", {"member.source": _of_senders(whole(1, SENDER_SLOTS))}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),

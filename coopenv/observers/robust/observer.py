@@ -81,6 +81,7 @@ from coopenv.observers.robust.search import advance_search, begin_search, postpo
 from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
+from coopenv.world.nearby import is_target
 from coopenv.world.v2x import start_covariance
 from coopenv.world.warp_internals import device_function
 
@@ -258,9 +259,12 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     memory.belief[world, i].gate_disabled = 0
     memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
     bits = wp.uint64(0)
-    for n in range(model.target_count[i]):
-        if model.targets[i, n] >= model.landmarks:
-            bits = bits | bit_of(model.targets[i, n] - model.landmarks)
+    for n in range(wp.where(model.listed == 1, model.target_count[i], model.agents)):
+        target = n
+        if model.listed == 1:
+            target = model.targets[i, n]
+        if target >= model.landmarks and target != model.landmarks + i and is_target(model, i, target):
+            bits = bits | bit_of(target - model.landmarks)
     memory.belief[world, i].depends_on = bits
 
 

@@ -204,7 +204,7 @@ def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
 
 @dataclass
 class OneAltered:
-    """Changes a message of the third vehicle that carries correlations: its covariance, or its odometry from then on."""
+    """Changes a message with correlations of the third vehicle: its covariance, or its odometry from then on."""
 
     what: str
     done: bool = False

@@ -1,0 +1,228 @@
+"""Which agents a vehicle keeps: those in range, which it may measure or receive, and earlier ones where there is room.
+
+What a vehicle has measured and received is in arrays with an entry per agent and, of messages, a box per sender. In a
+world whose model has `kept` above 0 there are so many entries only, however many agents there are. An entry then stays
+with its agent until another agent needs it; the agent that is farthest out of range makes room. In range are the agents
+that the camera, or the radio, may reach. Vehicles whose neighbours are listed keep these. All senders without a box
+share the last one, which is always empty.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import identity3
+from coopenv.estimation.outcomes import Sight
+from coopenv.world.cells import cell_at, first_in, last_of_all, next_in, window_about
+from coopenv.world.random import CAMERA_RANGE
+from coopenv.world.warp_internals import device_function
+
+NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
+
+
+@wp.func
+def entry_count(model: Any, state: Any, world: int, vehicle: int) -> int:
+    """Return how many entries there are with targets, and in worlds with `kept` with senders that are no targets."""
+    if model.kept == 0:
+        return model.target_count[vehicle]
+    return state.kept_count[world, vehicle]
+
+
+@wp.func
+def entry_at(model: Any, state: Any, kept: int, world: int, vehicle: int, n: int) -> int:
+    """Return the n-th of these entries, in the order of the agents; `kept` is that of the model, read once per loop."""
+    if kept == 0:
+        return model.targets[vehicle, n]
+    return state.kept_order[world, vehicle, n]
+
+
+@wp.func
+def agent_of(state: Any, kept: int, world: int, vehicle: int, entry: int) -> int:
+    """Return the agent of an entry; `kept` as for `entry_at`."""
+    if kept == 0:
+        return entry
+    return state.kept_agent[world, vehicle, entry]
+
+
+@wp.func
+def box_of_entry(model: Any, entry: int) -> int:
+    """Return the box of messages of an entry; below 0 for a landmark of worlds that keep all."""
+    return entry - model.before_boxes
+
+
+@device_function
+def sender_of(model: Any, state: Any, world: int, vehicle: int, box: int) -> int:
+    """Return the sender of a box; below 0: none."""
+    if model.kept == 0:
+        return box
+    if box >= model.kept:
+        return -1
+    return state.kept_agent[world, vehicle, box] - model.landmarks
+
+
+@device_function
+def kept_before(model: Any, state: Any, world: int, vehicle: int, agent: int) -> int:
+    """Return how many of the agents that a vehicle keeps have lower numbers than an agent."""
+    low = int(0)
+    high = state.kept_count[world, vehicle]
+    while low < high:
+        middle = (low + high) // 2
+        if state.kept_agent[world, vehicle, state.kept_order[world, vehicle, middle]] < agent:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@device_function
+def entry_of(model: Any, state: Any, world: int, vehicle: int, agent: int) -> int:
+    """Return the entry of an agent; -1: it is not kept."""
+    if model.kept == 0:
+        return agent
+    n = kept_before(model, state, world, vehicle, agent)
+    if n < state.kept_count[world, vehicle]:
+        entry = state.kept_order[world, vehicle, n]
+        if state.kept_agent[world, vehicle, entry] == agent:
+            return entry
+    return -1
+
+
+@device_function
+def box_of(model: Any, state: Any, world: int, vehicle: int, sender: int) -> int:
+    """Return the box of a sender; one that is not kept has the last one."""
+    if model.kept == 0:
+        return sender
+    entry = entry_of(model, state, world, vehicle, model.landmarks + sender)
+    return wp.where(entry < 0, model.kept, entry)
+
+
+@wp.func
+def is_target(model: Any, vehicle: int, agent: int) -> bool:
+    """Return whether a vehicle may measure an agent that it keeps."""
+    return model.listed == 1 or model.acyclic == 0 or agent < model.landmarks + vehicle
+
+
+@device_function
+def clear_entry(state: Any, world: int, vehicle: int, entry: int):
+    """Clear what has been measured of an agent."""
+    o = type(state.bearing[world, vehicle, entry])()
+    state.bearing[world, vehicle, entry] = o
+    state.bearing_tick[world, vehicle, entry] = -1
+    state.sight[world, vehicle, entry] = NOT_A_NEIGHBOUR
+
+
+@device_function
+def clear_box(state: Any, world: int, vehicle: int, box: int):
+    """Clear what has been received of a sender."""
+    o = type(state.inbox_position[world, vehicle, box])()
+    state.arriving[world, vehicle, box] = -1
+    state.inbox_tick[world, vehicle, box] = -1
+    state.inbox_stamp[world, vehicle, box] = -1
+    state.inbox_seen[world, vehicle, box] = -1
+    state.inbox_pose_only[world, vehicle, box] = 0
+    state.inbox_position[world, vehicle, box] = o
+    state.inbox_rotation[world, vehicle, box] = identity3(o)
+
+
+@device_function
+def clear_entries(model: Any, state: Any, world: int, vehicle: int):
+    """Clear all that a vehicle has measured and received."""
+    for entry in range(state.sight.shape[2]):
+        clear_entry(state, world, vehicle, entry)
+    for box in range(state.inbox_tick.shape[2]):
+        clear_box(state, world, vehicle, box)
+    state.crowded[world, vehicle] = 0
+    state.kept_count[world, vehicle] = wp.where(model.listed * model.kept > 0, model.target_count[vehicle], 0)
+    for entry in range(model.kept):
+        state.kept_order[world, vehicle, entry] = entry
+        state.kept_agent[world, vehicle, entry] = -1
+        if model.listed == 1:
+            state.kept_agent[world, vehicle, entry] = model.targets[vehicle, entry]
+
+
+@device_function
+def camera_reach(model: Any, state: Any, world: int, vehicle: int):
+    """Return how far from a vehicle an agent may be that its camera sees, m."""
+    camera = model.camera[vehicle]
+    place = camera.position + state.camera_shift[world, vehicle]
+    reach = camera.range * state.parameter[world, CAMERA_RANGE] + wp.length(place) + model.marker_reach
+    return reach * type(reach)(1.001)  # against rounding
+
+
+@device_function
+def beyond(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any):
+    """Return by how much an agent is out of range of a vehicle, m; `seen` is the reach of its camera."""
+    reach = seen
+    if agent >= model.landmarks:
+        reach = wp.max(reach, model.radio.range)
+    offset = state.position[world, agent] - state.position[world, model.landmarks + vehicle]
+    more = wp.length(offset) - reach
+    if state.present[world, agent] == 0:
+        more = type(more)(wp.inf)
+    return more
+
+
+@device_function
+def place_of_farthest(model: Any, state: Any, world: int, vehicle: int, seen: Any) -> int:
+    """Return the place in the order of the agent that is farthest out of range; -1: all are in range."""
+    found = int(-1)
+    most = type(seen)(0.0)
+    for n in range(model.kept):
+        agent = state.kept_agent[world, vehicle, state.kept_order[world, vehicle, n]]
+        more = beyond(model, state, world, vehicle, agent, seen)
+        if more > most:
+            found = n
+            most = more
+    return found
+
+
+@device_function
+def keep(model: Any, state: Any, world: int, vehicle: int, agent: int, seen: Any):
+    """Keep an agent that is in range; without room it is counted."""
+    if entry_of(model, state, world, vehicle, agent) >= 0:
+        return
+    count = state.kept_count[world, vehicle]
+    entry = count
+    if count == model.kept:
+        last = place_of_farthest(model, state, world, vehicle, seen)
+        if last < 0:
+            state.crowded[world, vehicle] += 1
+            return
+        entry = state.kept_order[world, vehicle, last]
+        count -= 1
+        for n in range(last, count):
+            state.kept_order[world, vehicle, n] = state.kept_order[world, vehicle, n + 1]
+        state.kept_count[world, vehicle] = count
+    at = kept_before(model, state, world, vehicle, agent)
+    for back in range(count - at):
+        n = count - back
+        state.kept_order[world, vehicle, n] = state.kept_order[world, vehicle, n - 1]
+    state.kept_order[world, vehicle, at] = entry
+    state.kept_agent[world, vehicle, entry] = agent
+    state.kept_count[world, vehicle] = count + 1
+    clear_entry(state, world, vehicle, entry)
+    clear_box(state, world, vehicle, entry)
+
+
+@device_function
+def keep_those_in_range(model: Any, state: Any, world: int, vehicle: int):
+    """Keep all agents in range that a vehicle may measure or receive; the grid is that of this tick."""
+    if model.kept == 0 or model.listed == 1:
+        return
+    own = model.landmarks + vehicle
+    state.crowded[world, vehicle] = 0
+    if state.present[world, own] == 0:
+        return
+    here = state.position[world, own]
+    seen = camera_reach(model, state, world, vehicle)
+    last = last_of_all(model)
+    x, y, columns, rows = window_about(model, here, here, wp.max(seen, model.radio.range))
+    for row in range(rows):
+        for column in range(columns):
+            agent = first_in(state, world, cell_at(model, x + column, y + row), last)
+            while agent >= 0:
+                if agent < model.agents and agent != own:
+                    if is_target(model, vehicle, agent) or model.radio.to_all == 1:
+                        if beyond(model, state, world, vehicle, agent, seen) <= seen - seen:
+                            keep(model, state, world, vehicle, agent, seen)
+                agent = next_in(state, world, agent, last)

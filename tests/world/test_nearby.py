@@ -1,0 +1,154 @@
+"""Vehicles that keep those nearby: the results of worlds that keep all, and memory that grows with the vehicles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError, ScenarioError
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario
+from coopenv.world.state import size_of, state_sizes, state_struct
+from tests.helpers.builders import constant, landmark, scenario, simulate, start, vehicle
+
+RANGE = 25.0
+
+
+def street(most: int | None, vehicles: int = 40, observer: str = "riccati", **sections: Any) -> Scenario:
+    """Return vehicles that drive fast among as many landmarks, so that many come into range and leave it."""
+    rng = np.random.default_rng(3)
+    half = 6.0 * np.sqrt(vehicles)
+    places = rng.uniform(-half, half, (2 * vehicles, 2))
+    cars = [
+        vehicle(
+            [*place, 0.5],
+            float(rng.uniform(-3, 3)),
+            body={"size": [4.0, 2.0, 1.5]},
+            marker=[0.0, 0.0, 1.0],
+            motion=constant([float(rng.uniform(0, 25)), 0, 0], [0, 0, float(rng.uniform(-0.5, 0.5))]),
+            initial_estimate={"position_offset": [0.3, 0.2, 0.0]},
+        )
+        for place in places[:vehicles].tolist()
+    ]
+    sections.setdefault("v2x", {"delay": 1, "range": 30.0})
+    return scenario(
+        cars,
+        landmarks=[landmark(f"L{i}", [*place, 2.0]) for i, place in enumerate(places[vehicles:].tolist())],
+        topology={"mode": "sensed", "acyclic": False, "most_nearby": most, **sections.pop("topology", {})},
+        camera={"model": "omnidirectional", "range": RANGE},
+        observer={"name": observer},
+        **sections,
+    )
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "cyclic": {},
+    "acyclic": {"topology": {"acyclic": True}, "v2x": {"range": 20.0}},
+    "all": {
+        "topology": {"acyclic": True},
+        "v2x": {"links": "all", "range": 35.0, "loss": 0.3, "period": 3, "delay": 2, "staleness": 0.5},
+    },
+    "faults": {
+        "faults": {"clock_offset": 0.05, "map_error": {"chance": 1.0, "offset": 0.5}},
+        "randomisation": {"camera_range": [0.7, 1.3]},
+    },
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("observer", ["riccati", pytest.param("robust", marks=pytest.mark.slow)])
+def test_results_are_those_of_all_pairs(variant: str, observer: str) -> None:
+    worlds = [start(street(most, observer=observer, **VARIANTS[variant]), 5) for most in (None, 60)]
+    everything, nearby = worlds
+    met = set()
+    for _ in range(12):
+        for world in worlds:
+            world.advance(5)
+        met |= {*nearby.view("kept_agent")[0, 0].tolist()}
+        for name in ("estimate_rotation", "estimate_position", "covariance", "gramian_22", "protection_level"):
+            assert_allclose(nearby.view(name), everything.view(name), rtol=1e-9, atol=1e-12, err_msg=name)
+        assert_array_equal(nearby.view("collided"), everything.view("collided"))
+        sight, of_all = nearby.view("sight"), everything.view("sight")
+        assert_array_equal(sight == Sight.VISIBLE, of_all == Sight.VISIBLE)
+        kept = sight != Sight.NOT_A_NEIGHBOUR
+        assert_array_equal(sight[kept], of_all[kept])
+        assert_array_equal(nearby.view("arriving"), everything.view("arriving"))
+    assert len(met) > nearby.view("kept_count")[0, 0]  # some have made room
+
+
+def test_all_in_range_are_kept_in_order() -> None:
+    world = start(street(60), 0)
+    for _ in range(10):
+        world.advance(6)
+        position, L = world.view("position")[0], world.model.landmarks
+        for i in range(world.model.vehicles):
+            distance = np.linalg.norm(position - position[L + i], axis=1)
+            in_range = {a for a in np.flatnonzero(distance < np.where(np.arange(len(distance)) < L, RANGE, 30.0))}
+            count = int(world.view("kept_count")[0, i])
+            agents = world.view("kept_agent")[0, i][world.view("kept_order")[0, i, :count]].tolist()
+            assert in_range - {L + i} <= {*agents}
+            assert agents == sorted({*agents})
+
+
+def test_too_many_in_range_are_one_line() -> None:
+    with pytest.raises(CoopenvError, match=r"^topology\.most_nearby: \d+ targets and senders are in range of vehicle_"):
+        start(street(5), 0)
+
+
+@pytest.mark.parametrize(
+    ("sections", "problem"),
+    [
+        ({"v2x": {}}, r"v2x\.range: needed with topology\.most_nearby"),
+        ({"sensing": "ideal"}, r"topology\.most_nearby: needs topology\.mode = 'sensed'"),
+        ({"topology": {"mode": "fixed"}}, r"topology\.most_nearby: needs topology\.mode = 'sensed'"),
+    ],
+)
+def test_scenarios_without_ranges_are_refused(sections: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ScenarioError, match=problem):
+        street(60, **sections)
+
+
+def test_observers_on_the_host_are_refused() -> None:
+    with pytest.raises(CoopenvError, match=r"^topology\.most_nearby: observer 'smoother' runs on the host"):
+        Engine(street(60, observer="smoother"))
+
+
+def test_saved_states_go_on_as_they_were_and_are_checked() -> None:
+    world = start(street(60), 0)
+    world.advance(6)
+    saved = world.get_state()
+    world.advance(6)
+    expected = world.get_state()
+    world.set_state(saved)
+    world.advance(6)
+    for name, values in world.get_state().items():
+        assert_array_equal(values, expected[name], err_msg=name)
+    saved["kept_agent"][0, 0, 0] = 1000
+    with pytest.raises(CoopenvError, match="'kept_agent'"):
+        world.set_state(saved)
+
+
+def test_memory_grows_with_the_vehicles() -> None:
+    sizes = []
+    for vehicles in (40, 160):
+        world = simulate(street(60, vehicles), 1)
+        sizes.append(size_of(state_struct(world.precision), state_sizes(world.model, 1)))
+    assert sizes[1] < 4.1 * sizes[0]
+
+
+def test_observations_have_a_row_for_each_that_is_kept() -> None:
+    engine = Engine(street(60), 1, "float64")
+    engine.reset([0])
+    engine.step()
+    field = engine.layout["bearing_mask"]
+    assert field.shape == (60,)
+    seen = field.values(engine.view("observation"))[0]
+    count = engine.view("kept_count")[0]
+    for i in range(len(seen)):
+        agents = np.sort(engine.view("kept_agent")[0, i][: count[i]])
+        assert_array_equal(seen[i, : count[i]] == 1.0, engine.view("sight")[0, i, agents] == Sight.VISIBLE)
+        assert not seen[i, count[i] :].any()
