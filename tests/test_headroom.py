@@ -111,7 +111,7 @@ def test_cooperation_costs_the_helpers_and_pays_for_the_fleet(environment: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", ["lighthouse"])
+@pytest.mark.parametrize("environment", ["lighthouse", "take_turns", "liar_among_us"])
 def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str) -> None:
     agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
     selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
