@@ -20,8 +20,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
 from coopenv.cli.bench import bench
-from coopenv.cli.calibrate import calibrate
-from coopenv.cli.run import export, figures, import_, record, run
+from coopenv.cli.run import calibrate, export, figures, import_, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
