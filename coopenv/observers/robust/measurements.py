@@ -13,8 +13,8 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise, position_variance
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, vec3d
+from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
-from coopenv.observers.robust.reports import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.v2x import fresh
