@@ -237,11 +237,6 @@ def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[f
     replace_text(folder / f"{name}.md", text)
 
 
-def write_index(scenarios: dict[str, Scenario], folder: Path) -> None:
-    """Write the list of environments, whose pages are in the folder."""
-    replace_text(folder / INDEX, index_text(scenarios))
-
-
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table; lines within a cell come one after the other, with semicolons between."""
     cells = ([plain("; ".join(text.splitlines())).replace("|", "\\|") for text in row] for row in (columns, *rows))

@@ -171,13 +171,16 @@ def record(given: RecordOptions) -> None:
 def check_log(out: Path, observer: str | None, scene: bool) -> None:
     """Refuse before any work a log that cannot be written. Raises CoopenvError: its path, the observer, or no SDK."""
     from coopenv.backends.mcap import check_target
-    from coopenv.runs.scenes import check_scene
+    from coopenv.observers.registry import find, named
+    from coopenv.viz.foxglove import check_installed
 
     check_target(out)
-    if scene:
-        check_scene(observer)
-    elif observer is not None:
+    if not scene and observer is not None:
         raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
+    if scene:
+        check_installed()
+    if observer is not None:
+        find(named(observer))
 
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
