@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2210, 7),
     "estimation": (1720, 8),
     "evaluation": (495, 3),
-    "observers": (11735, 47),
+    "observers": (11715, 47),
     "policies": (1570, 8),
     "runs": (2875, 11),
     "scenario": (3095, 12),
