@@ -25,10 +25,10 @@ from coopenv.base.errors import EVALUATION_SEEDS, CoopenvError
 from coopenv.base.format import in_parentheses
 from coopenv.bench.observers.changes import DIRECTION
 from coopenv.bench.observers.rows import standard_error
+from coopenv.bench.pages import table
 from coopenv.estimation.poses import Array
 from coopenv.observers.registry import find_embedded
 from coopenv.runs.console import Progress
-from coopenv.runs.page import table
 
 SCENE = "busy_intersection_tracking"
 TARGETS = {

@@ -22,11 +22,11 @@ from coopenv.base.format import in_parentheses
 from coopenv.base.installation import scenario_path
 from coopenv.bench.observers.faults import variant_of
 from coopenv.bench.observers.rows import standard_error
+from coopenv.bench.pages import table
 from coopenv.estimation.poses import Array
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.runs import record
-from coopenv.runs.page import table
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.files import parse_scenario
 

@@ -22,8 +22,8 @@ import numpy as np
 from rich.console import Console
 
 from coopenv.base.format import in_parentheses
+from coopenv.bench.pages import table
 from coopenv.runs.console import Progress
-from coopenv.runs.page import table
 
 AT = 12.0
 """s, from when on there is a fault, but for some of the map and of the scale."""

@@ -36,17 +36,7 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    _lazy, __dir__ = lazy_names(
-        __name__,
-        {
-            "coopenv.api.make": ["make_vec", "parallel_env"],
-            "coopenv.api.parallel_env": ["CooperativeLocalisationEnv"],
-            "coopenv.api.vector_env": ["CooperativeVectorEnv"],
-            "coopenv.bench.observers.comparison": ["Comparison", "compare"],
-            "coopenv.scenario": ["Scenario", "load_scenario"],
-            "coopenv.scenario.own_terms": ["register_observation", "register_reward", "register_termination"],
-        },
-    )
+    _lazy, __dir__ = lazy_names(__name__)
 
     def __getattr__(name):
         from coopenv.base.installation import version

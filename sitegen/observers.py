@@ -5,9 +5,9 @@ import re
 from collections.abc import Iterator
 from pkgutil import resolve_name
 
+from coopenv.bench.pages import bullets, table
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import ZOO, ZooEntry
-from coopenv.runs.page import bullets, table
 from sitegen.mirror import ROOT, relinked
 
 PACKAGE = "coopenv.observers"

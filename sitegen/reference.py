@@ -11,10 +11,10 @@ from pydantic.fields import FieldInfo
 from coopenv.base.installation import list_envs
 from coopenv.base.sections import Section
 from coopenv.bench.observers.rows import Row
+from coopenv.bench.pages import table
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.runs.page import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
 

@@ -85,22 +85,22 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 
 LINES_AND_FILES = {
-    ".": (130, 2),
-    "api": (3875, 19),
-    "backends": (3285, 17),
-    "base": (1400, 9),
-    "bench": (4535, 18),
-    "cars": (9110, 41),
-    "cli": (2230, 8),
+    ".": (110, 2),
+    "api": (3920, 19),
+    "backends": (3280, 17),
+    "base": (1395, 8),
+    "bench": (4665, 18),
+    "cars": (9100, 41),
+    "cli": (2210, 7),
     "estimation": (1720, 8),
-    "evaluation": (500, 3),
-    "observers": (11855, 49),
-    "policies": (1730, 10),
-    "runs": (3060, 13),
-    "scenario": (3135, 12),
+    "evaluation": (495, 3),
+    "observers": (11820, 47),
+    "policies": (1725, 10),
+    "runs": (2875, 11),
+    "scenario": (3165, 12),
     "training": (1380, 5),
-    "viz": (4500, 18),
-    "world": (4810, 19),
+    "viz": (4485, 17),
+    "world": (4885, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

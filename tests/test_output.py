@@ -234,7 +234,7 @@ sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder
 import coopenv.api.engine
 import coopenv.policies
 import coopenv.runs.demo
-import coopenv.runs.dataset
+import coopenv.runs.recorder
 import coopenv.runs.live
 from coopenv.cli import main
 

@@ -8,7 +8,7 @@ from typing import Any
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import number
-from coopenv.runs.page import table
+from coopenv.bench.pages import table
 
 BEGIN, END = "<!-- make gpu: begin -->", "<!-- make gpu: end -->"
 

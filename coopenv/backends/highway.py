@@ -120,7 +120,7 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
         if key not in defaults:
             near = suggest(key, defaults) or f"; allowed: {listed(sorted(set(defaults) - set(OWNED)), 40)}"
             raise ScenarioError(f"highway.config.{key}: unknown key{near}")
-        if not _like(value, defaults[key]):
+        if defaults[key] is not None and _kind(value) != _kind(defaults[key]):
             raise ScenarioError(
                 f"highway.config.{key}: expected a value like {shown(defaults[key])}, got {shown(value)}"
             )
@@ -150,11 +150,6 @@ def most_of_actions(scenario: Scenario) -> tuple[float, float]:
     """Return the acceleration (m/s^2) and the steering angle (rad) that an action of highway-env of 1 stands for."""
     limits = scenario.limits
     return max(of.max_acceleration for of in limits), max(of.max_steering for of in limits)
-
-
-def _like(value: Any, default: Any) -> bool:
-    """Return whether a value is of the kind of highway-env's default; where that is None anything may be meant."""
-    return default is None or _kind(value) == _kind(default)
 
 
 def _kind(value: Any) -> Any:

@@ -1,27 +1,28 @@
 """Errors, files, numbers and seeds that all other packages use, and names that are loaded at their first use."""
 
+import ast
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
-def lazy_names(
-    package: str, homes: Mapping[str, Sequence[str]]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return `__getattr__` and `__dir__` of a package whose names are loaded at their first use (PEP 562).
 
-    Args:
-        package: its name.
-        homes: module to the names that it holds.
+    They are the names that the package imports for type checkers alone, in its block `if TYPE_CHECKING`.
     """
-    module_of = {name: module for module, names in homes.items() for name in names}
     module = sys.modules[package]
+    source = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+    blocks = [node for node in source.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    module_of = {of.name: node.module for node in imports for of in node.names}
 
     def get(name: str) -> Any:
         if name not in module_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(import_module(module_of[name]), name)
+        value = getattr(import_module(str(module_of[name])), name)
         setattr(module, name, value)
         return value
 

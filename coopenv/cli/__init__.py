@@ -20,8 +20,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
 from coopenv.cli.bench import bench
-from coopenv.cli.calibrate import calibrate
-from coopenv.cli.run import export, figures, import_, record, run
+from coopenv.cli.run import calibrate, export, figures, import_, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
@@ -148,6 +147,7 @@ def page(
     worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
 ) -> None:
     """Write the pages of environments: description, picture, film, value of sensing."""
+    from coopenv.base.files import replace_text
     from coopenv.base.installation import list_envs
     from coopenv.bench import pages
     from coopenv.runs.console import Progress
@@ -175,7 +175,7 @@ def page(
                 pages.write_figures(stems[name], scenario, out, worlds, report)
             pages.write_page(name, scenario, out, report if film else None)
     if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
-        pages.write_index(shipped, out)
+        replace_text(out / pages.INDEX, pages.index_text(shipped))
     options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
 
 

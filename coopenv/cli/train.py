@@ -258,7 +258,7 @@ def dataset(given: DatasetOptions) -> None:
     from coopenv.base.installation import list_envs
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
-    from coopenv.runs.dataset import dataset_place, drive_vehicles, write_dataset
+    from coopenv.runs.recorder import dataset_place, drive_vehicles, write_dataset
 
     driver = load_policy(policy, scenario, given.seed)
     own = Path(policy.rpartition(":")[2] or policy).name

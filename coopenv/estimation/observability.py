@@ -38,7 +38,7 @@ import numpy as np
 
 from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
-from coopenv.base.npz import read_npz
+from coopenv.base.format import read_npz
 from coopenv.estimation.poses import Array, skew
 
 DEFAULT_WINDOW = 1.0

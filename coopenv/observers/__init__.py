@@ -21,25 +21,7 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
     from coopenv.observers.runner import Run, run
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "coopenv.estimation.poses": ["Coordinates"],
-            "coopenv.observers.contract": [
-                "Estimate",
-                "Gains",
-                "JointObserver",
-                "Message",
-                "Observer",
-                "Received",
-                "SensorNoise",
-                "Setup",
-                "Tick",
-            ],
-            "coopenv.observers.recording": ["Recording"],
-            "coopenv.observers.runner": ["Run", "run"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__)
 
 __all__ = [
     "Coordinates",

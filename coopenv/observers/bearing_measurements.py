@@ -159,6 +159,12 @@ def increment(tick: Tick) -> tuple[Array, Array]:
     return np.asarray(tick.rotation, float), np.asarray(tick.translation, float)
 
 
+def measured_message(tick: Tick) -> Message:
+    """Return the measurements of a tick as a message: the odometry sample and the bearings."""
+    odometry = np.concatenate([tick.angular_velocity, tick.velocity])
+    return Message(extra={"odometry": odometry, "bearings": tick.bearings[tick.valid]})
+
+
 class BearingMeasurements(NamedTuple):
     """The usable bearings of a frame."""
 

@@ -69,10 +69,6 @@ class Bound:
     orientation: Array  # (K, N) deg: sqrt(trace) of the orientation's block
     covariance: Array  # (K, N, 6, 6) left errors, rad and m
 
-    def position_rms(self, after: float = 0.0) -> Array:
-        """Return (N,) the root mean square of the position's bound from a time on, m."""
-        return np.asarray(np.sqrt(np.mean(self.position[self.t >= after] ** 2, axis=0)))
-
 
 def cramer_rao(recording: Recording, joint: bool = True) -> Bound:
     """Return the bound of a record: of its truth, visible edges, noise and initial covariance.

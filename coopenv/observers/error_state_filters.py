@@ -135,18 +135,16 @@ class MekfCovarianceUngated(MekfCovariance):
     gated = False
 
 
-class LeftInvariant(Mekf):
+class LeftInvariant(MekfCovariance):
     """Invariant filter, left error; sends covariances."""
 
     kind = INVARIANT
-    sends_covariance = True
 
 
-class RightInvariant(Mekf):
+class RightInvariant(MekfCovariance):
     """Invariant filter, right error; sends covariances."""
 
     kind = RIGHT
-    sends_covariance = True
 
 
 class IteratedEkf(MekfCovariance):
@@ -184,11 +182,10 @@ WEIGHT = 1.0 / (2.0 * SPREAD)  # weight of every sigma point but the mean
 MEAN_WEIGHT = 2.0  # weight of the mean in covariances: 3 - alpha^2. In means it is 0
 
 
-class Ukf(Mekf):
+class Ukf(MekfCovariance):
     """Unscented (sigma-point) filter; sends covariances."""
 
     kind = INVARIANT
-    sends_covariance = True
 
     def take(self, tick: Tick, measured: BearingMeasurements) -> None:
         """Correct by the bearings that pass the gate."""

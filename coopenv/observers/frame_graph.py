@@ -40,6 +40,7 @@ from coopenv.observers.bearing_measurements import (
     ahead,
     increment,
     linearised,
+    measured_message,
     moved,
     put_derivative,
 )
@@ -196,9 +197,7 @@ class GraphEstimator(ABC):
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:
         """Return the measurements of this tick, which every vehicle sends: odometry and bearings."""
-        odometry = [np.concatenate([tick.angular_velocity, tick.velocity]) for tick in ticks]
-        bearings = [tick.bearings[tick.valid] for tick in ticks]
-        return [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
+        return [measured_message(tick) for tick in ticks]
 
     def messages(self) -> list[Message]:
         """Return what each vehicle sent for this tick."""

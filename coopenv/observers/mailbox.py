@@ -129,7 +129,8 @@ class Mailbox:
         try:
             if _size(message) > MOST_CONTENTS:
                 return None
-            copied = _copied(message)
+            p, R, P = map(_floats, (message.position, message.rotation, message.covariance))
+            copied = Message(p, R, P, {name: sealed(np.array(value)) for name, value in message.extra.items()})
             check_received(copied, self.observer_init.setups[sender].planar)
         except (CoopenvError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError):
             return None
@@ -180,15 +181,8 @@ def _checked(message: Message | None) -> Message | None:
     return message
 
 
-def _copied(message: Message) -> Message:
-    """Return a read-only copy."""
-    position, rotation, covariance = map(_floats, (message.position, message.rotation, message.covariance))
-    extra = {name: sealed(np.array(value)) for name, value in message.extra.items()}
-    return Message(position, rotation, covariance, extra)
-
-
 def _floats(value: Array | None) -> Array | None:
-    """Return a copy in double precision, or in single precision if it came so."""
+    """Return a read-only copy in double precision, or in single precision if it came so."""
     if value is None:
         return None
     return sealed(np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64))

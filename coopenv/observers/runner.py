@@ -5,10 +5,8 @@ truth is only for errors. Messages are those of the observers, sent with the sce
 delayed like those of the world's radio.
 """
 
-import gc
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +23,6 @@ from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 
-OBJECTS = 100_000
-"""New objects after which Python collects garbage while observers run."""
 PLANAR_STATES = (2, 3, 4)
 """Yaw, x and y among (theta, rho): the states of NEES for vehicles on a plane, whose other errors are zero."""
 
@@ -98,15 +94,14 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     try:
         group.start(r.start_rotation, r.start_position, None if r.interference is None else r.interference.at(0))
         R[0], p[0] = r.start_rotation, r.start_position
-        with _rarely_collecting():
-            for k, i, (estimate, seconds) in _play(group, r):
-                R[k, i], p[k, i], elapsed[k, i] = estimate.rotation, estimate.position, seconds
-                if estimate.covariance is not None:
-                    P[k, i] = estimate.covariance
-                if estimate.protection_level is not None:
-                    levels[k, i] = estimate.protection_level
-                if estimate.nis is not None and estimate.nis_dof > 0:
-                    nis[k, i], nis_dof[k, i] = estimate.nis, estimate.nis_dof
+        for k, i, (estimate, seconds) in _play(group, r):
+            R[k, i], p[k, i], elapsed[k, i] = estimate.rotation, estimate.position, seconds
+            if estimate.covariance is not None:
+                P[k, i] = estimate.covariance
+            if estimate.protection_level is not None:
+                levels[k, i] = estimate.protection_level
+            if estimate.nis is not None and estimate.nis_dof > 0:
+                nis[k, i], nis_dof[k, i] = estimate.nis, estimate.nis_dof
     except ObserverError as error:  # the comparison goes on with the next observer
         failure = str(error)
     coordinates = group.coordinates or Coordinates.LEFT
@@ -132,18 +127,6 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         refused=group.refused,
         failure=failure,
     )
-
-
-@contextmanager
-def _rarely_collecting() -> Iterator[None]:
-    """Collect cyclic garbage less often: there is hardly any, and collections take 4 % of a run."""
-    youngest, *older = gc.get_threshold()
-    if youngest > 0:  # 0: no collection
-        gc.set_threshold(max(youngest, OBJECTS), *older)
-    try:
-        yield
-    finally:
-        gc.set_threshold(youngest, *older)
 
 
 def _play(group: ObserverGroup, recording: Recording) -> Iterator[tuple[int, int, TimedEstimate]]:

@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from coopenv.runs.recorder import record
     from coopenv.runs.rollouts import Rollout, rollout
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__, {"coopenv.runs.recorder": ["record"], "coopenv.runs.rollouts": ["Rollout", "rollout"]}
-    )
+    __getattr__, __dir__ = lazy_names(__name__)
 
 __all__ = ["Rollout", "record", "rollout"]

@@ -339,15 +339,6 @@ _ON_A_PLANE = "planar_robust"
 """Observer of recorded robots unless another one is asked for."""
 
 
-def check_scene(observer: str | None) -> None:
-    """Refuse before any work what `write_log` would refuse. Raises CoopenvError: no such observer, or no SDK."""
-    from coopenv.viz.foxglove import check_installed
-
-    check_installed()
-    if observer is not None:
-        find(named(observer))
-
-
 def observer_of(recording: Recording) -> str:
     """Return the name of the observer of a recording where none is asked for."""
     return _ON_A_PLANE if recording.scenario is None else recording.scenario.observer.name

@@ -4,5 +4,3 @@ FORMATS = ("png", "pdf", "svg")
 """Formats of the files that figures are written to."""
 FIGURE_NAMES = ("errors", "trajectories_2d", "trajectories_3d", "topology", "consistency", "observability")
 """Figures of a run."""
-WIDTHS = ("ieee1", "ieee2", "springer1", "springer2")
-"""Columns of journals, see `coopenv.viz.figures`."""

@@ -17,8 +17,7 @@ from pydantic import Field
 
 from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
-from coopenv.base.format import fixed, jsonable
-from coopenv.base.npz import read_npz
+from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.estimation.poses import position_covariance

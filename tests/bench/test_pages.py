@@ -17,11 +17,11 @@ from coopenv.bench.pages import (
     SETTINGS,
     environment_page,
     fingerprint,
+    index_text,
     is_measured,
     value_of_sensing_text,
 )
 from coopenv.cli import main
-from coopenv.runs.page import index_text
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
 from tests.helpers.commands import refused

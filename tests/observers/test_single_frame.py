@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Message, Received, Recording, Tick, run
 from coopenv.observers.bearing_measurements import LEFT, UncertainPose
-from coopenv.observers.centralised import Centralised
-from coopenv.observers.consistent_ekf import FirstEstimatesEkf, ObservabilityConstrainedEkf
+from coopenv.observers.centralised import Centralised, FirstEstimatesEkf, ObservabilityConstrainedEkf
 from coopenv.observers.single_frame import PerspectivePoints
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario

@@ -23,7 +23,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.policies import load_agent
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.console import legend, metrics_table, rates, remarks
-from coopenv.runs.dataset import drive_vehicles
+from coopenv.runs.recorder import drive_vehicles
 from coopenv.runs.rollouts import Ending, outcome_line, run_metrics, theory_rates, vehicle_metrics
 from tests.helpers.commands import printed, refused
 from tests.helpers.four_way import FOUR_WAY

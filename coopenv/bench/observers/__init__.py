@@ -9,13 +9,6 @@ if TYPE_CHECKING:
     from coopenv.bench.observers.rows import Row
     from coopenv.bench.observers.sources import RecordSource, find_source
 else:
-    __getattr__, __dir__ = lazy_names(
-        __name__,
-        {
-            "coopenv.bench.observers.comparison": ["Comparison", "compare"],
-            "coopenv.bench.observers.rows": ["Row"],
-            "coopenv.bench.observers.sources": ["RecordSource", "find_source"],
-        },
-    )
+    __getattr__, __dir__ = lazy_names(__name__)
 
 __all__ = ["Comparison", "RecordSource", "Row", "compare", "find_source"]

@@ -20,8 +20,8 @@ from coopenv.observers.robust.belief import append_member, apply_corrections, in
 from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec6d
+from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
-from coopenv.observers.robust.reports import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE

@@ -30,7 +30,7 @@ from coopenv.observers.robust.memory import (
     mat66f,
     vec3d,
 )
-from coopenv.observers.robust.reports import dependents, depends_on_own, marker_jacobian, own_report
+from coopenv.observers.robust.messages import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick

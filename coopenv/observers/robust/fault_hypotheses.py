@@ -25,7 +25,7 @@ from coopenv.observers.robust.memory import (
     mat66d,
     vec3d,
 )
-from coopenv.observers.robust.reports import includes
+from coopenv.observers.robust.messages import includes
 from coopenv.observers.robust.source_monitor import end_block, restart_gyro
 from coopenv.observers.robust.sources import (
     GYRO,

@@ -20,8 +20,8 @@ from coopenv.observers.robust.algebra import (
 )
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, mat66d, vec3d
+from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
-from coopenv.observers.robust.reports import is_circular
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count

@@ -65,7 +65,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
     vec6d,
 )
-from coopenv.observers.robust.messages import ROBUST_MESSAGES
+from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
 from coopenv.observers.robust.propagation import (
     begin_errors,
     calibration_noise,
@@ -76,7 +76,6 @@ from coopenv.observers.robust.propagation import (
     walk_mounting,
 )
 from coopenv.observers.robust.protection import protection_level
-from coopenv.observers.robust.reports import bit_of
 from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
 from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
