@@ -85,6 +85,10 @@ class Sample:
     value: Value
 
 
+PLAIN = VisionSettings()
+"""Tags of the usual family in frames of a global shutter."""
+
+
 def vector(value: Any, field: str, most: float) -> Array:
     """Return x, y, z as (3,), none of them larger than `most`."""
     return numbers_of((value.x, value.y, value.z), field, most)
@@ -198,7 +202,7 @@ def bearings(message: Any, calibration: Calibration | None, known: Collection[in
 
 
 def tags(
-    message: Any, calibration: Calibration, known: Collection[int] | None, vision: VisionSettings = VisionSettings()
+    message: Any, calibration: Calibration, known: Collection[int] | None, vision: VisionSettings = PLAIN
 ) -> Detections:
     """Return the bearings of tags in a frame, or of another detector's message, by the largest of each number."""
     lens = Lens(calibration.image_size, partial(rays, calibration=calibration))
@@ -285,7 +289,7 @@ def read(
     *,
     distorted: bool = True,
     known: Collection[int] | None = None,
-    vision: VisionSettings = VisionSettings(),
+    vision: VisionSettings = PLAIN,
 ) -> Value:
     """Return the value of a message.
 

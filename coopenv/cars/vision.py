@@ -180,7 +180,7 @@ def gray_of(message: Any) -> NDArray[np.uint8]:
     width, height, step = int(message.width), int(message.height), int(message.step)
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     used = width * channels * dtype.itemsize
-    if not (0 < used <= step and 0 < height and len(data) >= height * step):
+    if not (0 < used <= step and height > 0 and len(data) >= height * step):
         raise CoopenvError(f"data: {len(data)} bytes are no {width} x {height} pixels with a step of {step}")
     frame = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used]).view(dtype)
     if dtype.itemsize == 2:

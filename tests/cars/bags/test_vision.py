@@ -109,7 +109,7 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
 def test_what_is_wrong_is_one_line() -> None:
     from coopenv.cars.codec import make
 
-    with pytest.raises(ValueError, match="unknown family 'tag36h12'.*tag36h11"):
+    with pytest.raises(ValueError, match=r"unknown family 'tag36h12'.*tag36h11"):
         VisionSettings(family="tag36h12")
     with pytest.raises(CoopenvError, match="encoding: 'yuv444' is none of mono8"):
         gray_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
