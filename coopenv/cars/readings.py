@@ -247,7 +247,7 @@ def calibration_of(message: Any, rectified: bool = False) -> Calibration:
     if matrix.shape != (9,) or min(matrix[0], matrix[4]) <= 0.0 or matrix[1] != 0.0:
         raise CoopenvError("k: no camera matrix with two positive focal lengths and no skew")
     count = LENSES[message.distortion_model]
-    if given[count:].any():
+    if given[count:].any() or (given.size < count and given.size not in (0, 4)):
         raise CoopenvError(f"d: {given.size} numbers, {message.distortion_model or 'plumb_bob'} has {count}")
     bent = (*map(float, given[:count]), *[0.0] * (count - given.size))
     focal, centre = (float(matrix[0]), float(matrix[4])), (float(matrix[2]), float(matrix[5]))
