@@ -1,9 +1,9 @@
 """Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2; rays of a camera's pixels."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Self
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.profile import CarProfile, Role
+from coopenv.cars.vision import FINDERS, Lens, VisionSettings
 from coopenv.estimation.lens import undistort
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
@@ -25,6 +26,7 @@ class Detections:
     markers: tuple[int, ...]  # m numbers of markers (colour signatures)
     bearings: Array  # (m, 3) unit vectors camera -> target, optical frame, without the lens's distortion
     dropped: int = 0  # blocks that were left out: second ones of a marker, beyond the image, not finite
+    late: int = 0  # ns from the stamp to the exposure's middle
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +48,12 @@ class CarPose:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Intrinsics of a camera: plumb-bob model."""
+    """Intrinsics of a camera; the number of coefficients is that of a model of `coopenv.estimation.lens`."""
 
     image_size: tuple[int, int]
     focal_length: tuple[float, float]
     principal_point: tuple[float, float]
-    distortion: tuple[float, float, float, float, float]
+    distortion: tuple[float, ...]
 
     @classmethod
     def of(cls, camera: Any) -> Self:
@@ -81,6 +83,10 @@ class Sample:
     stamp: int  # ns, clock of the sender
     received: int  # ns, clock of the receiver
     value: Value
+
+
+PLAIN = VisionSettings()
+"""Tags of the usual family in frames of a global shutter."""
 
 
 def vector(value: Any, field: str, most: float) -> Array:
@@ -195,15 +201,25 @@ def bearings(message: Any, calibration: Calibration | None, known: Collection[in
     return _largest(found, len(table), known)
 
 
+def tags(
+    message: Any, calibration: Calibration, known: Collection[int] | None, vision: VisionSettings = PLAIN
+) -> Detections:
+    """Return the bearings of tags in a frame, or of another detector's message, by the largest of each number."""
+    lens = Lens(calibration.image_size, partial(rays, calibration=calibration))
+    found = FINDERS[message.__msgtype__](message, vision, lens)
+    late = vision.late([tag.row for tag in found if tag.row is not None], lens.image_size[1])
+    return replace(_largest([tag[:3] for tag in found], len(found), known), late=late)
+
+
 def _few(entries: Any, field: str) -> Any:
     if len(entries) > MOST:
         raise CoopenvError(f"{field}: {len(entries)} entries, a camera has at most {MOST}")
     return entries
 
 
-def _largest(found: list[tuple[int, int, Any]], total: int, known: Collection[int] | None) -> Detections:
+def _largest(found: Sequence[tuple[int, float, Any]], total: int, known: Collection[int] | None) -> Detections:
     """Return the first largest entry (marker, size, ray or None) of each known marker, of so many entries in all."""
-    best: dict[int, tuple[int, Any]] = {}
+    best: dict[int, tuple[float, Any]] = {}
     for marker, size, ray in found:
         counts = ray is not None and (known is None or marker in known)
         if counts and (marker not in best or size > best[marker][0]):
@@ -215,22 +231,31 @@ def _largest(found: list[tuple[int, int, Any]], total: int, known: Collection[in
 LONGEST_MODE = 64  # characters
 
 
-def calibration_of(message: Any) -> Calibration:
-    """Return the intrinsics of a CameraInfo; ROS 1 writes their names large."""
+LENSES = {"plumb_bob": 5, "": 5, "rational_polynomial": 8, "equidistant": 4, "fisheye": 4}
+"""Coefficients by the name of the model; missing ones are 0."""
+
+
+def calibration_of(message: Any, rectified: bool = False) -> Calibration:
+    """Return the intrinsics of a CameraInfo, of its rectified frames if asked for; ROS 1 writes their names large."""
     size = (int(message.width), int(message.height))
     if not all(0 < side <= 100_000 for side in size):
         raise CoopenvError(f"width, height: {size} is no image")
-    if message.distortion_model not in ("plumb_bob", ""):
-        raise CoopenvError(f"distortion_model: {shown(message.distortion_model)}, expected 'plumb_bob'")
+    if message.distortion_model not in LENSES:
+        raise CoopenvError(f"distortion_model: {shown(message.distortion_model)} is none of {listed(list(LENSES))}")
     matrix = numbers_of(getattr(message, "k", getattr(message, "K", ())), "k", 1e6)
     given = numbers_of(getattr(message, "d", getattr(message, "D", ())), "d", 1e6)
     if matrix.shape != (9,) or min(matrix[0], matrix[4]) <= 0.0 or matrix[1] != 0.0:
         raise CoopenvError("k: no camera matrix with two positive focal lengths and no skew")
-    if given.shape not in ((0,), (4,), (5,)):
-        raise CoopenvError(f"d: {given.size} numbers, expected k1, k2, p1, p2, k3")
-    k1, k2, p1, p2, k3 = (*map(float, given), *[0.0] * (5 - given.size))
+    count = LENSES[message.distortion_model]
+    if given[count:].any() or (given.size < count and given.size not in (0, 4)):
+        raise CoopenvError(f"d: {given.size} numbers, {message.distortion_model or 'plumb_bob'} has {count}")
+    bent = (*map(float, given[:count]), *[0.0] * (count - given.size))
     focal, centre = (float(matrix[0]), float(matrix[4])), (float(matrix[2]), float(matrix[5]))
-    return Calibration(size, focal, centre, (k1, k2, p1, p2, k3))
+    if rectified:
+        projection, bent = numbers_of(getattr(message, "p", getattr(message, "P", ())), "p", 1e6), (0.0,) * 5
+        if projection.shape == (12,) and projection.any():
+            focal, centre = (float(projection[0]), float(projection[5])), (float(projection[2]), float(projection[6]))
+    return Calibration(size, focal, centre, bent)
 
 
 def state_of(message: Any) -> CarStatus:
@@ -264,6 +289,7 @@ def read(
     *,
     distorted: bool = True,
     known: Collection[int] | None = None,
+    vision: VisionSettings = PLAIN,
 ) -> Value:
     """Return the value of a message.
 
@@ -273,6 +299,7 @@ def read(
         calibration: of the camera; needed for pixels, and for bearings that were made without removing distortion.
         distorted: whether `bearings` were made so.
         known: markers that there are; detections of others are dropped and counted (None: all count).
+        vision: what frames of a camera are of.
 
     Raises:
         CoopenvError: one line that names the role and the field: a type that the role has not, a value that is not
@@ -283,11 +310,15 @@ def read(
     if kind not in readers:
         raise CoopenvError(f"{role}: type {shown(kind)} is none of {listed(list(readers)) or 'those that are read'}")
     try:
+        if role is Role.CAMERA_INFO:
+            return calibration_of(message, vision.rectified)
         if role not in (Role.DETECTIONS, Role.BEARINGS):
             return readers[kind](message)
         needed = role is Role.DETECTIONS or distorted
         if needed and calibration is None:
             raise CoopenvError("the camera's calibration is not known")
+        if kind in FINDERS and calibration is not None:
+            return tags(message, calibration, known, vision)
         return readers[kind](message, calibration if needed else None, known)
     except CoopenvError as error:
         raise CoopenvError(f"{role}: {error}") from None
@@ -350,7 +381,7 @@ TWISTS: dict[str, Callable[[Any], Value]] = {
     "nav_msgs/msg/Odometry": lambda message: Twist(*_velocities(message.twist.twist)),  # in the child frame
 }
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
-    Role.DETECTIONS: {"pixy_camera/msg/ObjectInfoArrayStamped": detections},
+    Role.DETECTIONS: {"pixy_camera/msg/ObjectInfoArrayStamped": detections, **dict.fromkeys(FINDERS, tags)},
     Role.BEARINGS: {"pixy_camera/msg/ObjectBearingArrayStamped": bearings},
     Role.CAMERA_INFO: {"sensor_msgs/msg/CameraInfo": calibration_of},
     Role.ODOMETRY: TWISTS,

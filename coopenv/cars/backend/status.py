@@ -81,7 +81,7 @@ class StatusBoard:
         published = self.calibrations.get(car)
         for name, tolerance in TOLERANCES.items() if published is not None else ():
             a, b = getattr(published, name), getattr(used, name)
-            if (np.abs(np.subtract(a, b)) > tolerance).any():
+            if len(a) != len(b) or (np.abs(np.subtract(a, b)) > tolerance).any():
                 yield f"its camera publishes {name} = {list(a)}, the environment has {list(b)}"
 
     def happened(self, car: str) -> str:

@@ -28,7 +28,7 @@ from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
+from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
 
 NS = 1_000_000_000
@@ -106,7 +106,7 @@ def value_reader(
 
     def read_value(entry: Chosen, message: Any) -> Value:
         calibration = calibrations.get(entry.car)
-        value = read(entry.role, message, calibration, distorted=given.distorted, known=known)
+        value = read(entry.role, message, calibration, distorted=given.distorted, known=known, vision=given.vision)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
         if isinstance(value, Twist) and entry.role is Role.WHEEL and entry.car in turning:
@@ -116,7 +116,7 @@ def value_reader(
     return read_value
 
 
-def _published(files: Sequence[BagFile], chosen: Collection[Chosen]) -> dict[str, Calibration]:
+def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: TopicMap) -> dict[str, Calibration]:
     """Return the first calibration of each car that publishes one."""
     found: dict[str, Calibration] = {}
     for file in files:
@@ -125,7 +125,7 @@ def _published(files: Sequence[BagFile], chosen: Collection[Chosen]) -> dict[str
                 continue
             for _, _, decode in file.messages([entry.topic]):
                 try:
-                    value = read(Role.CAMERA_INFO, decode())
+                    value = read(Role.CAMERA_INFO, decode(), vision=given.vision)
                 except CoopenvError as error:
                     raise DataError(f"{file.path}: topic {entry.topic}: {error}") from None
                 if isinstance(value, Calibration):
@@ -201,8 +201,9 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         entry = track.chosen
         try:
             message = decode()
-            stamp = stamp_of(message) if stamped else 0
-            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, value(entry, message)))
+            stamp, found = stamp_of(message) if stamped else 0, value(entry, message)
+            stamp += found.late if stamp and isinstance(found, Detections) else 0
+            track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
@@ -322,7 +323,9 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         topics = {name: kind for file in files for name, kind in file.topics.items()}
         chosen = select(given, topics, where)
         lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
-        lenses |= _published(files, chosen)  # a calibration that a car publishes replaces the environment's
+        if given.vision.rectified:
+            lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
+        lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
         value, stamped = value_reader(given, binding, chosen, lenses), given.clocks.mode != "received"
         tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
     if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:

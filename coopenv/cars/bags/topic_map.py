@@ -12,6 +12,7 @@ from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
 from coopenv.cars.profile import AUTHORS, PREFIX, VELOCITY, Number, Positive, Role, load_profile
 from coopenv.cars.readings import READERS
+from coopenv.cars.vision import VisionSettings
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
@@ -43,7 +44,9 @@ class Topics(Section):
     """Topics of one car, in place of those of the naming scheme."""
 
     detections: TopicName | None = None
-    """pixy_camera/ObjectInfoArrayStamped: blocks in pixels."""
+    """pixy_camera/ObjectInfoArrayStamped: blocks in pixels; sensor_msgs/Image or CompressedImage: frames with tags;
+    apriltag_msgs/AprilTagDetectionArray, vision_msgs/Detection2DArray, aruco_msgs/MarkerArray, or the authors'
+    ArucoArray."""
     bearings: TopicName | None = None
     """pixy_camera/ObjectBearingArrayStamped: unit vectors from the target to the camera, optical frame."""
     camera_info: TopicName | None = None
@@ -146,6 +149,7 @@ class TopicMap(Section):
     """Time used after that, s (default: all)."""
     clocks: ClockSettings = ClockSettings()
     frames: PositionFrames = PositionFrames()
+    vision: VisionSettings = VisionSettings()
     path: Path = Field(default=Path("topics.toml"), exclude=True)
     """The file; set by `load_map`."""
 

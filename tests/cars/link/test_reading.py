@@ -197,7 +197,7 @@ WRONG: list[tuple[Role, Any, str]] = [
     (Role.TRUTH, lambda: imu(), "truth: type 'sensor_msgs/msg/Imu' is none of geometry_msgs/msg/PoseStamped"),
     (Role.ESTIMATE, lambda: make(ESTIMATE, pose=pose(covariance=-np.eye(6))), "estimate: pose.covariance: "),
     (Role.DETECTIONS, lambda: blocks((1, 5, 5, 1, 1)), "detections: the camera's calibration is not known"),
-    (Role.CAMERA_INFO, lambda: camera_info(2, distortion_model="equidistant"), "camera_info: distortion_model: "),
+    (Role.CAMERA_INFO, lambda: camera_info(2, distortion_model="wide"), "camera_info: distortion_model: "),
     (Role.CAMERA_INFO, lambda: camera_info(2, d=[1.0, 2.0]), "camera_info: d: 2 numbers"),
     (Role.CAMERA_INFO, lambda: camera_info(1, k=np.zeros(9)), "camera_info: k: "),
     (Role.BATTERY, lambda: battery(40.0), "battery: percentage: 40 "),

@@ -1,0 +1,117 @@
+"""Bags with images: rendered tags are found, imported as bearings, and estimated with."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coopenv import CoopenvError
+from coopenv.cars.bags import Bag
+from coopenv.cars.fake.frames import FrameRenderer, PlacedTag
+from coopenv.cars.readings import Calibration, rays
+from coopenv.cars.vision import Lens, VisionSettings, find_tags, gray_of
+from coopenv.estimation.lens import distort, undistort
+from coopenv.observers import run
+from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA
+from tests.helpers import bags
+
+cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
+
+LENSES = {
+    "plumb_bob": (-0.30, 0.10, 0.002, 0.0006, 0.0),
+    "rational": (0.3, -0.1, 0.001, -0.0007, 0.02, 0.6, 0.05, 0.003),
+    "fisheye": (-0.03, 0.01, -0.004, 0.001),
+}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_are_those_of_opencv(name: str) -> None:
+    flat, d = np.random.default_rng(0).uniform(-0.8, 0.8, (200, 2)), np.array(LENSES[name])
+    points = np.concatenate([flat, np.ones((200, 1))], axis=-1)[:, None]
+    project = cv2.fisheye.projectPoints if len(d) == 4 else cv2.projectPoints
+    expected = project(points, np.zeros(3), np.zeros(3), np.eye(3), d)[0].reshape(-1, 2)
+    np.testing.assert_allclose(distort(flat, LENSES[name]), expected, atol=1e-12)
+    found, there = undistort(expected, LENSES[name])
+    assert there.all()
+    np.testing.assert_allclose(found, flat, atol=1e-9)
+
+
+@pytest.mark.parametrize("family", ["tag36h11", "tag16h5", "DICT_4X4_50", "DICT_6X6_250"])
+@pytest.mark.parametrize("name", LENSES)
+def test_bearings_of_oblique_tags(name: str, family: str) -> None:
+    calibration = Calibration((640, 480), (450.0, 455.0), (322.3, 236.1), LENSES[name])
+    lens = Lens(calibration.image_size, partial(rays, calibration=calibration))
+    renderer, rng = FrameRenderer(calibration, family), np.random.default_rng(1)
+    errors, placed = [], 0
+    for k in range(5):
+        tags = [tag_at(np.array([x, y, 1.0]) * rng.uniform(0.6, 2.0), n, rng) for n, (x, y) in enumerate(PLACES)]
+        found = {
+            tag.number: tag.ray for tag in find_tags(renderer.render(tags, blur=0.5, noise=2.0, seed=k), family, lens)
+        }
+        placed += len(tags)
+        for tag in tags:
+            if (ray := found.get(tag.number)) is not None:
+                errors.append(np.linalg.norm(ray - tag.place / np.linalg.norm(tag.place)))
+    assert len(errors) >= 0.9 * placed
+    assert np.degrees(max(errors)) < 0.1
+
+
+PLACES = ((-0.42, -0.28), (0.42, -0.28), (-0.42, 0.28), (0.42, 0.28))
+
+
+def tag_at(place: np.ndarray, number: int, rng: np.random.Generator) -> PlacedTag:
+    """Return a tag that is turned by up to 60 degrees away from the camera."""
+    facing = Rotation.align_vectors([place / np.linalg.norm(place)], [[0.0, 0.0, 1.0]])[0]
+    tilt = Rotation.from_rotvec(rng.uniform(0.0, np.pi / 3) * np.array([*unit(rng.normal(size=2)), 0.0]))
+    return PlacedTag(number, (facing * tilt).as_matrix(), place, 0.16)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v)
+
+
+def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
+    drive, camera = bags.drive(), load_scenario("crossing_path").cameras[0]
+    calibration = Calibration(camera.image_size, camera.focal_length, camera.principal_point, bags.DISTORTION)
+    renderer, C = FrameRenderer(calibration, "tag36h11"), ROTATION_OF_CAMERA["forward"]
+    given = [m for m in bags.messages(drive) if m.topic != bags.AUTHORS["blocks"]]
+    width, height = camera.image_size
+    for k in range(drive.ticks):
+        R, p = drive.truth.rotation[k, 0], drive.truth.position[k, 0]
+        tags = []
+        for target in range(4):
+            place = C.T @ (R.T @ (drive.landmarks[k, target] - p) - np.array(camera.position))
+            across = unit(np.cross([0.0, 1.0, 0.0], place))  # upright, and facing the camera
+            tags.append(
+                PlacedTag(
+                    bags.NUMBERS[target], np.stack([across, [0, 1, 0], np.cross(across, [0, 1, 0])], -1), place, 0.12
+                )
+            )
+        frame, t = renderer.render(tags, noise=2.0, seed=k), round(k * 1e9 * drive.dt)
+        fields = {"width": width, "height": height, "step": width, "encoding": "mono8", "data": frame.ravel()}
+        given.append(bags.Message("/camera/image_raw", "sensor_msgs/msg/Image", t, t, fields))
+    text = bags.MAP.replace("agent = 8\n", 'agent = 8\n[cars.topics]\ndetections = "/camera/image_raw"\n')
+    (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
+    bag = Bag([bags.write(tmp_path / "mcap", given, "mcap")], tmp_path / "topics.toml")
+    recording = record(bag)
+    assert recording.visible[:, 0, :4].any(axis=0).all()
+    result = run("riccati", recording)
+    assert not result.failure
+    assert result.position_rmse(2.8)[0] < 0.05
+
+
+def test_what_is_wrong_is_one_line() -> None:
+    from coopenv.cars.codec import make
+
+    with pytest.raises(ValueError, match=r"unknown family 'tag36h12'.*tag36h11"):
+        VisionSettings(family="tag36h12")
+    with pytest.raises(CoopenvError, match="encoding: 'yuv444' is none of mono8"):
+        gray_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
+    with pytest.raises(CoopenvError, match="no image that OpenCV reads"):
+        gray_of(make("sensor_msgs/msg/CompressedImage", format="jpeg", data=[1, 2, 3]))
