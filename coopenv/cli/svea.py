@@ -192,8 +192,9 @@ def health(
             raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}{hint}")
         refused = sum(int(count) for count in status.counts)
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
-        (after, way), v = fleet.safety.stopping(fleet.limits.speed), fleet.limits.speed
-        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration")
+        v, brake = fleet.limits.speed, fleet.profile.command.brake
+        (after, way), by = fleet.safety.stopping(v, brake), "braking" if brake else "rolling"
+        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m {by}, with safety.deceleration")
         if fleet.network.kind != "zenoh":
             return
         foreign = _count(status, FOREIGN)
