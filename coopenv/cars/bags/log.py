@@ -26,7 +26,8 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
-from coopenv.cars.codec import stamp_of
+from coopenv.cars.codec import encode, stamp_of
+from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Calibration, CarPose, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
@@ -106,6 +107,8 @@ def value_reader(
 
     def read_value(entry: Chosen, message: Any) -> Value:
         calibration = calibrations.get(entry.car)
+        if entry.role is Role.MANUAL:
+            return read_drive(encode(message), binding.profile.command)
         value = read(entry.role, message, calibration, distorted=given.distorted, known=known)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
@@ -303,6 +306,8 @@ class BagLog:
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
     added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
     """By car and role: the topic, and s that were added to its stamps."""
+    sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
+    """By car and role, the samples with unchanged times."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -345,11 +350,15 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
+    sent = {
+        (track.chosen.car, track.chosen.role): tuple(sorted(track.entries, key=lambda entry: entry.stamp))
+        for track in reversed(tracks)
+    }
     for track in tracks:
         shift, topic = clocks.shifts.get(track.source), track.chosen.topic
         moved = moves.get(topic, 0) + (shift.added if shift else 0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved / NS))
-    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added)
+    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added, sent)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

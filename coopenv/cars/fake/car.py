@@ -141,7 +141,7 @@ class Fake:
     @property
     def next(self) -> int:
         """When something is due next, steady clock, ns."""
-        return self._schedule.next
+        return int(min(self._schedule.next, self._wire.next))
 
     def add_fault(self, fault: Fault) -> None:
         """Let a fault happen, its start counted from now."""

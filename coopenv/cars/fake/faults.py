@@ -34,6 +34,10 @@ class FakeSettings(Section):
     """Steering angle when straight on is commanded, rad, left is positive."""
     deceleration: Positive | None = None
     """Of a car that is faster than commanded, m/s^2 (default: the environment's acceleration)."""
+    wheel_scale: Number | None = None
+    """Share by which wheels measure too much (default: drawn as the environment states)."""
+    gyro_bias: Number | None = None
+    """Bias of the turn rate, rad/s (default: likewise)."""
     wheel_rate: Positive = 50.0
     """Velocities of the wheels per second."""
     imu_rate: Positive = 100.0
@@ -149,6 +153,11 @@ class Wire:
     def close(self) -> None:
         """Forget what is under way."""
         self._late = PriorityQueue()
+
+    @property
+    def next(self) -> float:
+        """When the next late message is due, ns; inf: none is under way."""
+        return self._late.queue[0][0] if self._late.queue else float("inf")
 
     def flush(self) -> None:
         """Pass on what has been under way for long enough."""

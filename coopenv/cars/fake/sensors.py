@@ -67,6 +67,7 @@ class CarSensors:
     ) -> None:
         """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
         self._world, self._publisher, self._differential = world, publisher, differential
+        self._settings = settings
         noise = world.scenario.noises[world.vehicle]
         self._wheel_std = deviation(noise.velocity, noise, settings.wheel_rate)  # m/s, of a sample
         self._wheel_turn_std = deviation(noise.angular_velocity, noise, settings.wheel_rate)
@@ -90,7 +91,8 @@ class CarSensors:
     def _wheel(self, due: int, stamp: int) -> None:
         velocity, turn = self._world.twist
         slip = self._world.view("slip")[0, self._world.vehicle]
-        scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
+        drawn, fixed = self._world.view("odometry_scale")[0, self._world.vehicle], self._settings.wheel_scale
+        scale = (1.0 + (drawn if fixed is None else fixed)) * (1.0 + slip[0])
         self._dead_reckon(due)
         noise = self._rng.normal(size=2) * self._factor * (self._wheel_std, self._wheel_turn_std)
         self._speed = float(velocity[0] * scale * math.cos(slip[1]) + noise[0])
@@ -101,7 +103,9 @@ class CarSensors:
 
     def _imu(self, due: int, stamp: int) -> None:
         """Publish turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
-        bias = self._world.view("gyro_bias")[0, self._world.vehicle]
+        bias = self._world.view("gyro_bias")[0, self._world.vehicle].copy()
+        if self._settings.gyro_bias is not None:
+            bias[2] = self._settings.gyro_bias
         turn = self._world.twist[1] + bias + self._rng.normal(size=3) * self._factor * self._gyro_std
         self._dead_reckon(due)
         self._turn_rate = float(turn[2])
