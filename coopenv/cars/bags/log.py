@@ -23,7 +23,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
+from coopenv.cars.bags.clocks import Delay, Leads, delay_of, jumps, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import encode, stamp_of
@@ -156,16 +156,21 @@ class Track:
     entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
+    jumps: list[tuple[int, int]] = field(default_factory=list)  # first message after each, and ns that were added
     outlying: int = 0  # messages that were dropped for their stamps
     delay: Delay | None = None  # None: no message with a stamp
     source: str = ""  # whose clock makes the stamps
 
-    def drop_outlying(self) -> None:
-        """Drop messages with wrong stamps, and measure the delay of the others."""
+    def clean_stamps(self) -> None:
+        """Remove jumps of the clock, drop messages with wrong stamps, and measure the delay of the others."""
         stamps, received = (
             np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
         )
         given = stamps != 0
+        self.jumps = list(jumps(stamps[given], received[given]).items())
+        for k, behind in self.jumps:
+            stamps[np.flatnonzero(given)[k:]] += behind
+        self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
         wrong = np.zeros(len(given), bool)
         if given.any():
             wrong[given] = outlying(stamps[given], received[given])
@@ -211,7 +216,7 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.drop_outlying()
+        track.clean_stamps()
     return list(tracks.values())
 
 
@@ -389,8 +394,11 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
     for track in tracks:
         total = track.refused.total() + len(track.entries) + track.outlying
         if track.delay is not None and track.delay.jump:
-            jump = f"its clock jumps by {track.delay.jump / NS:.2g} s"
+            jump = f"its delay changes by {track.delay.jump / NS:.2g} s"
             yield f'topic {track.chosen.topic}: {jump}; clocks.mode = "received" needs no stamps'
+        if track.jumps:
+            sizes = listed([f"{-behind / NS:+.3f}" for _, behind in track.jumps])
+            yield f"topic {track.chosen.topic}: its clock jumps by {sizes} s, which was removed"
         if track.outlying:
             yield f"topic {track.chosen.topic}: {track.outlying} of {total} messages left out: wrong stamps"
         if track.refused:
