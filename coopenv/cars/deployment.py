@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated
+from coopenv.cars.fake.faults import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.faults import FakeSettings
 from coopenv.cars.profile import (
     SVEA,
@@ -309,7 +310,7 @@ class Deployment(Section):
     security: Security = Security()
     fakes: bool = False
     """Whether the cars are fakes, which are moved to the start of each episode."""
-    fake: FakeSettings = Field(default=FakeSettings(), exclude=True)  # matters in the fakes' processes alone
+    fake: FakeSettings = Field(default=DEFAULT_FAKE, exclude=True)  # matters in the fakes' processes alone
     identified: str | None = Field(default=None, exclude=True)
     """File that `coopenv identify` has written (relative to this file): its overrides and its table `fake` replace
     those of this file."""

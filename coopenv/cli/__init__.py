@@ -116,7 +116,22 @@ def schema(out: options.TextFile = None) -> None:
     options.write_text(schema_text(), out)
 
 
-for command in (run, figures, export, record, import_, calibrate, identify, dataset, train, evaluate, watch, play, view, film):
+for command in (
+    run,
+    figures,
+    export,
+    record,
+    import_,
+    calibrate,
+    identify,
+    dataset,
+    train,
+    evaluate,
+    watch,
+    play,
+    view,
+    film,
+):
     app.command(command.__name__.rstrip("_"))(command)
 
 

@@ -193,8 +193,8 @@ def health(
         refused = sum(int(count) for count in status.counts)
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
         v, brake = fleet.limits.speed, fleet.profile.command.brake
-        (after, way), by = fleet.safety.stopping(v, brake), "braking" if brake else "rolling"
-        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m {by}, with safety.deceleration")
+        (after, way), by = fleet.safety.stopping(v, brake), " braking" if brake else ""
+        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m{by}, with safety.deceleration")
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return

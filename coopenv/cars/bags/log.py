@@ -161,13 +161,13 @@ class Track:
     delay: Delay | None = None  # None: no message with a stamp
     source: str = ""  # whose clock makes the stamps
 
-    def clean_stamps(self) -> None:
-        """Remove jumps of the clock, drop messages with wrong stamps, and measure the delay of the others."""
+    def clean_stamps(self, mode: str) -> None:
+        """Drop messages with wrong stamps, after jumps of the clock if a mode removes them; measure the delay."""
         stamps, received = (
             np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
         )
         given = stamps != 0
-        self.jumps = list(jumps(stamps[given], received[given]).items())
+        self.jumps = list(jumps(stamps[given], received[given]).items()) if mode == "auto" else []
         for k, behind in self.jumps:
             stamps[np.flatnonzero(given)[k:]] += behind
         self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
@@ -200,8 +200,8 @@ class Track:
 APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
-def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, stamped: bool) -> list[Track]:
-    """Return what a file of that number has on the chosen topics; `stamped`: whether stamps count."""
+def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, mode: str) -> list[Track]:
+    """Return what a file of that number has on the chosen topics; `mode` of the map's clocks."""
     wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
     tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
     for topic, received, decode in file.messages(tracks):
@@ -209,14 +209,14 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         entry = track.chosen
         try:
             message = decode()
-            stamp = stamp_of(message) if stamped else 0
+            stamp = 0 if mode == "received" else stamp_of(message)
             track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, value(entry, message)))
         except CoopenvError as error:
             track.refused[str(error)] += 1
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.clean_stamps()
+        track.clean_stamps(mode)
     return list(tracks.values())
 
 
@@ -333,20 +333,20 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         chosen = select(given, topics, where)
         lenses = {name: Calibration.of(binding.scenario.cameras[vehicle]) for name, vehicle in binding.cars.items()}
         lenses |= _published(files, chosen)  # a calibration that a car publishes replaces the environment's
-        value, stamped = value_reader(given, binding, chosen, lenses), given.clocks.mode != "received"
-        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
+        value, mode = value_reader(given, binding, chosen, lenses), given.clocks.mode
+        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, mode)]
     if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:
         known = listed(sorted(entry.topic for entry in chosen))
         raise DataError(f"{given.path.name}: clocks.offsets: {odd[0]} is none of the topics that are read: {known}")
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
-    tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
+    tolerance = given.clocks.tolerance * NS if mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
     delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
     drifts = {track.chosen.topic: drift for track in tracks if (drift := track.remove_drift(tolerance))}
     clocks = reconcile(delays, tolerance, stated)
     samples = _samples(tracks, clocks, {})
-    leads = leads_of(samples, chosen, binding) if stamped else {}
+    leads = leads_of(samples, chosen, binding) if mode != "received" else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)

@@ -40,6 +40,7 @@ LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
 LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of odometry noise
 WINDOW = 6.0  # s of sightings from which a first pose is found
 HEADINGS = 72  # that are tried for it
+LATE = np.arange(-0.5, 0.51, 0.05)  # s, offsets of motion capture that are tried
 
 
 class Kind(NamedTuple):
@@ -89,8 +90,9 @@ class Path(NamedTuple):
         moved = np.interp(end, self.time, self.place) - np.interp(begin, self.time, self.place)
         turned = np.interp(end, self.time, self.yaw) - yaw
         if late:
-            turn, speed = (np.interp(end + 0.5 * late, self.time, rate) for rate in (self.turn, self.speed))
-            moved, turned = moved + late * speed * np.exp(1j * (yaw + turned + 0.5 * late * turn)), turned + late * turn
+            turn = late * np.interp(end + 0.5 * late, self.time, self.turn)
+            speed = np.interp(end + 0.5 * late, self.time, self.speed)
+            moved, turned = moved + late * speed * np.exp(1j * (yaw + turned + 0.5 * turn)), turned + turn
         return np.exp(-1j * yaw) * moved, turned
 
 
@@ -175,7 +177,7 @@ class Batch:
     def residuals(self, c: int, x: Array, pose: Array, near: Array | None = None) -> tuple[Array, Array, Array]:
         """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad.
 
-        `near`: constants whose offsets of camera and motion capture assign keyframes, and from which they act (None: x).
+        `near`: constants by whose offsets keyframes are assigned, and from which offsets act (None: x).
         """
         near = x if near is None else near
         car, own, start, keys = self.cars[c], x[self.own(c)], near[self.own(c)], self.keys[c]
@@ -365,17 +367,22 @@ class Batch:
         return Fit(x, tuple(poses), self.scales(x, poses), free)
 
     def misfit(self, labels: NDArray[np.int64]) -> float:
-        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places."""
+        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places.
+
+        Motion capture counts at the offset of its stamps at which they fit best.
+        """
         total = 0.0
         for c, car in enumerate(self.cars):
             if not self.truth[c]:
                 total += self.resected(c, labels)[1]
                 continue
-            at, yaw = np.interp(car.time, car.truth_time, car.truth), np.unwrap(car.truth_yaw)
-            yaw, point = np.interp(car.time, car.truth_time, yaw), self.places[labels[car.target]]
-            flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
-            to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
-            total += _misfit(car.ray @ car.mounting.T, to)
+            point, unit, found = self.places[labels[car.target]], car.ray @ car.mounting.T, []
+            for time in car.time - LATE[:, None]:
+                at, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
+                flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
+                to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
+                found.append(_misfit(unit, to))
+            total += min(found)
         return total
 
     def resected(self, c: int, labels: NDArray[np.int64]) -> tuple[Array, float]:

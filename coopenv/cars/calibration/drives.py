@@ -71,7 +71,7 @@ class Drive:
     scenario: Scenario
 
 
-def averaged(values: NDArray[Any], period: float) -> NDArray[Any]:
+def averaged(values: NDArray[Any], period: float) -> Any:
     """Return values at a regular period, s, as means over `SMOOTH`."""
     return uniform_filter1d(values, max(1, round(SMOOTH / period)), mode="nearest")
 

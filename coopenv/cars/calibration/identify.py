@@ -12,7 +12,7 @@ from coopenv.cars.calibration.batch import deviation, stated_rate
 from coopenv.cars.calibration.drives import tracks_of
 from coopenv.cars.calibration.findings import Row, constants
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
-from coopenv.cars.fake.faults import FakeSettings
+from coopenv.cars.fake.faults import USUAL, FakeSettings
 from coopenv.cars.fake.replay import Sent, replay
 from coopenv.cars.profile import MotionCommand, Role
 from coopenv.cars.readings import CarPose, Detections, Sample
@@ -56,9 +56,11 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
     Raises:
         DataError: the bag has no commands of the car, or too few.
     """
-    sent = {name: {role: found for (of, role), found in bag.log.sent.items() if of == name} for name in bag.binding.cars}
+    sent = {
+        name: {role: found for (of, role), found in bag.log.sent.items() if of == name} for name in bag.binding.cars
+    }
     if car is None:
-        car = next((name for name in sent if Role.MANUAL in sent[name] or Role.COMMAND in sent[name]), [*sent][0])
+        car = next((name for name in sent if Role.MANUAL in sent[name] or Role.COMMAND in sent[name]), next(iter(sent)))
     check_one_of("unknown car", car, sent, DataError)
     samples = [s for s in bag.log.samples if s.car == car]
     vehicle, profile = bag.binding.cars[car], bag.binding.profile
@@ -67,9 +69,9 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
     given = np.array([_given(limits, kind.name) for kind in KINDS])
     found = constants_of(response, given, limits.dead_band)
     rows = []
-    for kind, old, value, error in zip(KINDS, given, found.x, found.error, strict=True):
-        known = 0.0 < error < kind.prior / np.sqrt(2.0)
-        rows.append(Row(kind.name, kind.unit, old, value if known else old, error, "" if known else UNKNOWN))
+    for kind, old, value, error, beyond in zip(KINDS, given, found.x, found.error, found.beyond, strict=True):
+        finding = BEYOND if beyond else "" if 0.0 < error < kind.prior / np.sqrt(2.0) else UNKNOWN
+        rows.append(Row(kind.name, kind.unit, old, old if finding == UNKNOWN else value, error, finding))
     low, high = found.dead
     rows.append(Row(DEAD_BAND, "m/s", limits.dead_band, (low + high) / 2, (high - low) / np.sqrt(12.0), ""))
     rows += [*_noise(bag, vehicle, response, found.rest), *_links(sent[car], bag, vehicle)]
@@ -78,6 +80,7 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
 
 
 NOISES = "velocity", "angular_velocity"
+BEYOND = "not reached: at least this"
 UNKNOWN = "not determined by this drive"
 
 
@@ -86,7 +89,7 @@ def _given(limits: Any, name: str) -> float:
     if table == "dynamics":
         return float(getattr(limits, name))
     by_the_environment = {"latency": limits.latency, "deceleration": limits.max_acceleration}
-    return float(by_the_environment.get(name, getattr(FakeSettings(), name, None) or 0.0))
+    return float(by_the_environment.get(name, getattr(USUAL, name) or 0.0))
 
 
 def _level(name: str, unit: str, given: float, measure: Callable[[Array], float], values: Array) -> Row:
@@ -105,7 +108,7 @@ def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) 
 
 def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
     """Yield rates, jitter, loss and delay of the sensors' messages, and noise and misses of the camera."""
-    usual, camera = FakeSettings(), bag.scenario.cameras[vehicle]
+    usual, camera = USUAL, bag.scenario.cameras[vehicle]
     steps, delays = [], []
     for role in SENSORS:
         stamp, received = _times(sent.get(role, ()))
@@ -127,7 +130,9 @@ def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
         rounding = float(camera.quantise) / 12.0 / camera.focal_length[0] ** 2
         scale = bag.scenario.noises[vehicle].bearing.scale
         measure = lambda part: float(np.sqrt(max((part**2).mean() / 6.0 - rounding, 0.0)))  # noqa: E731
-        yield _level("noise.bearing.scale", "rad", scale, measure, bend[np.abs(bend) < CUT * np.quantile(abs(bend), 0.9)])
+        yield _level(
+            "noise.bearing.scale", "rad", scale, measure, bend[np.abs(bend) < CUT * np.quantile(abs(bend), 0.9)]
+        )
         yield _level("camera.miss_probability", "", camera.miss_probability, lambda part: float(part.mean()), missed)
 
 
@@ -148,7 +153,9 @@ def _sightings(sent: Sent) -> tuple[Array, Array]:
     """Return second differences (n,) of azimuths over three frames, rad, and whether the middle one is missed (m,)."""
     frames = next((sent[role] for role in SENSORS[2:] if sent.get(role)), ())
     time = _times(frames)[0]
-    seen = [dict(zip(s.value.markers, s.value.bearings, strict=True)) for s in frames if isinstance(s.value, Detections)]
+    seen = [
+        dict(zip(s.value.markers, s.value.bearings, strict=True)) for s in frames if isinstance(s.value, Detections)
+    ]
     bend, missed = [], []
     for k in range(1, len(time) - 1):
         if time[k + 1] - time[k - 1] < 3.0 * np.median(np.diff(time)):
@@ -182,9 +189,13 @@ def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Se
     """Yield how far fakes with the same commands are from the bag."""
     end = drives[0].stamp + round(COMPARED * 1e9)
     commands = [(s.stamp, s.value) for s in drives if s.stamp < end and isinstance(s.value, MotionCommand)]
-    start = next((s.value for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp), None)
+    start = next(
+        (s.value for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp), None
+    )
     shift = {role: round(bag.log.added[car, role][1] * 1e9) for role in sent}
-    inside = {role: [s for s in sent[role] if drives[0].stamp <= s.stamp + shift[role] < commands[-1][0]] for role in sent}
+    inside = {
+        role: [s for s in sent[role] if drives[0].stamp <= s.stamp + shift[role] < commands[-1][0]] for role in sent
+    }
     overrides, fake = tables(rows)
     scenario = load_scenario(bag.map.environment_path, {**bag.changes, **overrides})
     identified = replace(bag.binding, scenario=scenario)
@@ -192,7 +203,7 @@ def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Se
     fakes = [
         {name: value for name, value in _quantities(replay(binding, car, commands, settings, seed, pose))}
         for binding, settings, seed in (
-            (bag.binding, FakeSettings(), 0),
+            (bag.binding, USUAL, 0),
             (identified, FakeSettings(**fake), 0),
             (identified, FakeSettings(**fake), 1),
         )
@@ -213,7 +224,7 @@ def tables(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
 def toml_text(result: Identified) -> str:
     """Return overrides, settings of the fake, and all constants with their standard errors as TOML."""
     overrides, fake = tables(result.rows)
-    lines = [f"# Written by coopenv identify. Key `identified` of a deployment file uses [overrides] and [fake].", ""]
+    lines = ["# Written by coopenv identify. Key `identified` of a deployment file uses [overrides] and [fake].", ""]
     lines += ["[overrides]", *(f'"{key}" = {value}' for key, value in overrides.items())]
     lines += ["", "[fake]", *(f"{key} = {value}" for key, value in fake.items())]
     return "\n".join([*lines, *constants(result.rows)]) + "\n"

@@ -15,16 +15,17 @@ from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
 from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, STRETCH, Kind, deviation, sandwich
-from coopenv.estimation.poses import Array
-from coopenv.world.dynamics import first_order_lag
-from coopenv.world.launch import kernel, launch
+from coopenv.estimation.poses import Array, Mask
+from coopenv.world.dynamics import follow_commands
+from coopenv.world.launch import kernel, launch, start_warp
 
-GRID = 0.01  # s, of the model
+GRID = 0.01  # s, longest step of the model
 INTERVAL = 0.2  # s over which motion capture gives a speed
 SETTLED = 1.0  # s after which commands before the bag no longer matter
 LEAST_SECONDS = 10.0  # of commands
 TRIED = 100  # dead bands in one evaluation
 PASSES = 4  # of fit, weights and dead band
+REACHED = 4.5  # cost by which a limit is better than none: three standard deviations
 SURE = 2.0  # cost by which a dead band is worse than the best: two standard deviations
 
 KINDS = (
@@ -45,27 +46,8 @@ KINDS = (
 LIMITS = slice(4, 9)
 SIGNED = ("fake.steering_offset", "fake.gyro_bias", "fake.wheel_scale")
 DEAD_BAND = "dynamics.dead_band"
-
-
-def follow_all(
-    wanted: wp.array3d(dtype=wp.float64),
-    lags: wp.array2d(dtype=wp.float64),
-    start: wp.float64,
-    dt: wp.float64,
-    reached: wp.array3d(dtype=wp.float64),
-):
-    """Follow wanted speeds and steering angles (P, T, 2); lags (P, 6): s of both, rates up, down, of steering; m/s."""
-    p = wp.tid()
-    speed = start
-    steering = wp.float64(0.0)
-    for k in range(wanted.shape[1]):
-        rate = lags[p, 2]
-        if wp.abs(wanted[p, k, 0]) < wp.abs(speed):
-            rate = lags[p, 3]
-        speed = wp.clamp(first_order_lag(speed, wanted[p, k, 0], dt, lags[p, 0], rate), -lags[p, 5], lags[p, 5])
-        steering = first_order_lag(steering, wanted[p, k, 1], dt, lags[p, 1], lags[p, 4])
-        reached[p, k, 0] = speed
-        reached[p, k, 1] = steering
+PRIOR, STEPS = (np.array([getattr(kind, name) for kind in KINDS]) for name in ("prior", "step"))
+LEAST = np.array([-np.inf if kind.name in SIGNED else 1e-3 for kind in KINDS])
 
 
 class Response:
@@ -73,6 +55,7 @@ class Response:
 
     def __init__(self, tracks: Mapping[str, Any], wheelbase: float, timeout: float, where: str) -> None:
         """Take tracks as of `tracks_of`, m, and s after which a command no longer counts. Raises DataError."""
+        start_warp()
         self._tracks, self._wheelbase = tracks, wheelbase
         time = tracks["command_time"]
         ends = [tracks[name][-1] if len(tracks[name]) else 0.0 for name in ("wheel_time", "gyro_time")]
@@ -86,37 +69,45 @@ class Response:
         self._when = np.insert(time, late + 1, time[late] + timeout)
         told = [np.insert(tracks[f"command_{name}"], late + 1, 0.0) for name in ("speed", "steering")]
         self.told = np.stack(told, axis=-1)
-        self._edges = np.arange(time[0], time[0] + seconds, GRID)
+        self._grid = np.arange(time[0], time[0] + seconds, GRID)
         self.series = [
             self._kept(tracks["wheel_time"], tracks["wheel"].real),
             self._kept(tracks["gyro_time"], tracks["gyro"]),
             self._kept(*_speed_by_truth(tracks)),
         ]
         """Times and values of the speed of the wheels, the turn rate, and the speed by motion capture."""
+        self.free = np.array([kind.name != "fake.wheel_scale" or len(self.series[2][0]) > 0 for kind in KINDS])
+        """Constants that are estimated: the scale of the wheels needs motion capture."""
         self.ends = np.cumsum([len(time) for time, _ in self.series])[:-1]
 
     def _kept(self, time: Array, value: Array) -> tuple[Array, Array]:
-        inside = (time > self._edges[0] + SETTLED) & (time < self._edges[-1])
+        inside = (time > self._grid[0] + SETTLED) & (time < self._grid[-1])
         return time[inside], value[inside]
 
     def rows(self, x: Array, dead: Array) -> Array:
         """Return what the model exceeds the measurements by (P, R), for constants (P, K) and dead bands (P,), m/s."""
-        wanted = np.empty((len(x), len(self._edges) - 1, 2))
+        grid = self._grid
+        edges = np.empty((len(x), len(grid) + len(self._when)))
+        wanted = np.empty((len(x), edges.shape[1] - 1, 2))
         for p, (latency, *gains, offset, _, _, _, _, most, _, _, _, _) in enumerate(x):
-            v, angle = (self.told * gains).T
-            for n, value in enumerate((np.where(np.abs(v) < dead[p], 0.0, v), (angle + offset).clip(-most, most))):
-                passed = np.concatenate([[0.0], np.cumsum(value[:-1] * np.diff(self._when))])
-                wanted[p, :, n] = np.diff(np.interp(self._edges - latency, self._when, passed)) / GRID
+            begin = self._when + latency  # steps of the command are edges, so that none is within a step of the model
+            edges[p] = np.sort(np.concatenate([grid, begin.clip(grid[0], grid[-1])]))
+            row = np.searchsorted(begin, 0.5 * (edges[p, 1:] + edges[p, :-1]), side="right")
+            v, angle = (np.concatenate([[[0.0, 0.0]], self.told]) * gains)[row].T
+            wanted[p] = np.stack([np.where(np.abs(v) < dead[p], 0.0, v), (angle + offset).clip(-most, most)], axis=-1)
         lags = np.ascontiguousarray(x[:, [9, 10, 5, 4, 6, 7]])
         reached = wp.zeros(wanted.shape, dtype=wp.float64, device="cpu")
-        arrays = [wp.array(part, dtype=wp.float64, device="cpu") for part in (wanted, lags)]
-        begin = float(np.interp(self._edges[0], self._tracks["wheel_time"], self._tracks["wheel"].real))
-        inputs = [*arrays, begin, GRID, reached]
-        launch(kernel(follow_all, "float64"), dim=len(x), inputs=inputs, device="cpu")
-        at, (wheel, gyro, truth), found = self._edges[1:], self.series, []
-        for (v, angle), (*_, bias, scale) in zip(reached.numpy().transpose(0, 2, 1), x, strict=True):
+        steps = np.diff(edges, axis=-1)
+        arrays: list[Any] = [wp.array(part, dtype=wp.float64, device="cpu") for part in (wanted, lags, steps)]
+        start = float(np.interp(grid[0], self._tracks["wheel_time"], self._tracks["wheel"].real))
+        inputs = [*arrays[:2], start, arrays[2], reached]
+        launch(kernel(follow_commands, "float64"), dim=len(x), inputs=inputs, device="cpu")
+        (wheel, gyro, truth), found = self.series, []
+        for (v, angle), (*_, bias, scale), at, step in zip(
+            reached.numpy().transpose(0, 2, 1), x, edges[:, 1:], steps, strict=True
+        ):
             turn = np.interp(gyro[0], at, v * np.tan(angle) / self._wheelbase) + bias
-            way = (np.cumsum(v) - v / 2) * GRID
+            way = np.cumsum(0.5 * (v + np.append(start, v[:-1])) * step)
             mean = np.interp(truth[0] + INTERVAL / 2, at, way) - np.interp(truth[0] - INTERVAL / 2, at, way)
             speed = np.interp(wheel[0], at, v) * (1.0 + scale)
             found.append(np.concatenate([speed - wheel[1], turn - gyro[1], mean / INTERVAL - truth[1]]))
@@ -163,64 +154,72 @@ class Constants(NamedTuple):
 
     x: Array  # (K,) of `KINDS`
     error: Array  # (K,)
+    beyond: Mask  # (K,) limits that the drive has not reached
     dead: tuple[float, float]  # bounds of the dead band, m/s
-    rest: tuple[Array, ...]  # what is left of each series
+    rest: list[Array]  # what is left of each series
+
+
+class _Fit(NamedTuple):
+    cost: float
+    x: Array
+    dead: float
+    bounds: tuple[float, float]
+    J: Array  # weighted derivatives (R, F) by the free constants
+    r: Array  # weighted residuals (R,)
 
 
 def constants_of(response: Response, given: Array, dead: float) -> Constants:
     """Return the constants by least squares, from given ones."""
     reached, starts = response.limits(), []
-    for share in (None, 1.0, 0.6):  # a limit that is not reached gives no slope: begin at limits that are
+    for share in (10.0, 1.0, 0.6):  # a limit that is not reached gives no slope: begin at limits that are
         x = given.copy()
-        if share is not None:
-            x[LIMITS] = np.minimum(x[LIMITS], share * reached)
+        x[LIMITS] = np.minimum(x[LIMITS], share * reached)
         starts.append(_fitted(response, given, x, dead, 1))
-    x = min(starts, key=lambda found: found[0])[1]
-    _, x, J, r, free, bounds = _fitted(response, given, x, dead, PASSES)
-    prior = np.array([kind.prior for kind in KINDS])
+    fit = _fitted(response, given, min(starts, key=lambda start: start.cost).x, dead, PASSES)
+    free, x, error = response.free, fit.x, np.zeros(len(KINDS))
     stretch = (np.concatenate([time for time, _ in response.series]) / STRETCH).astype(int)
-    score = np.stack([np.bincount(stretch, column * r) for column in J.T], axis=-1)
-    S = J.T @ J + np.diag(prior[free] ** -2)
-    error = np.zeros(len(x))
-    error[free] = np.sqrt(sandwich(S, score, prior[free]).diagonal())
-    rest = np.split(response.rows(x[None], np.mean(bounds, keepdims=True))[0], response.ends)
-    return Constants(x, error, bounds, tuple(rest))
+    scores = np.stack([np.bincount(stretch, column * fit.r) for column in fit.J.T], axis=-1).astype(np.float64)
+    error[free] = np.sqrt(sandwich(fit.J.T @ fit.J + np.diag(PRIOR[free] ** -2), scores, PRIOR[free]).diagonal())
+    without = np.tile(x, (1 + len(reached), 1))
+    without[1:, LIMITS] *= 1.0 + 9.0 * np.eye(len(reached))
+    rows = response.rows(without, np.full(len(without), fit.dead))
+    cost = 0.5 * ((response.weights(rows[0]) * rows) ** 2).sum(axis=-1)
+    beyond = np.zeros(len(x), dtype=bool)
+    beyond[LIMITS] = cost[1:] - cost[0] < REACHED
+    x[LIMITS] = np.where(beyond[LIMITS], np.maximum(given[LIMITS], reached), x[LIMITS])
+    return Constants(x, np.where(beyond, PRIOR, error), beyond, fit.bounds, np.split(rows[0], response.ends))
 
 
-def _fitted(response: Response, given: Array, x: Array, dead: float, passes: int) -> tuple[Any, ...]:
-    """Return cost, constants, derivatives, residuals, free constants, and bounds of the dead band."""
-    prior = np.array([kind.prior for kind in KINDS])
-    free = np.array([kind.name != "fake.wheel_scale" or len(response.series[2][0]) > 0 for kind in KINDS])
-    least = np.array([-np.inf if kind.name in SIGNED else 1e-3 for kind in KINDS])
-    steps = np.array([kind.step for kind in KINDS])[free]
-    lowest, highest = 0.0, dead
-
-    def full(part: Array) -> Array:
-        whole = np.tile(given, (*part.shape[:-1], 1))
-        whole[..., free] = part
-        return whole
-
+def _fitted(response: Response, given: Array, x: Array, dead: float, passes: int) -> _Fit:
+    """Return the fit from constants x and a dead band, which are improved in turn."""
+    free, prior = response.free, PRIOR[response.free]
+    least, steps = LEAST[free], np.diag(STEPS[free])
+    bounds, found = (0.0, dead), None
     for _ in range(passes):
         w = response.weights(response.rows(x[None], np.array([dead]))[0])
 
-        def residual(part: Array, w: Array = w, dead: float = dead) -> Array:
-            return np.append(w * response.rows(full(part[None]), np.array([dead]))[0], (part - given[free]) / prior[free])
+        def weighted(parts: Array, w: Array = w, dead: float = dead) -> Array:
+            sets = np.tile(given, (len(parts), 1))
+            sets[:, free] = parts
+            return np.asarray(w * response.rows(sets, np.full(len(sets), dead)))
 
-        def slopes(part: Array, w: Array = w, dead: float = dead) -> Array:
-            sets = np.concatenate([part[None], part + np.diag(steps)])
-            rows = w * response.rows(full(sets), np.full(len(sets), dead))
-            return np.concatenate([(rows[1:] - rows[0]).T / steps, np.diag(1.0 / prior[free])])
+        def residual(part: Array, weighted: Any = weighted) -> Array:
+            return np.append(weighted(part[None])[0], (part - given[free]) / prior)
 
-        found = least_squares(
-            residual, np.maximum(x, least)[free], slopes, bounds=(least[free], np.inf), x_scale=prior[free], max_nfev=15
-        )
-        x = full(found.x)
-        dead, lowest, highest = _dead_band(response, x, w)
-    rows = len(w)
-    return found.cost, x, found.jac[:rows], found.fun[:rows], free, (lowest, highest)
+        def slopes(part: Array, weighted: Any = weighted) -> Array:
+            first, *others = weighted(np.concatenate([part[None], part + steps]))
+            return np.concatenate([(np.array(others) - first).T / STEPS[free], np.diag(1.0 / prior)])
+
+        start = np.maximum(x[free], least)
+        found = least_squares(residual, start, slopes, bounds=(least, np.inf), x_scale=prior, max_nfev=15)
+        x = given.copy()
+        x[free] = found.x
+        dead, bounds = _dead_band(response, x, w)
+    assert found is not None
+    return _Fit(found.cost, x, dead, bounds, found.jac[: len(w)], found.fun[: len(w)])
 
 
-def _dead_band(response: Response, x: Array, w: Array) -> tuple[float, float, float]:
+def _dead_band(response: Response, x: Array, w: Array) -> tuple[float, tuple[float, float]]:
     """Return the dead band of the least cost and its bounds, m/s."""
     steps = np.unique(np.append(0.0, np.abs(x[1] * response.told[:, 0]).round(6)))
     low, high = 0, len(steps) - 1
@@ -231,5 +230,5 @@ def _dead_band(response: Response, x: Array, w: Array) -> tuple[float, float, fl
         cost = 0.5 * ((w * response.rows(np.tile(x, (len(tried), 1)), tried)) ** 2).sum(axis=-1)
         good = np.flatnonzero(cost < cost.min() + SURE)
         if len(picked) == high - low + 1:
-            return float(tried[np.argmin(cost)]), float(edges[good[0]]), float(edges[good[-1] + 1])
+            return float(tried[np.argmin(cost)]), (float(edges[good[0]]), float(edges[good[-1] + 1]))
         low, high = int(picked[max(good[0] - 1, 0)]), int(picked[min(good[-1] + 2, len(picked) - 1)])

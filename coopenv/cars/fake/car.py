@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, warm_up
-from coopenv.cars.fake.faults import CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
+from coopenv.cars.fake.faults import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
@@ -27,9 +27,7 @@ LATE = 50_000_000
 class Schedule:
     """What several sensors do and when; in ns on one clock."""
 
-    def __init__(
-        self, acts: Iterable[tuple[float, Act]], start: int, rng: np.random.Generator, jitter: float
-    ) -> None:
+    def __init__(self, acts: Iterable[tuple[float, Act]], start: int, rng: np.random.Generator, jitter: float) -> None:
         """Begin.
 
         Args:
@@ -74,7 +72,7 @@ class Fake:
         differential: bool = False,
         gate: Callable[[Transport, GateClock], GateConnection] | None = None,
         clock: GateClock = CLOCK,
-        settings: FakeSettings = FakeSettings(),
+        settings: FakeSettings = USUAL,
     ) -> None:
         """Put the car at the start of a seed and announce it.
 

@@ -52,6 +52,8 @@ class FakeSettings(Section):
     """Mean of an exponentially distributed further delay, s."""
 
 
+USUAL = FakeSettings()
+
 _Kind = partial(FaultKind, start=True, duration=True)
 FAKE_FAULTS = {
     "freeze": _Kind("ON", "the computer stops: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),

@@ -46,7 +46,6 @@ def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, 
 def test_a_braked_car_stands_sooner_and_inside_the_margin(speed: float) -> None:
     for cause in ("silence", "stop"):
         rolling, braking = way_to_stand(SVEA, speed, cause), way_to_stand(BRAKED, speed, cause)
-        print(f"{speed:4} m/s, {cause:7}: {rolling[0]:.2f} s {rolling[1]:.2f} m, braked {braking[0]:.2f} s {braking[1]:.2f} m")
         for (seconds, way, _), brake in ((rolling, None), (braking, BRAKE)):
             assert way < Safety().stopping(speed, brake)[1] and seconds < Safety().stopping(speed, brake)[0] + 0.35
         assert braking[1] < rolling[1] - speed**2 / 2 * (1.0 - 1.0 / 3.0) * 0.6
