@@ -90,8 +90,8 @@ LINES_AND_FILES = {
     "backends": (3275, 17),
     "base": (1400, 9),
     "bench": (4535, 18),
-    "cars": (9110, 41),
-    "cli": (2230, 8),
+    "cars": (9850, 44),
+    "cli": (2280, 8),
     "estimation": (1720, 8),
     "evaluation": (500, 3),
     "observers": (11835, 49),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3095, 12),
     "training": (1360, 5),
     "viz": (4500, 18),
-    "world": (4312, 17),
+    "world": (4336, 17),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

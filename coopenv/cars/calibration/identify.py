@@ -27,6 +27,7 @@ STEP = 0.2  # s over which changes are compared
 COMPARED = 60.0  # s of the drive that a fake repeats
 SENSORS = (Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.BEARINGS)
 CUT = 3.0  # times the 90 % quantile, beyond which a sighting is another block's
+MOST = 0.49  # share of a fake's loss and jitter
 LATEST = 1.0  # s, delay beyond which clocks differ
 
 
@@ -51,11 +52,7 @@ class Identified:
 
 
 def identify(bag: "Bag", car: str | None = None) -> Identified:
-    """Return the fake that a car of a bag is; None: the first with commands.
-
-    Raises:
-        DataError: the bag has no commands of the car, or too few.
-    """
+    """Return the fake that a car of a bag is; None: the first with commands. Raises DataError: too few commands."""
     sent = {
         name: {role: found for (of, role), found in bag.log.sent.items() if of == name} for name in bag.binding.cars
     }
@@ -79,7 +76,6 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
     return Identified(car, tuple(rows), tuple(_distances(bag, car, rows, sent[car], drives)))
 
 
-NOISES = "velocity", "angular_velocity"
 BEYOND = "not reached: at least this"
 UNKNOWN = "not determined by this drive"
 
@@ -101,7 +97,8 @@ def _level(name: str, unit: str, given: float, measure: Callable[[Array], float]
 def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) -> Iterator[Row]:
     """Yield the noise of wheels and gyro, as the environment states it."""
     noise, rate = bag.scenario.noises[vehicle], stated_rate(bag.scenario, vehicle)
-    for name, unit, (time, _), left in zip(NOISES, ("m/s", "rad/s"), response.series, rest, strict=False):
+    for name, (time, _), left in zip(("velocity", "angular_velocity"), response.series, rest, strict=False):
+        unit = "m/s" if name == "velocity" else "rad/s"
         scale = np.sqrt(0.5 * rate * float(np.median(np.diff(time))))
         yield _level(f"noise.{name}", unit, getattr(noise, name), deviation, scale * np.diff(left)[:, None])
 
@@ -119,9 +116,9 @@ def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
                 name, near = f"fake.{role}_rate", np.diff(stamp)[steps[-1] < 1.5]
                 yield _level(name, "Hz", getattr(usual, f"{role}_rate"), lambda part: 1.0 / float(part.mean()), near)
     step, delay = np.concatenate(steps), np.concatenate(delays)
-    count = np.maximum(np.rint(step), 1.0)
-    yield _level("fake.loss", "", usual.loss, lambda part: 1.0 - len(part) / float(part.sum()), count)
-    yield _level("fake.jitter", "", usual.jitter, lambda part: float(np.sqrt(1.5) * part.std()), step[step < 1.5])
+    count, near = np.maximum(np.rint(step), 1.0), step[step < 1.5]
+    yield _level("fake.loss", "", usual.loss, lambda part: min(1.0 - len(part) / float(part.sum()), MOST), count)
+    yield _level("fake.jitter", "", usual.jitter, lambda part: min(np.sqrt(1.5) * float(part.std()), MOST), near)
     late = _level("fake.delay", "s", usual.delay, lambda part: _exponential(part)[0], delay)
     yield late if 0.0 <= late.value < LATEST else replace(late, value=0.0, finding="another clock")
     yield _level("fake.delay_spread", "s", usual.delay_spread, lambda part: _exponential(part)[1], delay)
@@ -152,25 +149,21 @@ def _times(samples: Sequence[Sample]) -> Array:
 def _sightings(sent: Sent) -> tuple[Array, Array]:
     """Return second differences (n,) of azimuths over three frames, rad, and whether the middle one is missed (m,)."""
     frames = next((sent[role] for role in SENSORS[2:] if sent.get(role)), ())
-    time = _times(frames)[0]
-    seen = [
-        dict(zip(s.value.markers, s.value.bearings, strict=True)) for s in frames if isinstance(s.value, Detections)
-    ]
-    bend, missed = [], []
-    for k in range(1, len(time) - 1):
-        if time[k + 1] - time[k - 1] < 3.0 * np.median(np.diff(time)):
-            for marker in seen[k - 1].keys() & seen[k + 1].keys():
-                missed.append(marker not in seen[k])
-                if marker in seen[k]:
-                    a, b, c = (np.arctan2(*seen[n][marker][[0, 2]]) for n in (k - 1, k, k + 1))
-                    bend.append(a - 2.0 * b + c)
+    rows = [(s.value.markers, s.value.bearings) for s in frames if isinstance(s.value, Detections)]
+    seen = [dict(zip(markers, np.arctan2(*rays[:, [0, 2]].T), strict=True)) for markers, rays in rows]
+    step, bend, missed = np.diff(_times(frames)[0]), [], []
+    for k in np.flatnonzero(step[1:] + step[:-1] < 3.0 * np.median(step)) if len(step) else ():
+        first, middle, last = seen[k : k + 3]
+        for marker in first.keys() & last.keys():
+            missed.append(marker not in middle)
+            bend += [first[marker] - 2.0 * middle[marker] + last[marker]] if marker in middle else []
     return np.array(bend), np.array(missed)
 
 
 def _quantities(sent: Sent) -> Iterator[tuple[str, Array]]:
     """Yield the values of what is compared."""
     for role, name, axis in ((Role.WHEEL, "linear", 0), (Role.IMU, "angular", 2)):
-        samples = sent.get(role, ())
+        samples = [s for s in sent.get(role, ()) if getattr(s.value, name) is not None]
         value = np.array([getattr(s.value, name)[axis] for s in samples])
         if len(value) > PARTS:
             time, what = _times(samples)[0], "speed" if axis == 0 else "turn rate"
@@ -189,28 +182,20 @@ def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Se
     """Yield how far fakes with the same commands are from the bag."""
     end = drives[0].stamp + round(COMPARED * 1e9)
     commands = [(s.stamp, s.value) for s in drives if s.stamp < end and isinstance(s.value, MotionCommand)]
-    start = next(
-        (s.value for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp), None
-    )
+    truth = (s for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp)
+    pose = next((s.value for s in truth if isinstance(s.value, CarPose)), None)
     shift = {role: round(bag.log.added[car, role][1] * 1e9) for role in sent}
     inside = {
         role: [s for s in sent[role] if drives[0].stamp <= s.stamp + shift[role] < commands[-1][0]] for role in sent
     }
     overrides, fake = tables(rows)
-    scenario = load_scenario(bag.map.environment_path, {**bag.changes, **overrides})
-    identified = replace(bag.binding, scenario=scenario)
-    pose = start if isinstance(start, CarPose) else None
-    fakes = [
-        {name: value for name, value in _quantities(replay(binding, car, commands, settings, seed, pose))}
-        for binding, settings, seed in (
-            (bag.binding, USUAL, 0),
-            (identified, FakeSettings(**fake), 0),
-            (identified, FakeSettings(**fake), 1),
-        )
-    ]
+    changed = replace(bag.binding, scenario=load_scenario(bag.map.environment_path, {**bag.changes, **overrides}))
+    makes = (bag.binding, USUAL, 0), (changed, FakeSettings(**fake), 0), (changed, FakeSettings(**fake), 1)
+    fakes = [dict(_quantities(replay(binding, car, commands, made, seed, pose))) for binding, made, seed in makes]
     for name, value in _quantities(inside):
-        pairs = ((value, fakes[0][name]), (value, fakes[1][name]), (fakes[1][name], fakes[2][name]))
-        if all(len(part) for pair in pairs for part in pair):
+        given, identified, other = (made.get(name, np.zeros(0)) for made in fakes)
+        if all(map(len, (value, given, identified, other))):
+            pairs = (value, given), (value, identified), (identified, other)
             yield Distance(name, len(value), *(float(ks_2samp(*pair).statistic) for pair in pairs))
 
 

@@ -1,7 +1,8 @@
 """A fake car that obeys recorded commands as fast as it can, on a clock of its own; its messages are kept."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,25 +20,6 @@ Sent = Mapping[Role, Sequence[Sample]]
 """Samples by role in the order of their stamps, by the sender's clock, with times of reception."""
 
 
-class _Recorder:
-    """A network without other ends."""
-
-    def __init__(self, clock: Callable[[], int]) -> None:
-        self._clock, self.arrived = clock, list[tuple[str, bytes, int]]()
-
-    def publish(self, topic: str, payload: bytes, *_: Any, **__: Any) -> None:
-        """Keep a message."""
-        self.arrived.append((topic, payload, self._clock()))
-
-    def subscribe(self, *_: Any) -> None:
-        """Nothing comes."""
-
-    announce = watch = subscribe
-
-    def close(self) -> None:
-        """End."""
-
-
 def replay(
     binding: Binding,
     car: str,
@@ -49,7 +31,9 @@ def replay(
     """Return what a fake sends under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
     now = commands[0][0]
     clock = GateClock(lambda: now, lambda: now)
-    network = _Recorder(lambda: now)
+    arrived: list[tuple[str, bytes, int]] = []
+    network: Any = SimpleNamespace(**dict.fromkeys(("subscribe", "announce", "watch", "close"), lambda *_: None))
+    network.publish = lambda topic, payload, *_, **__: arrived.append((topic, payload, now))  # without other ends
     fake = Fake(binding, car, network, seed=seed, clock=clock, settings=settings)
     if start is not None and start.rotation is not None:
         fake.world.put(fake.world.agent, start.rotation, start.position - np.array(binding.scenario.map.origin))
@@ -63,7 +47,7 @@ def replay(
     roles = {binding.profile.topic_of(car, role): role for role in READERS}
     found: dict[Role, list[Sample]] = {}
     lens = Calibration.of(binding.scenario.cameras[binding.cars[car]])
-    for topic, payload, received in network.arrived:
+    for topic, payload, received in arrived:
         with suppress(CoopenvError):  # of no use to readers either
             role = roles[topic]
             message = decode(payload, binding.profile.topics[role].type)
