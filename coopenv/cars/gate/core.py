@@ -214,6 +214,10 @@ class Gate:
         return self._clock.steady() < self._braked and self._wanted is None
 
     @property
+    def _still(self) -> MotionCommand:
+        return MotionCommand(brake=True) if self.braking else NEUTRAL
+
+    @property
     def state(self) -> GateMode:
         """The state at this instant."""
         if self._wanted is not None and self._clock.steady() - self.commanded > TIMEOUT:
@@ -247,7 +251,7 @@ class Gate:
             )
             self._output = MotionCommand(steering, speed)
         else:
-            self._output = MotionCommand(brake=True) if self.braking else NEUTRAL
+            self._output = self._still
         self._ticked = now
         return write_drive(self._clock.wall(), self.profile.command, self._output)
 
@@ -259,7 +263,7 @@ class Gate:
     def neutral(self) -> bytes:
         """Close for good and return the message for a car that brakes or stands."""
         self._come_to_a_stand(GateMode.STOPPED)
-        return self.tick()
+        return write_drive(self._clock.wall(), self.profile.command, self._still)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
