@@ -90,8 +90,8 @@ LINES_AND_FILES = {
     "backends": (3280, 17),
     "base": (1395, 8),
     "bench": (4665, 18),
-    "cars": (9520, 43),
-    "cli": (2210, 7),
+    "cars": (10280, 46),
+    "cli": (2285, 8),
     "estimation": (1765, 8),
     "evaluation": (495, 3),
     "observers": (11820, 47),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3165, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (4885, 19),
+    "world": (4910, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -9,9 +9,12 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.sections import Section, read_toml, validated
+from coopenv.cars.fake.faults import USUAL as DEFAULT_FAKE
+from coopenv.cars.fake.faults import FakeSettings
 from coopenv.cars.profile import (
     SVEA,
     USUAL,
+    Brake,
     CarProfile,
     Limits,
     Number,
@@ -241,8 +244,9 @@ class Safety(Section):
     """Corners of a polygon that no car may leave, m, in the coordinates of the environment's file (none: no fence)."""
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
     """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
-    deceleration: Positive = 1.0
-    """Of a car that gets neutral, m/s^2, by a test. Cars are stopped in time to stand inside the geofence, apart."""
+    deceleration: Positive | None = None
+    """Of a car that is stopped, m/s^2, by a test (default: of the profile's brake, or 1). Cars are stopped in time to
+    stand inside the geofence, apart."""
     judge: Literal["truth", "estimate"] = "truth"
     """Source of the positions for geofence and separation."""
     max_error: Positive | None = 1.0
@@ -263,9 +267,10 @@ class Safety(Section):
     max_clock_offset: Positive = 0.02
     """Largest offset between the clocks of a car and of this computer for arming, s."""
 
-    def stopping(self, speed: float) -> tuple[float, float]:
+    def stopping(self, speed: float, brake: Brake | None) -> tuple[float, float]:
         """Return after which time, s, and way, m, a car at a speed, m/s, stands that gets no more commands."""
-        return REACTION + speed / self.deceleration, speed * REACTION + speed**2 / (2.0 * self.deceleration)
+        rate = self.deceleration or (brake.deceleration if brake else 1.0)
+        return REACTION + speed / rate, speed * REACTION + speed**2 / (2.0 * rate)
 
     @field_validator("geofence")
     @classmethod
@@ -305,6 +310,10 @@ class Deployment(Section):
     security: Security = Security()
     fakes: bool = False
     """Whether the cars are fakes, which are moved to the start of each episode."""
+    fake: FakeSettings = Field(default=DEFAULT_FAKE, exclude=True)  # matters in the fakes' processes alone
+    identified: str | None = Field(default=None, exclude=True)
+    """File that `coopenv identify` has written (relative to this file): its overrides and its table `fake` replace
+    those of this file."""
     file: Path = Field(default=Path(), exclude=True)
     """Where it stands; set by `load_deployment`."""
 
@@ -374,6 +383,9 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
     network = raw.get("network", {})
     if connect is not None and isinstance(network, dict):
         raw["network"] = {**network, "connect": [connect]}
+    if isinstance(name := raw.get("identified"), str):
+        found = read_toml(path.parent / name, DeploymentError)
+        raw |= {key: {**raw.get(key, {}), **found.get(key, {})} for key in ("overrides", "fake")}
     return parse_deployment(raw, path)
 
 

@@ -157,6 +157,7 @@ class MotionCommand:
 
     steering: float = 0.0  # rad, left is positive
     speed: float = 0.0  # m/s, forward is positive
+    brake: bool = False  # with the profile's brake, whatever the others are
 
 
 NEUTRAL = MotionCommand()
@@ -200,6 +201,15 @@ class Channel(Section):
     """Change of the field from neutral to full."""
 
 
+class Brake(Section):
+    """How the wheels are braked."""
+
+    fields: dict[str, Number] = Field(min_length=1)
+    """Fields of the message that differ from a standing car's."""
+    deceleration: Positive
+    """Of a braking car, m/s^2, by a test. Braking ends when the last commanded speed is used up at it."""
+
+
 FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
 
 
@@ -214,6 +224,8 @@ class CommandMessage(Section):
     """Field of the speed."""
     most: float = Field(default=1.0, gt=0.0, le=1.0)
     """Share of full that is sent at most, either way."""
+    brake: Brake | None = None
+    """With it a gate that stops its car brakes first (none: a stop is neutral alone)."""
     timeout: Positive = 0.5
     """Time without a message after which the car goes to neutral by itself, s (assumed by fake cars)."""
 
@@ -224,6 +236,9 @@ class CommandMessage(Section):
                 raise ValueError(f"{name}.field: {shown(channel.field)} is no float32 or float64 of neutral")
             if channel.change == 0.0:
                 raise ValueError(f"{name}.change: must not be 0")
+        for field in self.brake.fields if self.brake else ():
+            if field not in self.neutral:
+                raise ValueError(f"brake.fields: {shown(field)} is no field of neutral")
         return self
 
     def share(self, channel: Channel, value: float) -> float:
@@ -233,12 +248,16 @@ class CommandMessage(Section):
     def values(self, drive: MotionCommand) -> dict[str, float]:
         """Return the fields of a finite command by name."""
         found = {name: value for name, (_, value) in self.neutral.items()}
+        if drive.brake and self.brake:
+            return found | self.brake.fields
         for channel, value in ((self.steering, drive.steering), (self.speed, drive.speed)):
             found[channel.field] += channel.change * self.share(channel, value)
         return found
 
     def drive(self, values: Mapping[str, float]) -> MotionCommand:
         """Return the command of fields by name."""
+        if self.brake and all(values[name] == value for name, value in self.brake.fields.items()):
+            return MotionCommand(brake=True)
         steering, speed = (
             (values[channel.field] - self.neutral[channel.field][1]) / channel.change * channel.full
             for channel in (self.steering, self.speed)

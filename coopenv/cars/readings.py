@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
-from coopenv.cars.profile import CarProfile, Role
+from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role
 from coopenv.cars.vision import FINDERS, Lens, VisionSettings
 from coopenv.estimation.lens import undistort
 from coopenv.estimation.poses import Array, log_so3
@@ -71,7 +71,7 @@ class CarStatus:
     battery: float | None = None  # share that is left
 
 
-Value = Detections | Twist | CarPose | Message | Calibration | CarStatus
+Value = Detections | Twist | CarPose | Message | Calibration | CarStatus | MotionCommand
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,11 +391,14 @@ READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.POINT: {"geometry_msgs/msg/PointStamped": lambda message: CarPose(vector(message.point, "point", FARTHEST))},
     Role.REPORT: {"coopenv_msgs/msg/RobustReport": _report},
     Role.TRUTH: POSES,
+    Role.COMMAND: {
+        GATE_TYPES[Role.COMMAND]: lambda message: MotionCommand(message.drive.steering_angle, message.drive.speed)
+    },
     Role.STATE: {"mavros_msgs/msg/State": state_of},
     Role.REMOTE: {"mavros_msgs/msg/RCIn": remote_of},
     Role.BATTERY: {"sensor_msgs/msg/BatteryState": battery_of},
 }
-"""Types of a role, and what reads them; roles of commands are not here."""
+"""Types of a role, and what reads them; the message to the wheels depends on the profile."""
 
 
 def check_types(profile: CarProfile, where: str) -> None:

@@ -20,7 +20,8 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
 from coopenv.cli.bench import bench
-from coopenv.cli.run import calibrate, export, figures, import_, record, run
+from coopenv.cli.calibrate import calibrate, identify
+from coopenv.cli.run import export, figures, import_, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
@@ -115,7 +116,22 @@ def schema(out: options.TextFile = None) -> None:
     options.write_text(schema_text(), out)
 
 
-for command in (run, figures, export, record, import_, calibrate, dataset, train, evaluate, watch, play, view, film):
+for command in (
+    run,
+    figures,
+    export,
+    record,
+    import_,
+    calibrate,
+    identify,
+    dataset,
+    train,
+    evaluate,
+    watch,
+    play,
+    view,
+    film,
+):
     app.command(command.__name__.rstrip("_"))(command)
 
 

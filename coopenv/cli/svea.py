@@ -175,7 +175,7 @@ def health(
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
     --connect ROUTER --off-board.
     """
-    from coopenv.cars.backend.station import BYPASSED, FOREIGN, neutral_command
+    from coopenv.cars.backend.station import BYPASSED, FOREIGN, UNTRIED, neutral_command
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import Role
@@ -192,9 +192,11 @@ def health(
             raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}{hint}")
         refused = sum(int(count) for count in status.counts)
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
-        (after, way), v = fleet.safety.stopping(fleet.limits.speed), fleet.limits.speed
-        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m, with safety.deceleration")
+        v, brake = fleet.limits.speed, fleet.profile.command.brake
+        (after, way), by = fleet.safety.stopping(v, brake), " braking" if brake else ""
+        print(f"{car}: from {v:.3g} m/s to a stand {after:.2g} s and {way:.2g} m{by}, with safety.deceleration")
         if fleet.network.kind != "zenoh":
+            print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return
         foreign = _count(status, FOREIGN)
         try:

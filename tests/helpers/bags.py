@@ -173,3 +173,16 @@ def _fill(bag: Any, ordered: list[Message], store: Any, encode: Callable[[Any], 
 def made(m: Message) -> Any:
     """Return a message as one of ROS 2."""
     return codec.make(m.kind, header=codec.header(BEGIN + m.stamp), **m.fields)
+
+
+def write_raw(path: Path, given: Iterable[tuple[str, bytes, int]], kinds: dict[str, str]) -> None:
+    """Write an MCAP bag of CDR payloads with their topics and times of reception, ns; `kinds` are types by topic."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connections: dict[str, Any] = {}
+        for topic, payload, received in given:
+            if topic in kinds:
+                if topic not in connections:
+                    connections[topic] = bag.add_connection(f"/{topic}", kinds[topic], typestore=codec.ros2())
+                bag.write(connections[topic], received, payload)

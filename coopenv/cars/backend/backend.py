@@ -22,7 +22,7 @@ from coopenv.cars.backend.binding import (
     reset_options,
 )
 from coopenv.cars.backend.drive import PRESENCE, DriveRecorder, RecordedTransport, head_of
-from coopenv.cars.backend.station import Gates, Pacer, Station
+from coopenv.cars.backend.station import UNTRIED, Gates, Pacer, Station
 from coopenv.cars.backend.status import ROLES, StatusBoard
 from coopenv.cars.backend.watchdog import LinkMonitor, Trip, Watchdog, bearing_nis, since
 from coopenv.cars.codec import encode, make, warm_up
@@ -163,6 +163,8 @@ class Svea:
         _wait(lambda: self._obstacle() is None, READY_TIME)
         if found := self._obstacle():
             raise CoopenvError(f"not armed: {found}")
+        if (kind := self.deployment.network.kind) != "zenoh":
+            warnings.warn(f"network.kind = {kind} {UNTRIED}", DataWarning, stacklevel=2)
         self.watchdog.forget()
         self.board.begin()
         self.gates.begin(release or self.deployment.fakes)

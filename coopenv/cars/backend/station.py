@@ -351,6 +351,10 @@ BYPASSED = (
 )
 
 
+UNTRIED = "has no access rules: past the gate, any of its programs can command the wheels; arming cannot try that"
+"""Of networks other than Zenoh."""
+
+
 def neutral_command(profile: CarProfile, car: str) -> tuple[str, bytes]:
     """Return topic and bytes of a command to the wheels of a car to stand, such as its gate alone may send."""
     return profile.topic_of(car, Role.MANUAL), write_drive(time.time_ns(), profile.command, NEUTRAL)

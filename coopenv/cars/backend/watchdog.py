@@ -341,4 +341,5 @@ class Watchdog:
     def _way_to_stand(self, place: Place) -> Array:
         """Return the vector (2,), m, along which a car rolls until it stands, if it is stopped."""
         speed = float(np.linalg.norm(place.velocity[:2]))
-        return place.velocity[:2] * (self._safety.stopping(speed)[1] / max(speed, 1e-9))
+        way = self._safety.stopping(speed, self._gates.profile.command.brake)[1]
+        return place.velocity[:2] * (way / max(speed, 1e-9))

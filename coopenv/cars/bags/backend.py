@@ -12,7 +12,7 @@ from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import OPTIONS, bind, reset_options
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import NS, read_log
-from coopenv.cars.bags.topic_map import TopicMap, load_map
+from coopenv.cars.bags.topic_map import UNNEEDED, TopicMap, load_map
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Sample
 from coopenv.scenario import Scenario, load_scenario
@@ -54,13 +54,13 @@ class Bag(TickGenerator):
         """
         check_extra()
         self.map = topics if isinstance(topics, TopicMap) else load_map(topics)
-        changes = {**self.map.overrides, **(overrides or {})}
+        self.changes = changes = {**self.map.overrides, **(overrides or {})}
         self.where = ", ".join(str(path) for path in paths)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ScenarioWarning)  # repeated below
             scenario = load_scenario(self.map.environment_path, changes)
         self._rate = float(scenario.rates.camera)
-        self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None)
+        self.binding = bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None, self.map.make)
         self.log = read_log([Path(path) for path in paths], self.map, self.binding)
         self._begin, ticks = self._ticks()
         scenario = self._scenario(changes, ticks)
@@ -72,7 +72,7 @@ class Bag(TickGenerator):
 
     def _ticks(self) -> tuple[int, int]:
         """Return when tick 0 is, ns, and how many ticks there are."""
-        needed = [s for s in self.log.samples if s.car in self.binding.cars and s.role is not Role.TRUTH]
+        needed = [s for s in self.log.samples if s.car in self.binding.cars and s.role not in UNNEEDED]
         first = {(s.car, s.role): s.stamp for s in reversed(needed)}
         begin = max(first.values()) + round(self.map.start * NS) + round(1.5 * NS / self._rate)
         end = needed[-1].stamp

@@ -1,7 +1,8 @@
 """Offsets of clocks in a bag: by times of reception, robust against wrong stamps, and by what topics measure.
 
 - By reception: the delay (received - stamp) of a topic is the offset of its clock and the time of transport. Its level
-  is a low quantile over windows; a robust line through the windows gives offset and drift.
+  is a low quantile over windows; a robust line through the windows gives offset and drift. A level that changes from
+  one message to the next is a jump of the clock where the stamps are irregular, and not the times of reception.
 - By content: topics of a car measure the same motion. Turns and distances by gyro, wheels and motion capture, and the
   bearings of landmarks, agree best at one offset between their stamps. It contains no time of transport.
 
@@ -15,7 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import percentile_filter
+from scipy.ndimage import median_filter, percentile_filter
 from scipy.stats import theilslopes
 
 from coopenv.cars.backend.binding import Binding
@@ -30,6 +31,7 @@ Times = NDArray[np.int64]
 OUTLYING = 50_000_000
 """ns by which a delay may be off those around it before its stamp counts as wrong, five times their spread at least."""
 WILD, NEAR = 10_000_000_000, 101  # ns between the middle of the delays near one, and a low one, that is no transport
+STEADY = 25  # messages on both sides of a jump whose delays are compared
 WINDOWS, LEAST = 20, 10  # number of windows, and of messages in one
 
 
@@ -55,6 +57,29 @@ def outlying(stamps: Times, received: Times) -> NDArray[np.bool_]:
     reached = np.maximum.accumulate(np.where(wrong, np.iinfo(np.int64).min, stamps))
     wrong |= (stamps < reached) & (delays > usual + 2.0 * most)
     return wrong
+
+
+def jumps(stamps: Times, received: Times) -> dict[int, int]:
+    """Return the jumps of a topic's clock: by the first message (n,) after it, ns by which stamps fall behind."""
+    delays, found = (received - stamps).astype(np.float64), dict[int, int]()
+    if len(delays) < 2 * STEADY:
+        return found
+    after = median_filter(delays, STEADY, origin=-(STEADY // 2), mode="nearest")
+    before = median_filter(delays, STEADY, origin=STEADY // 2, mode="nearest")
+    change = after - np.append(before[:1], before[:-1])  # of the levels on both sides of the begin of each message
+    there = STEADY + np.flatnonzero(np.abs(change[STEADY:-STEADY]) > OUTLYING)
+    for some in np.split(there, np.flatnonzero(np.diff(there) > 1) + 1) if len(there) else ():
+        best = int(some[np.argmax(np.abs(change[some]))])
+        low, high = delays[max(best - STEADY, 0) : best], delays[best : best + STEADY]
+        step = float(np.median(high) - np.median(low))
+        near = np.arange(max(best - STEADY, 1), min(best + STEADY, len(delays)))
+        upper = np.sign(step) * (delays[near] - np.median(low) - step / 2) > 0.0
+        k = int(near[np.argmin(np.cumsum(upper) - upper + np.cumsum(~upper[::-1])[::-1])])
+        usual = float(np.median(np.diff(stamps)))
+        irregular = [abs(float(times[k] - times[k - 1]) - usual) for times in (stamps, received)]
+        if abs(step) > OUTLYING and irregular[0] > irregular[1]:
+            found[k] = round(step)
+    return found
 
 
 def delay_of(stamps: Times, received: Times) -> Delay:

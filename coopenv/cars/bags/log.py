@@ -23,10 +23,11 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import Delay, Leads, delay_of, leads_of, moves_of, outlying
+from coopenv.cars.bags.clocks import Delay, Leads, delay_of, jumps, leads_of, moves_of, outlying
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
-from coopenv.cars.codec import stamp_of
+from coopenv.cars.codec import encode, stamp_of
+from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, Value, read
 from coopenv.scenario.base import rotation_of
@@ -106,6 +107,8 @@ def value_reader(
 
     def read_value(entry: Chosen, message: Any) -> Value:
         calibration = calibrations.get(entry.car)
+        if entry.role is Role.MANUAL:
+            return read_drive(encode(message), binding.profile.command)
         value = read(entry.role, message, calibration, distorted=given.distorted, known=known, vision=given.vision)
         if isinstance(value, CarPose):
             return in_frame(value, frames.get(entry.role, given.frames.map))
@@ -153,16 +156,21 @@ class Track:
     entries: list[Sample] = field(default_factory=list)  # by the clocks of source and recorder; stamp 0: none
     refused: Counter[str] = field(default_factory=Counter)
 
+    jumps: list[tuple[int, int]] = field(default_factory=list)  # first message after each, and ns that were added
     outlying: int = 0  # messages that were dropped for their stamps
     delay: Delay | None = None  # None: no message with a stamp
     source: str = ""  # whose clock makes the stamps
 
-    def drop_outlying(self) -> None:
-        """Drop messages with wrong stamps, and measure the delay of the others."""
+    def clean_stamps(self, mode: str) -> None:
+        """Drop messages with wrong stamps, after jumps of the clock if a mode removes them; measure the delay."""
         stamps, received = (
             np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
         )
         given = stamps != 0
+        self.jumps = list(jumps(stamps[given], received[given]).items()) if mode == "auto" else []
+        for k, behind in self.jumps:
+            stamps[np.flatnonzero(given)[k:]] += behind
+        self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
         wrong = np.zeros(len(given), bool)
         if given.any():
             wrong[given] = outlying(stamps[given], received[given])
@@ -192,8 +200,8 @@ class Track:
 APART = NS  # ns between the delays of two topics of a car beyond which they have different clocks
 
 
-def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, stamped: bool) -> list[Track]:
-    """Return what a file of that number has on the chosen topics; `stamped`: whether stamps count."""
+def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: ReadValue, mode: str) -> list[Track]:
+    """Return what a file of that number has on the chosen topics; `mode` of the map's clocks."""
     wanted = [entry for entry in chosen if entry.role is not Role.CAMERA_INFO and entry.topic in file.topics]
     tracks = {entry.topic: Track(number, entry) for entry in sorted(wanted, key=lambda entry: entry.topic)}
     for topic, received, decode in file.messages(tracks):
@@ -201,7 +209,7 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         entry = track.chosen
         try:
             message = decode()
-            stamp, found = stamp_of(message) if stamped else 0, value(entry, message)
+            stamp, found = 0 if mode == "received" else stamp_of(message), value(entry, message)
             stamp += found.late if stamp and isinstance(found, Detections) else 0
             track.entries.append(Sample(entry.car, entry.sample_role, stamp, received, found))
         except CoopenvError as error:
@@ -209,7 +217,7 @@ def tracks_of(number: int, file: BagFile, chosen: Collection[Chosen], value: Rea
         except (AttributeError, TypeError, ValueError) as error:  # a definition with other fields than ours
             track.refused[f"{file.topics[topic]} has other fields than expected ({error})"] += 1
     for track in tracks.values():
-        track.drop_outlying()
+        track.clean_stamps(mode)
     return list(tracks.values())
 
 
@@ -304,6 +312,8 @@ class BagLog:
     lenses: Mapping[str, Calibration] = field(default_factory=dict)  # by car; none: its bearings are without pixels
     added: Mapping[tuple[str, Role], tuple[str, float]] = field(default_factory=dict)
     """By car and role: the topic, and s that were added to its stamps."""
+    sent: Mapping[tuple[str, Role], tuple[Sample, ...]] = field(default_factory=dict)
+    """By car and role, the samples with unchanged times."""
 
 
 def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog:
@@ -326,20 +336,20 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         if given.vision.rectified:
             lenses = {name: replace(lens, distortion=(0.0,) * 5) for name, lens in lenses.items()}
         lenses |= _published(files, chosen, given)  # a calibration that a car publishes replaces the environment's
-        value, stamped = value_reader(given, binding, chosen, lenses), given.clocks.mode != "received"
-        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, stamped)]
+        value, mode = value_reader(given, binding, chosen, lenses), given.clocks.mode
+        tracks = [track for n, file in enumerate(files) for track in tracks_of(n, file, chosen, value, mode)]
     if odd := [name for name in given.clocks.offsets if name[0] == "/" and name not in {e.topic for e in chosen}]:
         known = listed(sorted(entry.topic for entry in chosen))
         raise DataError(f"{given.path.name}: clocks.offsets: {odd[0]} is none of the topics that are read: {known}")
     for entry in chosen:
         _check(entry, [track for track in tracks if track.chosen is entry], where)
-    tolerance = given.clocks.tolerance * NS if given.clocks.mode == "auto" else float("inf")
+    tolerance = given.clocks.tolerance * NS if mode == "auto" else float("inf")
     stated = {name: round(seconds * NS) for name, seconds in given.clocks.offsets.items()}
     delays = delays_of(tracks, len(files), given.clocks.tolerance * NS, stated)
     drifts = {track.chosen.topic: drift for track in tracks if (drift := track.remove_drift(tolerance))}
     clocks = reconcile(delays, tolerance, stated)
     samples = _samples(tracks, clocks, {})
-    leads = leads_of(samples, chosen, binding) if stamped else {}
+    leads = leads_of(samples, chosen, binding) if mode != "received" else {}
     fixed = {track.chosen.topic for track in tracks if track.source in stated}
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
@@ -348,11 +358,15 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
+    sent = {
+        (track.chosen.car, track.chosen.role): tuple(sorted(track.entries, key=lambda entry: entry.stamp))
+        for track in reversed(tracks)
+    }
     for track in tracks:
         shift, topic = clocks.shifts.get(track.source), track.chosen.topic
         moved = moves.get(topic, 0) + (shift.added if shift else 0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved / NS))
-    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added)
+    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added, sent)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:
@@ -383,8 +397,11 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
     for track in tracks:
         total = track.refused.total() + len(track.entries) + track.outlying
         if track.delay is not None and track.delay.jump:
-            jump = f"its clock jumps by {track.delay.jump / NS:.2g} s"
+            jump = f"its delay changes by {track.delay.jump / NS:.2g} s"
             yield f'topic {track.chosen.topic}: {jump}; clocks.mode = "received" needs no stamps'
+        if track.jumps:
+            sizes = listed([f"{-behind / NS:+.3f}" for _, behind in track.jumps])
+            yield f"topic {track.chosen.topic}: its clock jumps by {sizes} s, which was removed"
         if track.outlying:
             yield f"topic {track.chosen.topic}: {track.outlying} of {total} messages left out: wrong stamps"
         if track.refused:

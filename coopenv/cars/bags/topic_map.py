@@ -10,7 +10,17 @@ from pydantic import Field, model_validator
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
 from coopenv.base.sections import Section, read_toml, validated
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
-from coopenv.cars.profile import AUTHORS, PREFIX, VELOCITY, Number, Positive, Role, load_profile
+from coopenv.cars.profile import (
+    AUTHORS,
+    PREFIX,
+    SVEA,
+    VELOCITY,
+    CarProfile,
+    Number,
+    Positive,
+    Role,
+    load_profile,
+)
 from coopenv.cars.readings import READERS
 from coopenv.cars.vision import VisionSettings
 
@@ -21,13 +31,13 @@ PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
 """By name and role: the first of them that a bag has counts."""
 
 
-def patterns_of(names: str, folder: Path) -> dict[Role, tuple[str, ...]]:
-    """Return the names of topics by role. Raises CoopenvError: there is no such scheme or profile."""
+def patterns_of(names: str, make: CarProfile) -> dict[Role, tuple[str, ...]]:
+    """Return the names of topics by role, of a scheme or a profile."""
     if names in PATTERNS:
         return PATTERNS[names]
-    found, topics = {}, load_profile(names, folder).topics
+    found = {}
     for role in READ:
-        topic = topics[role]
+        topic = make.topics[role]
         given = (topic.name, *(topic.bag_names or (topic.name.removeprefix(f"{PREFIX}/"),)))
         found[role] = tuple(dict.fromkeys(f"/{name}" for name in given))
     return found
@@ -62,6 +72,10 @@ class Topics(Section):
     landmark."""
     point: TopicName | None = None
     """geometry_msgs/PointStamped: position broadcast by a moving landmark."""
+    manual: TopicName | None = None
+    """Message of the profile from the gate to the car, for `identify`."""
+    command: TopicName | None = None
+    """ackermann_msgs/AckermannDriveStamped: commands to the car, for `identify` where there is no `manual`."""
     truth: TopicName | None = None
     """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: motion capture, for errors
     only, never observed."""
@@ -74,6 +88,9 @@ class Topics(Section):
 
 READ = tuple(Role(name) for name in Topics.model_fields)
 """Roles that are of use in a bag."""
+COMMANDS = (Role.MANUAL, Role.COMMAND)
+UNNEEDED = (Role.CAMERA_INFO, Role.TRUTH, *COMMANDS)
+"""Roles without which there are ticks."""
 
 
 class BagCar(Car):
@@ -150,6 +167,8 @@ class TopicMap(Section):
     clocks: ClockSettings = ClockSettings()
     frames: PositionFrames = PositionFrames()
     vision: VisionSettings = VisionSettings()
+    make: CarProfile = Field(default=SVEA, exclude=True)
+    """Of `names`, or SVEA's; set by `load_map`."""
     path: Path = Field(default=Path("topics.toml"), exclude=True)
     """The file; set by `load_map`."""
 
@@ -184,10 +203,10 @@ def load_map(path: str | Path) -> TopicMap:
         clocks["offsets"] = {**clocks.get("offsets", {}), **found.get("clocks", {}).get("offsets", {})}
     made = validated(TopicMap, data, path.name, TopicMapError)
     try:
-        patterns_of(made.names, path.parent)
+        make = SVEA if made.names in PATTERNS else load_profile(made.names, path.parent)
     except CoopenvError as error:
         raise TopicMapError(f"{path.name}: names: {error}, authors, none") from None
-    return made.model_copy(update={"path": path})
+    return made.model_copy(update={"path": path, "make": make})
 
 
 TRUTH = "truth"
@@ -211,12 +230,12 @@ class Chosen:
     @property
     def needed(self) -> bool:
         """Whether there are no ticks without it."""
-        return self.leads or self.role not in (Role.CAMERA_INFO, Role.TRUTH)
+        return self.leads or self.role not in UNNEEDED
 
     @property
     def source(self) -> str:
         """Whose clock makes its stamps."""
-        return TRUTH if self.role is Role.TRUTH else self.car
+        return TRUTH if self.role is Role.TRUTH else self.topic if self.role is Role.COMMAND else self.car
 
     @property
     def clock(self) -> str:
@@ -262,7 +281,7 @@ def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str)
             raise DataError(f"{table}.{role}: {absent(name)}{hint}")
     found = {role: there[0] for role, some in names.items() if (there := [name for name in some if name in topics])}
     for role, name in found.items():
-        if topics[name] not in READERS[role]:
+        if topics[name] not in READERS.get(role, topics.values()):
             kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
             raise DataError(f"{where}: topic {name} of {car.name} holds {kinds}")
     if car.landmark:  # motion capture is its position where it publishes none
@@ -271,7 +290,8 @@ def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str)
         twists = [VELOCITY[given.odometry]] if given.odometry != "auto" else [*VELOCITY.values()]
         cameras = [Role(given.camera)] if given.camera != "auto" else [Role.DETECTIONS, Role.BEARINGS]
         chosen = first("odometry", twists) + first("camera", [(role,) for role in cameras])
-        chosen += tuple(role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in found)
+        found.pop(Role.COMMAND if Role.MANUAL in found else Role.MANUAL, None)
+        chosen += tuple(role for role in UNNEEDED if role in found)
     return [Chosen(found[role], car.name, role, car.landmark is not None) for role in chosen]
 
 
@@ -279,6 +299,6 @@ def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
     """Return the names that topics of a car may have, by role."""
     scheme = {
         role: tuple(pattern.format(**car.names) for pattern in patterns)
-        for role, patterns in patterns_of(given.names, given.path.parent).items()
+        for role, patterns in patterns_of(given.names, given.make).items()
     }
     return scheme | {role: (name,) for role, name in car.topics.given.items()}

@@ -6,6 +6,9 @@ residual depends on the pose of one keyframe, or of two neighbours, so that six 
 The poses are eliminated by a banded factor (Schur complement). Sightings and motion capture have the loss of
 Geman and McClure, whose scale follows from the residuals; odometry has the density of its own noise.
 
+Time offsets act on motion that is averaged over half a second: otherwise they would fit the noise of odometry, and
+its derivative would count as information.
+
 Standard errors are the larger of those by the information and of those by the spread of the scores of stretches of a
 second ("sandwich"): whole pixels give residuals that are correlated in time.
 Source: Geman and McClure, Statistical methods for tomographic image reconstruction, Bulletin of the International
@@ -23,9 +26,10 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.drives import CarDrive, Drive
+from coopenv.cars.calibration.drives import CarDrive, Drive, averaged
 from coopenv.estimation.lens import distort, largest_radius
 from coopenv.estimation.poses import Array, Mask, skew
+from coopenv.scenario import Scenario
 
 KEYFRAME = 0.1  # s
 GRID = 0.005  # s, of dead reckoning
@@ -36,6 +40,7 @@ LEAST_PIXEL, LEAST_ANGLE, LEAST_PLACE, LEAST_YAW = 0.2, 5e-4, 1e-3, 2e-3
 LEAST_SPEED, LEAST_TURN = 1e-6, 1e-7  # m^2/s and rad^2/s, least densities of odometry noise
 WINDOW = 6.0  # s of sightings from which a first pose is found
 HEADINGS = 72  # that are tried for it
+LATE = np.arange(-0.5, 0.51, 0.05)  # s, offsets of motion capture that are tried
 
 
 class Kind(NamedTuple):
@@ -71,17 +76,24 @@ NUISANCE = (SCALE, BIAS)
 
 
 class Path(NamedTuple):
-    """Dead reckoning."""
+    """Dead reckoning, and its averaged rates."""
 
     time: Array
     yaw: Array
     place: NDArray[np.complex128]
+    turn: Array
+    speed: NDArray[np.complex128]
 
-    def step(self, begin: Array, end: Array) -> tuple[NDArray[np.complex128], Array]:
-        """Return the motion from times to others, in the body at the first: m, rad."""
+    def step(self, begin: Array, end: Array, late: float = 0.0) -> tuple[NDArray[np.complex128], Array]:
+        """Return the motion from times to others and a little later, s, in the body at the first: m, rad."""
         yaw = np.interp(begin, self.time, self.yaw)
         moved = np.interp(end, self.time, self.place) - np.interp(begin, self.time, self.place)
-        return np.exp(-1j * yaw) * moved, np.interp(end, self.time, self.yaw) - yaw
+        turned = np.interp(end, self.time, self.yaw) - yaw
+        if late:
+            turn = late * np.interp(end + 0.5 * late, self.time, self.turn)
+            speed = np.interp(end + 0.5 * late, self.time, self.speed)
+            moved, turned = moved + late * speed * np.exp(1j * (yaw + turned + 0.5 * turn)), turned + turn
+        return np.exp(-1j * yaw) * moved, turned
 
 
 @dataclass(frozen=True)
@@ -126,7 +138,7 @@ class Batch:
         ]
         self.density = []  # of the odometry noise of each car, x, y and yaw
         for car, (speed, turn) in zip(self.cars, self.measured, strict=True):
-            stated, rate = drive.scenario.noises[car.vehicle], self.rate(car)
+            stated, rate = drive.scenario.noises[car.vehicle], stated_rate(drive.scenario, car.vehicle)
             speed = max(speed, stated.velocity**2 / rate, LEAST_SPEED)
             turn = max(turn, stated.angular_velocity**2 / rate, LEAST_TURN)
             self.density.append(np.array([speed, speed, turn]))
@@ -137,12 +149,7 @@ class Batch:
             if (lens := car.lens) is not None:
                 mine[LENS] = *lens.focal_length, *lens.principal_point, *lens.distortion
         self.base[self.markers : self.frame] = self.places.ravel()
-        self.start = np.zeros((len(self.cars), 2))  # offsets by which keyframes were assigned
-
-    def rate(self, car: CarDrive) -> float:
-        """Return the rate in Hz at which the environment states a car's odometry noise."""
-        stated = self.drive.scenario.noises[car.vehicle].odometry_rate
-        return self.drive.scenario.rates.odometry if isinstance(stated, str) else stated
+        self.slow = [averaged(car.wheel, float(np.median(np.diff(car.wheel_time)))) for car in self.cars]
 
     def own(self, c: int) -> slice:
         """Return where the constants of a car are."""
@@ -153,23 +160,32 @@ class Batch:
         return slice(self.markers + 3 * i, self.markers + 3 * i + 3)
 
     def path(self, c: int, x: Array) -> Path:
-        """Return the dead reckoning of a car."""
+        """Return the dead reckoning of a car; the offset of its wheels acts on averaged speeds."""
         car, own = self.cars[c], x[self.own(c)]
         time = np.arange(self.keys[c][0] - 1.0, self.keys[c][-1] + 1.0, GRID)
         rate = np.interp(time, car.gyro_time, car.gyro) - own[BIAS]
-        speed = np.interp(time, car.wheel_time + own[WHEEL_TIME], car.wheel) / (1.0 + own[SCALE])
+        speed = np.interp(time, car.wheel_time, car.wheel)
+        if own[WHEEL_TIME]:
+            speed += np.interp(time, car.wheel_time + own[WHEEL_TIME], self.slow[c])
+            speed -= np.interp(time, car.wheel_time, self.slow[c])
+        speed /= 1.0 + own[SCALE]
         yaw = np.concatenate([[0.0], np.cumsum(0.5 * GRID * (rate[1:] + rate[:-1]))])
         going = speed * np.exp(1j * yaw)
-        return Path(time, yaw, np.concatenate([[0.0], np.cumsum(0.5 * GRID * (going[1:] + going[:-1]))]))
+        place = np.concatenate([[0.0], np.cumsum(0.5 * GRID * (going[1:] + going[:-1]))])
+        return Path(time, yaw, place, averaged(rate, GRID), averaged(speed, GRID))
 
-    def residuals(self, c: int, x: Array, pose: Array) -> tuple[Array, Array, Array]:
-        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad."""
-        car, own, keys = self.cars[c], x[self.own(c)], self.keys[c]
+    def residuals(self, c: int, x: Array, pose: Array, near: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad.
+
+        `near`: constants by whose offsets keyframes are assigned, and from which offsets act (None: x).
+        """
+        near = x if near is None else near
+        car, own, start, keys = self.cars[c], x[self.own(c)], near[self.own(c)], self.keys[c]
         path = self.path(c, x)
         place, yaw = pose[:, 0] + 1j * pose[:, 1], pose[:, 2]
-        when = car.time + own[CAMERA_TIME]
-        k = self.nearest(c, car.time + self.start[c, 0])
-        moved, turned = path.step(keys[k], when)
+        when = car.time + start[CAMERA_TIME]
+        k = self.nearest(c, when)
+        moved, turned = path.step(keys[k], when, own[CAMERA_TIME] - start[CAMERA_TIME])
         at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
         points = self.places + x[self.markers : self.frame].reshape(-1, 3)
         point = points[car.target]
@@ -182,8 +198,9 @@ class Batch:
         odometry = np.stack([gap.real, gap.imag, np.diff(yaw) - bend], axis=-1)
         if not self.truth[c]:
             return seen, odometry, np.zeros((0, 3))
-        k = self.nearest(c, car.truth_time + self.start[c, 1])
-        moved, turned = path.step(keys[k], car.truth_time + own[TRUTH_TIME])
+        when = car.truth_time + start[TRUTH_TIME]
+        k = self.nearest(c, when)
+        moved, turned = path.step(keys[k], when, own[TRUTH_TIME] - start[TRUTH_TIME])
         at, heading = place[k] + np.exp(1j * yaw[k]) * moved, yaw[k] + turned
         offset, frame = own[BODY], x[self.frame :]
         at = at + np.exp(1j * heading) * (offset[1] + 1j * offset[2])
@@ -232,14 +249,14 @@ class Batch:
         found = np.ones((len(self.cars), 3))
         for c, car in enumerate(self.cars):
             seen, _, truth = self.residuals(c, x, poses[c])
-            found[c, 0] = max(_deviation(seen), LEAST_ANGLE if car.lens is None else LEAST_PIXEL)
+            found[c, 0] = max(deviation(seen), LEAST_ANGLE if car.lens is None else LEAST_PIXEL)
             if len(truth):
-                found[c, 1:] = max(_deviation(truth[:, :2]), LEAST_PLACE), max(_deviation(truth[:, 2:]), LEAST_YAW)
+                found[c, 1:] = max(deviation(truth[:, :2]), LEAST_PLACE), max(deviation(truth[:, 2:]), LEAST_YAW)
         return found
 
-    def cost(self, x: Array, poses: Sequence[Array], sigma: Array, free: Mask) -> float:
-        """Return the cost of constants and poses, that of the priors included."""
-        parts = [self.weights(c, self.residuals(c, x, poses[c]), sigma[c])[1] for c in range(len(self.cars))]
+    def cost(self, x: Array, poses: Sequence[Array], sigma: Array, free: Mask, near: Array | None = None) -> float:
+        """Return the cost of constants and poses, that of the priors included; `near` as for `residuals`."""
+        parts = [self.weights(c, self.residuals(c, x, poses[c], near), sigma[c])[1] for c in range(len(self.cars))]
         return sum(parts) + 0.5 * float(((x / self.prior)[free] ** 2).sum())
 
     def linearised(self, c: int, fit: Fit, columns: NDArray[np.int64]) -> tuple[Array, Array, csr_array, Array]:
@@ -248,8 +265,9 @@ class Batch:
         W, _ = self.weights(c, parts, fit.sigma[c])
         r = _flat(parts)
         car, M = self.cars[c], len(pose)
-        late = self.nearest(c, car.truth_time + self.start[c, 1]) if self.truth[c] else np.zeros(0, np.int64)
-        seen = self.nearest(c, car.time + self.start[c, 0])
+        own = fit.x[self.own(c)]
+        late = self.nearest(c, car.truth_time + own[TRUTH_TIME]) if self.truth[c] else np.zeros(0, np.int64)
+        seen = self.nearest(c, car.time + own[CAMERA_TIME])
         key = np.concatenate([np.repeat(seen, 2), np.repeat(np.arange(M - 1), 3), np.repeat(late, 3)])
         after = np.zeros(len(r), dtype=np.int64)  # odometry depends on the next keyframe, too
         after[parts[0].size : parts[0].size + parts[1].size] = 1
@@ -269,7 +287,7 @@ class Batch:
         for n, column in enumerate(columns):
             x = fit.x.copy()
             x[column] += self.steps[column]
-            J[:, n] = (_flat(self.residuals(c, x, pose)) - r) / self.steps[column]
+            J[:, n] = (_flat(self.residuals(c, x, pose, fit.x)) - r) / self.steps[column]
         column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
         return r, W, csr_array((value, (np.tile(np.arange(len(r)), 6), column)), shape=(len(r), 3 * M)), J
 
@@ -313,8 +331,6 @@ class Batch:
         """Return the fit from a start, of the constants that are free there."""
         fit, columns = begin, np.flatnonzero(begin.free)
         for _ in range(most):
-            own = [fit.x[self.own(c)] for c in range(len(self.cars))]
-            self.start = np.array([[o[CAMERA_TIME], o[TRUTH_TIME]] for o in own])
             sigma = self.scales(fit.x, fit.poses)
             before = self.cost(fit.x, fit.poses, sigma, fit.free)
             fit = replace(fit, sigma=sigma, cost=before)
@@ -325,7 +341,7 @@ class Batch:
                 x = fit.x.copy()
                 x[columns] += share * change
                 poses = tuple(pose + share * move for pose, move in zip(fit.poses, moves, strict=True))
-                cost = self.cost(x, poses, sigma, fit.free)
+                cost = self.cost(x, poses, sigma, fit.free, fit.x)
                 if cost < before:
                     break
             else:
@@ -351,17 +367,22 @@ class Batch:
         return Fit(x, tuple(poses), self.scales(x, poses), free)
 
     def misfit(self, labels: NDArray[np.int64]) -> float:
-        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places."""
+        """Return how badly sightings fit, (2 sin(angle / 2))^2 up to 0.04, if markers stand at others' places.
+
+        Motion capture counts at the offset of its stamps at which they fit best.
+        """
         total = 0.0
         for c, car in enumerate(self.cars):
             if not self.truth[c]:
                 total += self.resected(c, labels)[1]
                 continue
-            at, yaw = np.interp(car.time, car.truth_time, car.truth), np.unwrap(car.truth_yaw)
-            yaw, point = np.interp(car.time, car.truth_time, yaw), self.places[labels[car.target]]
-            flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
-            to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
-            total += _misfit(car.ray @ car.mounting.T, to)
+            point, unit, found = self.places[labels[car.target]], car.ray @ car.mounting.T, []
+            for time in car.time - LATE[:, None]:
+                at, yaw = (np.interp(time, car.truth_time, v) for v in (car.truth, np.unwrap(car.truth_yaw)))
+                flat = np.exp(-1j * yaw) * (point[:, 0] + 1j * point[:, 1] - at)
+                to = np.stack([flat.real, flat.imag, point[:, 2] - car.height], axis=-1) - car.lever
+                found.append(_misfit(unit, to))
+            total += min(found)
         return total
 
     def resected(self, c: int, labels: NDArray[np.int64]) -> tuple[Array, float]:
@@ -426,11 +447,15 @@ class System(NamedTuple):
 
     def covariance(self, prior: Array) -> Array:
         """Return the covariance of the constants; `prior` are their standard deviations."""
-        inverse = np.linalg.inv(self.S)
-        spread = self.scores.T @ self.scores + np.diag(1.0 / prior[self.columns] ** 2)
-        robust = inverse @ spread @ inverse
-        more = np.sqrt(np.maximum(robust.diagonal() / inverse.diagonal(), 1.0))
-        return np.asarray(inverse * np.outer(more, more))
+        return sandwich(self.S, self.scores, prior[self.columns])
+
+
+def sandwich(S: Array, scores: Array, prior: Array) -> Array:
+    """Return the covariance by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
+    inverse = np.linalg.inv(S)
+    robust = inverse @ (scores.T @ scores + np.diag(prior**-2)) @ inverse
+    more = np.sqrt(np.maximum(robust.diagonal() / inverse.diagonal(), 1.0))
+    return np.asarray(inverse * np.outer(more, more))
 
 
 def _flat(parts: tuple[Array, Array, Array]) -> Array:
@@ -442,9 +467,15 @@ def _misfit(unit: Array, to: Array) -> float:
     return float(np.minimum(2.0 - 2.0 * cosine, 0.04).mean())
 
 
-def _deviation(rows: Array) -> float:
+def deviation(rows: Array) -> float:
     """Return the standard deviation of the components of rows (n, 1) or (n, 2), by the median of their lengths."""
     return float(np.median(np.linalg.norm(rows, axis=-1))) / (0.6745, 1.1774)[rows.shape[1] - 1] if len(rows) else 0.0
+
+
+def stated_rate(scenario: Scenario, vehicle: int) -> float:
+    """Return the rate in Hz at which the environment states a vehicle's odometry noise."""
+    stated = scenario.noises[vehicle].odometry_rate
+    return scenario.rates.odometry if isinstance(stated, str) else stated
 
 
 def density(time: Array, values: Array) -> float:

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import Calibration, CarPose, Detections, Twist, rays
+from coopenv.cars.profile import MotionCommand, Role
+from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, rays
 from coopenv.estimation.lens import distort
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
@@ -29,6 +30,10 @@ CLIMB, TILT = 0.05, 0.1
 """Mean vertical velocity, m/s, and mean rate of roll and pitch, rad/s, above which a vehicle is no car."""
 ROLES = ((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,))
 """Of the topics of camera, wheels and motion capture."""
+TRACKS = (
+    *("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw"),
+    *("command_time", "command_speed", "command_steering"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +71,11 @@ class Drive:
     scenario: Scenario
 
 
+def averaged(values: NDArray[Any], period: float) -> Any:
+    """Return values at a regular period, s, as means over `SMOOTH`."""
+    return uniform_filter1d(values, max(1, round(SMOOTH / period)), mode="nearest")
+
+
 def image(ray: Array, lens: Calibration) -> Array:
     """Return the pixels (n, 2) of rays (n, 3) in the optical frame."""
     flat = distort(ray[:, :2] / ray[:, 2:], lens.distortion)
@@ -93,9 +103,8 @@ def car_of(
     if len(rows):
         time = np.arange(car.time.min(), car.time.max() + SMOOTH, SMOOTH)
         speed, turn = (
-            np.abs(np.interp(time, t, np.convolve(v, np.ones(n) / n, "same")))
+            np.abs(np.interp(time, t, averaged(v, float(np.median(np.diff(t))))))
             for t, v in ((car.wheel_time, car.wheel.real), (car.gyro_time, car.gyro))
-            for n in (max(1, round(SMOOTH / float(np.median(np.diff(t))))),)
         )
         moved = SMOOTH * np.cumsum(speed + TURNING * turn)
         step = (np.interp(car.time[rows], time, moved) / STEP).astype(np.int64)
@@ -121,24 +130,38 @@ def drive_of_bag(bag: "Bag") -> Drive:
     return Drive(cars, tuple(m.name for _, m in marks), np.array(places).reshape(-1, 3), scenario)
 
 
-def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
-    samples, added = [s for s in bag.log.samples if s.car == name], bag.log.added
-    seen, wheel, gyro, truth = [], [], [], []
+def tracks_of(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Return what wheels, gyro and motion capture measured, and commands, by the names of `CarDrive`.
+
+    Times are in s since the first sample.
+    """
+    wheel, gyro, truth, command = [], [], [], []
     for s in samples:
         value, t = s.value, NS * (s.stamp - samples[0].stamp)
-        if isinstance(value, Detections):
-            pairs = zip(value.markers, value.bearings, strict=True)
-            seen += [(t, number[marker], *ray) for marker, ray in pairs if marker in number]
-        elif isinstance(value, Twist):
+        if isinstance(value, Twist):
             wheel += [] if value.linear is None else [(t, complex(*value.linear[:2]))]
             gyro += [] if value.angular is None else [(t, value.angular[2])]
         elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
             truth.append((t, complex(*value.position[:2]), _yaw(value.rotation)))
+        elif isinstance(value, MotionCommand):
+            command.append((t, value.speed, value.steering))
+    columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 3), *_columns(command, 3)]
+    tracks = dict(zip(TRACKS, columns, strict=True))
+    return tracks | {key: tracks[key].real for key in tracks if key not in ("wheel", "truth")}
+
+
+def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
+    samples, added = [s for s in bag.log.samples if s.car == name], bag.log.added
+    seen = [
+        (NS * (s.stamp - samples[0].stamp), number[marker], *ray)
+        for s in samples
+        if isinstance(value := s.value, Detections)
+        for marker, ray in zip(value.markers, value.bearings, strict=True)
+        if marker in number
+    ]
     time, target, *ray = _columns(seen, 5)
     topics = (next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES)
-    names = ("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw")
-    tracks = dict(zip(names, [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 3)], strict=True))
-    tracks |= {key: tracks[key].real for key in tracks if key not in ("wheel", "truth")}
+    tracks = {key: value for key, value in tracks_of(samples).items() if "command" not in key}
     found = {"time": time, "target": target.astype(np.int64), "topics": tuple(topics), **tracks}
     return car_of(bag.scenario, name, vehicle, bag.log.lenses.get(name), np.stack(ray, axis=-1), bag.where, **found)
 

@@ -28,6 +28,7 @@ from coopenv.cars.calibration.batch import (
     WHEEL_TIME,
     Batch,
     Fit,
+    stated_rate,
 )
 from coopenv.cars.calibration.drives import Drive
 from coopenv.estimation.poses import Array, Mask
@@ -127,6 +128,7 @@ def exchanged(batch: Batch) -> list[tuple[int, int]]:
             break
         batch.places = batch.places.copy()
         batch.places[[*best]] = batch.places[[*best[::-1]]]
+        batch.base[batch.markers : batch.frame] = batch.places.ravel()
         found.append(best)
     return found
 
@@ -255,7 +257,7 @@ def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:
 
 def _noise(batch: Batch, fit: Fit) -> dict[str, float]:
     """Return the noise that was measured, by key of an environment."""
-    rate = batch.rate(batch.cars[0])
+    rate = stated_rate(batch.drive.scenario, batch.cars[0].vehicle)
     focal = [1.0 if car.lens is None else car.lens.focal_length[0] for car in batch.cars]
     return {
         "noise.bearing.scale": float(np.mean(fit.sigma[:, 0] / focal)),
@@ -302,8 +304,12 @@ def toml_text(result: Calibrated) -> str:
         "[clocks]",
         "offsets = {" + ", ".join(f' "{key}" = {value:.5f}' for key, value in offsets.items()) + " }",
     ]
-    lines += ["", "[constants]"]
-    for row in result.rows:
+    return "\n".join([*lines, *constants(result.rows)]) + "\n"
+
+
+def constants(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the lines of a table of constants in TOML."""
+    yield from ("", "[constants]")
+    for row in rows:
         numbers = f"given = {row.given:.7g}, value = {row.value:.7g}, standard_error = {row.error:.3g}"
-        lines.append(f'"{row.name}" = {{ {numbers}, unit = "{row.unit}", finding = "{row.finding}" }}')
-    return "\n".join(lines) + "\n"
+        yield f'"{row.name}" = {{ {numbers}, unit = "{row.unit}", finding = "{row.finding}" }}'

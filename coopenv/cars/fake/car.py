@@ -12,15 +12,14 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, warm_up
-from coopenv.cars.fake.faults import CarFaults, Wire, end_process, fake_fault, fault_topic
+from coopenv.cars.fake.faults import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
 from coopenv.cars.gate.process import CLOCK, GateConnection
-from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
+from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
 from coopenv.cars.transport.base import Callback, Transport
 
-JITTER = 0.05  # of a period, largest deviation to either side of a regular time
 LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
 
@@ -28,15 +27,16 @@ LATE = 50_000_000
 class Schedule:
     """What several sensors do and when; in ns on one clock."""
 
-    def __init__(self, acts: Iterable[tuple[float, Act]], start: int, rng: np.random.Generator) -> None:
+    def __init__(self, acts: Iterable[tuple[float, Act]], start: int, rng: np.random.Generator, jitter: float) -> None:
         """Begin.
 
         Args:
             acts: rates, Hz, and what is done so often.
             start: from when on.
             rng: of phases and jitter.
+            jitter: share of a period, largest deviation to either side of a regular time.
         """
-        self._rng = rng
+        self._rng, self._jitter = rng, jitter
         self._waiting: list[tuple[int, int, float, float, Act]] = []  # due, number, regular time and period, ns, act
         for number, (rate, act) in enumerate(acts):
             self._wait(number, start + 1e9 / rate * rng.uniform(0.1, 1.0), 1e9 / rate, act)
@@ -55,7 +55,7 @@ class Schedule:
                 yield due, act
 
     def _wait(self, number: int, regular: float, period: float, act: Act) -> None:
-        jitter = period * JITTER * self._rng.uniform(-1.0, 1.0)
+        jitter = period * self._jitter * self._rng.uniform(-1.0, 1.0)
         heapq.heappush(self._waiting, (int(regular + jitter), number, regular, period, act))
 
 
@@ -72,6 +72,7 @@ class Fake:
         differential: bool = False,
         gate: Callable[[Transport, GateClock], GateConnection] | None = None,
         clock: GateClock = CLOCK,
+        settings: FakeSettings = USUAL,
     ) -> None:
         """Put the car at the start of a seed and announce it.
 
@@ -83,14 +84,16 @@ class Fake:
             differential: whether the wheels measure a turn rate, as they do where no other sensor does.
             gate: connects a gate of its own, through which commands come; None: it obeys ManualControl on the network.
             clock: wall and steady; the wall clock is that of motion capture.
+            settings: what differs from the environment.
         """
+        self._settings = settings
         self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
         self.world = CarWorld(
             scenario, len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
         )
         self._origin = np.array(scenario.map.origin)
-        self._wire = Wire(transport, self._faults, clock.steady, seed)
+        self._wire = Wire(transport, self._faults, clock.steady, seed, settings)
         self._inbox: deque[Callable[[], None]] = deque()
         self._others = Neighbours(self.world, binding, name, transport)
         self._link: GateConnection | None = None
@@ -99,9 +102,9 @@ class Fake:
         acts: list[tuple[float, Act]] = [(TRUTH_RATE, self._truth)]
         if self._drives:
             self._pixy = Pixy(self.world, binding, self._others, self._faults, self._publisher)
-            self._sensors = CarSensors(self.world, self._publisher, differential=differential)
-            limits = scenario.limits[self.world.vehicle]
-            self._wheels = Actuators(limits.latency, self._profile.command.timeout)
+            self._sensors = CarSensors(self.world, self._publisher, settings, differential=differential)
+            latency = scenario.limits[self.world.vehicle].latency if settings.latency is None else settings.latency
+            self._wheels = Actuators(latency, self._profile.command.timeout)
             acts += [*self._pixy.acts, *self._sensors.acts]
         else:
             acts.append((LEADER_RATE, self._leader))
@@ -118,9 +121,9 @@ class Fake:
             acts.append((1e9 / PERIOD, self._tick_gate))
         else:
             if self._drives:
-                self._wire.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self._obey))
+                transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
             transport.announce(presence_of(name))
-        self._schedule = Schedule(acts, clock.steady(), self._rng)
+        self._schedule = Schedule(acts, clock.steady(), self._rng, settings.jitter)
 
     def begin(self, seed: int) -> None:
         """Go to the start of a seed; wheels and commands are as if nothing had been."""
@@ -136,7 +139,7 @@ class Fake:
     @property
     def next(self) -> int:
         """When something is due next, steady clock, ns."""
-        return self._schedule.next
+        return int(min(self._schedule.next, self._wire.next))
 
     def add_fault(self, fault: Fault) -> None:
         """Let a fault happen, its start counted from now."""
@@ -176,8 +179,14 @@ class Fake:
             self.world.follow(max(to - self._began, 0) * 1e-9)
         elif to > self._moved:
             for duration, drive in self._wheels.pieces(self._moved, to):
-                self.world.drive(duration, drive.speed, drive.steering)
+                self._drive(duration, drive)
             self._moved = to
+
+    def _drive(self, duration: float, drive: MotionCommand) -> None:
+        s, brake = self._settings, self._profile.command.brake
+        deceleration = brake.deceleration if brake and drive.brake else s.deceleration
+        speed, steering = s.speed_gain * drive.speed, s.steering_gain * drive.steering + s.steering_offset
+        self.world.drive(duration, speed, steering, deceleration)
 
     def _truth(self, due: int, _stamp: int) -> None:
         """Publish the message of motion capture, whose clock is right."""
@@ -195,13 +204,17 @@ class Fake:
         """Obey the gate's command; a frozen computer sends none."""
         if self._link is not None and not self._faults.value("freeze", due):
             # The dead time of the scenario is that from a command to its effect, the gate's turn in it.
-            self._obey(self._link.tick(), max(self._link.commanded, due - PERIOD))
+            begin = max(self._link.commanded, due - PERIOD) if self._settings.latency is None else due
+            self.obey(self._link.tick(), begin)
 
     def _later(self, act: Callable[[bytes, int], None]) -> Callback:
         """Return a callback for threads of the transport, which keeps a message and when it came, steady clock, ns."""
         return lambda arrival: self._inbox.append(partial(act, arrival.payload, self._clock.steady()))
 
-    def _obey(self, payload: bytes, at: int) -> None:
+    def obey(self, payload: bytes, at: int) -> None:
+        """Take a message of a gate at a time, steady clock, ns; a frozen computer does not."""
+        if self._faults.value("freeze", at):
+            return
         try:
             self._wheels.receive(read_drive(payload, self._profile.command), at)
         except Malformed as error:

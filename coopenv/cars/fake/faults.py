@@ -1,4 +1,4 @@
-"""What may go wrong with a fake car, on request: `NAME[=VALUE][@START[+DURATION]]`."""
+"""What differs between fake cars: lasting settings, and faults on request, `NAME[=VALUE][@START[+DURATION]]`."""
 
 import itertools
 import os
@@ -8,10 +8,51 @@ from collections.abc import Callable
 from functools import partial
 from math import isinf
 from queue import PriorityQueue
+from typing import Annotated
+
+from pydantic import Field
 
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
-from coopenv.cars.profile import PREFIX
+from coopenv.base.sections import Section
+from coopenv.cars.profile import PREFIX, Number, Positive
 from coopenv.cars.transport.base import Arrival, Callback, Transport
+
+Share = Annotated[float, Field(ge=0.0, lt=0.5)]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
+
+
+class FakeSettings(Section):
+    """A fake car beyond its environment; `coopenv identify` measures a real one's."""
+
+    latency: Seconds | None = None
+    """Dead time from a command of the gate to the wheels, s (default: the environment's, from one of the station)."""
+    speed_gain: Positive = 1.0
+    """Speed per commanded speed."""
+    steering_gain: Positive = 1.0
+    """Steering angle per commanded angle."""
+    steering_offset: Number = 0.0
+    """Steering angle when straight on is commanded, rad, left is positive."""
+    deceleration: Positive | None = None
+    """Of a car that is faster than commanded, m/s^2 (default: the environment's acceleration)."""
+    wheel_scale: Number | None = None
+    """Share by which wheels measure too much (default: drawn as the environment states)."""
+    gyro_bias: Number | None = None
+    """Bias of the turn rate, rad/s (default: likewise)."""
+    wheel_rate: Positive = 50.0
+    """Velocities of the wheels per second."""
+    imu_rate: Positive = 100.0
+    """Turn rates per second."""
+    jitter: Share = 0.05
+    """Largest deviation from regular times, share of a sensor's period."""
+    loss: Share = 0.0
+    """Share of messages that is lost on the radio, both ways."""
+    delay: Seconds = 0.0
+    """Delay of messages on the radio, s."""
+    delay_spread: Seconds = 0.0
+    """Mean of an exponentially distributed further delay, s."""
+
+
+USUAL = FakeSettings()
 
 _Kind = partial(FaultKind, start=True, duration=True)
 FAKE_FAULTS = {
@@ -79,7 +120,9 @@ class CarFaults:
 class Wire:
     """A transport on which messages get lost, come late, or stop, both ways; its owner calls `flush`."""
 
-    def __init__(self, transport: Transport, faults: CarFaults, steady: Callable[[], int], seed: int) -> None:
+    def __init__(
+        self, transport: Transport, faults: CarFaults, steady: Callable[[], int], seed: int, settings: FakeSettings
+    ) -> None:
         """Lay it.
 
         Args:
@@ -87,7 +130,9 @@ class Wire:
             faults: that it has.
             steady: the clock that they go by, ns.
             seed: of what is lost.
+            settings: that last.
         """
+        self._settings = settings
         self._transport, self._faults, self._steady = transport, faults, steady
         self.announce, self.watch = transport.announce, transport.watch
         self._rng, self._numbers = random.Random(seed), itertools.count()
@@ -111,6 +156,11 @@ class Wire:
         """Forget what is under way."""
         self._late = PriorityQueue()
 
+    @property
+    def next(self) -> float:
+        """When the next late message is due, ns; inf: none is under way."""
+        return self._late.queue[0][0] if self._late.queue else float("inf")
+
     def flush(self) -> None:
         """Pass on what has been under way for long enough."""
         while not self._late.empty():
@@ -121,11 +171,14 @@ class Wire:
             first[2]()
 
     def _pass_on(self, act: Callable[[], None]) -> None:
-        now, faults = self._steady(), self._faults
-        loss = faults.value("loss", now)
+        now, faults, lasting = self._steady(), self._faults, self._settings
+        loss = max(lasting.loss, faults.value("loss", now))
         if faults.value("freeze", now) or (loss and self._rng.random() < loss):
             return
-        if delay := faults.value("delay", now):
+        delay = lasting.delay + faults.value("delay", now)
+        if lasting.delay_spread:
+            delay += self._rng.expovariate(1.0 / lasting.delay_spread)
+        if delay:
             self._late.put((now + round(delay * 1e9), next(self._numbers), act))
         else:
             act()

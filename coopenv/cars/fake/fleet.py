@@ -179,7 +179,9 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
     binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None, fleet.profile)
     own_gate = prepare_gate(fleet, car, station) if gate else None
-    return partial(Fake, binding, car, differential=fleet.sensors.odometry == "wheel", gate=own_gate)
+    return partial(
+        Fake, binding, car, differential=fleet.sensors.odometry == "wheel", gate=own_gate, settings=fleet.fake
+    )
 
 
 def run(fake: Fake, stop: threading.Event) -> None:

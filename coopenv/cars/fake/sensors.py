@@ -10,7 +10,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.fake.faults import CarFaults
+from coopenv.cars.fake.faults import CarFaults, FakeSettings
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import Calibration
@@ -20,9 +20,9 @@ from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Noise
 from coopenv.world.random import ODOMETRY_NOISE
 
-TRUTH_RATE, WHEEL_RATE, IMU_RATE, FILTER_RATE = 100.0, 50.0, 100.0, 20.0
+TRUTH_RATE, FILTER_RATE = 100.0, 20.0
 LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 60.0, 5.0, 1.0
-"""Hz: motion capture, wheels, gyro, own filter; poses of a moving landmark, conditions of a car, its calibration."""
+"""Hz: motion capture, own filter; poses of a moving landmark, conditions of a car, its calibration."""
 
 
 GRAVITY = 9.81  # m/s^2
@@ -62,16 +62,19 @@ class SensorPublisher:
 class CarSensors:
     """Odometry and condition of one car. Lasting errors are those that the world has drawn."""
 
-    def __init__(self, world: CarWorld, publisher: SensorPublisher, *, differential: bool) -> None:
+    def __init__(
+        self, world: CarWorld, publisher: SensorPublisher, settings: FakeSettings, *, differential: bool
+    ) -> None:
         """Put them on the car of a world; `differential`: the wheels measure a turn rate, else 0."""
         self._world, self._publisher, self._differential = world, publisher, differential
+        self._settings = settings
         noise = world.scenario.noises[world.vehicle]
-        self._wheel_std = deviation(noise.velocity, noise, WHEEL_RATE)  # m/s, of a sample
-        self._wheel_turn_std = deviation(noise.angular_velocity, noise, WHEEL_RATE)
-        self._gyro_std = deviation(noise.angular_velocity, noise, IMU_RATE)  # rad/s, of a sample of each axis
+        self._wheel_std = deviation(noise.velocity, noise, settings.wheel_rate)  # m/s, of a sample
+        self._wheel_turn_std = deviation(noise.angular_velocity, noise, settings.wheel_rate)
+        self._gyro_std = deviation(noise.angular_velocity, noise, settings.imu_rate)  # rad/s, a sample of each axis
         self.acts: list[tuple[float, Act]] = [
-            (WHEEL_RATE, self._wheel),
-            (IMU_RATE, self._imu),
+            (settings.wheel_rate, self._wheel),
+            (settings.imu_rate, self._imu),
             (FILTER_RATE, self._odometry),
             (CONDITION_RATE, self._condition),
         ]
@@ -88,7 +91,8 @@ class CarSensors:
     def _wheel(self, due: int, stamp: int) -> None:
         velocity, turn = self._world.twist
         slip = self._world.view("slip")[0, self._world.vehicle]
-        scale = (1.0 + self._world.view("odometry_scale")[0, self._world.vehicle]) * (1.0 + slip[0])
+        drawn, fixed = self._world.view("odometry_scale")[0, self._world.vehicle], self._settings.wheel_scale
+        scale = (1.0 + (drawn if fixed is None else fixed)) * (1.0 + slip[0])
         self._dead_reckon(due)
         noise = self._rng.normal(size=2) * self._factor * (self._wheel_std, self._wheel_turn_std)
         self._speed = float(velocity[0] * scale * math.cos(slip[1]) + noise[0])
@@ -99,7 +103,9 @@ class CarSensors:
 
     def _imu(self, due: int, stamp: int) -> None:
         """Publish turn rates, and the weight of a car on a plane; the IMU knows no orientation."""
-        bias = self._world.view("gyro_bias")[0, self._world.vehicle]
+        bias = self._world.view("gyro_bias")[0, self._world.vehicle].copy()
+        if self._settings.gyro_bias is not None:
+            bias[2] = self._settings.gyro_bias
         turn = self._world.twist[1] + bias + self._rng.normal(size=3) * self._factor * self._gyro_std
         self._dead_reckon(due)
         self._turn_rate = float(turn[2])

@@ -90,10 +90,11 @@ class CarWorld(World):
         for name in ("speed", "steering", "velocity", "angular_velocity"):
             self.view(name)[0] = 0.0
 
-    def drive(self, duration: float, speed: float, steering: float) -> None:
-        """Move by the bicycle under a command, m/s and rad, for a while, s."""
+    def drive(self, duration: float, speed: float, steering: float, deceleration: float | None = None) -> None:
+        """Move by the bicycle under a command, m/s and rad, for a while, s; slow down by a deceleration, m/s^2."""
         self._time_value[0] = duration
-        self.view("command")[0, self.vehicle] = (speed, steering, self._acceleration, 0.0)
+        slower = deceleration is not None and abs(speed) < abs(self.view("speed")[0, self.vehicle])
+        self.view("command")[0, self.vehicle] = (speed, steering, deceleration if slower else self._acceleration, 0.0)
         self._run("drive", drive_one, PerWorld(self._time), self.vehicle)
 
     def follow(self, time: float) -> None:

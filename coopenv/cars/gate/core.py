@@ -206,6 +206,16 @@ class Gate:
         self.commanded = self._ticked = clock.steady()
         """When the last valid command came, steady clock, ns."""
         self._output = NEUTRAL
+        self._braked = 0  # until when, steady clock, ns
+
+    @property
+    def braking(self) -> bool:
+        """Whether the car is being braked."""
+        return self._clock.steady() < self._braked and self._wanted is None
+
+    @property
+    def _still(self) -> MotionCommand:
+        return MotionCommand(brake=True) if self.braking else NEUTRAL
 
     @property
     def state(self) -> GateMode:
@@ -240,6 +250,8 @@ class Gate:
                 (before.speed, before.steering), (wanted.speed, wanted.steering), dt
             )
             self._output = MotionCommand(steering, speed)
+        else:
+            self._output = self._still
         self._ticked = now
         return write_drive(self._clock.wall(), self.profile.command, self._output)
 
@@ -249,9 +261,9 @@ class Gate:
         self._come_to_a_stand(GateMode.STOPPED)  # with another nonce: an arming under way opens nothing
 
     def neutral(self) -> bytes:
-        """Close for good and return the message of a car that stands."""
+        """Close for good and return the message for a car that brakes or stands."""
         self._come_to_a_stand(GateMode.STOPPED)
-        return write_drive(self._clock.wall(), self.profile.command, NEUTRAL)
+        return write_drive(self._clock.wall(), self.profile.command, self._still)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
@@ -302,7 +314,12 @@ class Gate:
             self._come_to_a_stand(GateMode.STOPPED)
 
     def _come_to_a_stand(self, state: GateMode) -> None:
-        """Go on in a state with neutral output; unless it is a mere time-out, earlier armings are worth nothing."""
+        """Brake, where the make can, and go on in a state with neutral output.
+
+        Unless it is a mere time-out, earlier armings are worth nothing.
+        """
+        if (brake := self.profile.command.brake) and self._output.speed:
+            self._braked = self._clock.steady() + round(1e9 * abs(self._output.speed) / brake.deceleration)
         self._state, self._wanted, self._output = state, None, NEUTRAL
         if state is not GateMode.TIMED_OUT:
             self.nonce = secrets.token_hex(8)

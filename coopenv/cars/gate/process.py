@@ -97,11 +97,12 @@ class GateConnection:
         if state is GateMode.STOPPED:
             self._send(Role.STOP, write("?", True), self._own)
 
-    def neutral(self) -> None:
-        """Close the gate for good and send the car a neutral command."""
+    def neutral(self) -> bool:
+        """Close the gate for good and send the car a neutral command, unless it is braking; return whether it was."""
         with self._lock:
-            payload = self._gate.neutral()
+            payload, braking = self._gate.neutral(), self._gate.braking
         self._send(Role.MANUAL, payload)
+        return not braking
 
     def _arrive(self, role: Role, arrival: Arrival) -> None:
         if role is Role.STOP and arrival.attachment == self._own:
@@ -148,8 +149,9 @@ def run(link: GateConnection) -> None:
                 missed = max(time.monotonic_ns() - due, 0) // PERIOD
                 due += (missed + 1) * PERIOD
     finally:
-        for _ in range(LAST_NEUTRALS):
-            link.neutral()
+        left = LAST_NEUTRALS
+        while left:
+            left -= link.neutral()
             time.sleep(PERIOD / 1e9)
 
 

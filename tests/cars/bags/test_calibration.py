@@ -132,6 +132,35 @@ def test_the_wrong_constant_is_named_and_recovered(
         assert off(result, name, value) < 3.0, name
 
 
+SEVERAL: list[tuple[dict[str, Any], set[str], dict[str, float]]] = [
+    (
+        {"turned": np.radians(-1.5), "lever": LEVER + np.array([0.06, 0, 0]), "late": 0.06},
+        {"car: camera orientation", "car: camera position", "car: stamps"},
+        {"car.camera.yaw": 1.5, "car.camera.x": 0.3218, "car.camera.offset": -0.06},
+    ),
+    (
+        {"lens": NO_DISTORTION, "markers": MOVED},
+        {"car: lens distortion", "marker M2: position"},
+        {"car.camera.k1": -0.352043, "marker.M2.x": 1.6},
+    ),
+    (
+        {"markers": MOVED[[1, 0, 2, 3, 4, 5]], "late": -0.08, "truth_late": 0.1},
+        {"markers M0 and M1 are exchanged", "marker M2: position", "car: stamps"},
+        {"marker.M2.x": 1.6, "marker.M0.y": 2.5, "car.camera.offset": 0.08, "car.truth.offset": -0.1},
+    ),
+]
+
+
+@pytest.mark.parametrize(("given", "named", "true"), SEVERAL)
+def test_several_wrong_constants_are_named_and_recovered(
+    given: dict[str, Any], named: set[str], true: dict[str, float]
+) -> None:
+    result = calibrate(drive(**given))
+    assert {line.split(" is wrong")[0] for line in result.findings} == named
+    for name, value in true.items():
+        assert off(result, name, value) < 3.0, name
+
+
 def test_motion_capture_that_is_late_is_named() -> None:
     result = calibrate(drive(truth_late=0.15))
     assert [line.split(" is")[0] for line in result.findings] == ["car: stamps"]

@@ -15,7 +15,7 @@ from numpy.testing import assert_array_equal
 from coopenv import DataError
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
-from coopenv.cars.bags.clocks import Signal, delay_of, lead_of_bearings, lead_of_motion, outlying, turn_of
+from coopenv.cars.bags.clocks import Signal, delay_of, jumps, lead_of_bearings, lead_of_motion, outlying, turn_of
 from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -58,6 +58,32 @@ def test_offset_and_drift_of_a_clock(offset: float, drift: float) -> None:
     assert found.drift == pytest.approx(drift, abs=1e-5) and not found.jump
     stepped = delay_of(np.where(true > 30 * S, true + S // 2, true), received)
     assert stepped.jump * 1e-9 == pytest.approx(0.5, abs=0.01)
+
+
+@given(
+    jump=st.one_of(st.none(), st.floats(0.1, 1e3), st.floats(-1e3, -0.1)),
+    late=st.booleans(),
+    rate=st.sampled_from([10.0, 60.0, 200.0]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_a_jump_of_the_clock_is_found_and_a_longer_way_is_none(
+    jump: float | None, late: bool, rate: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    true = np.cumsum((1.0 + 0.05 * rng.uniform(-1.0, 1.0, 900)) / rate * S).astype(np.int64)
+    true = true[rng.random(900) > 0.03]
+    received = true + (rng.exponential(0.003, len(true)) * S).astype(np.int64)
+    received[len(true) // 4 :] += late * S // 3  # from there on it takes a third of a second
+    k, stamps = int(rng.integers(len(true) // 2, len(true) - 60)), true.copy()
+    stamps[k:] += round((jump or 0.0) * S)
+    stamps[k + 7 :: 100] += 5 * S
+    found = jumps(stamps, np.maximum.accumulate(received))
+    if jump is None:
+        assert not found
+    else:
+        [(first, behind)] = found.items()
+        assert abs(first - k) <= 1 and behind / S == pytest.approx(-jump, abs=0.01)
 
 
 def heading(t: np.ndarray | float) -> np.ndarray:
@@ -151,6 +177,20 @@ def test_a_topic_with_another_clock_and_wrong_stamps_cost_nothing(
         assert rows[topic].lead == pytest.approx(-offset, abs=0.02)  # twists are held until the next one
         assert re.search(rf"svea3: .* truth by \d+\(\d+\) ms; stamps were moved .* \"{topic}\" = ", notes)
     assert ("stamps were moved" in notes) == bool(topic) and ('{ "truth" = -0.1' in notes) == (topic == TRUTH)
+
+
+@pytest.mark.parametrize("jump", [0.4, -2.5])
+def test_a_clock_that_jumps_costs_nothing(jump: float, drive: Recording, tmp_path: Path) -> None:
+    clean = bags.messages(drive)
+    late = [m.received > 5 * S and m.topic in (BLOCKS, TWIST) for m in clean]
+    moved = [bags.later([m], stamps=jump * off)[0] for m, off in zip(clean, late, strict=True)]
+    _, reference, _ = opened(tmp_path, clean)
+    bag, error, notes = opened(tmp_path, moved)
+    assert error < 1.3 * reference + 5e-4
+    assert f"{BLOCKS}: its clock jumps by {jump:+.3f} s, which was removed" in notes
+    assert all(row.outlying == 0 for row in bag.log.rows if row.topic == BLOCKS)
+    _, unchanged, silent = opened(tmp_path, moved, f'{bags.MAP}[clocks]\nmode = "stamps"\n')
+    assert unchanged > 10.0 * reference and "removed" not in silent
 
 
 def test_what_is_printed_can_be_stated(drive: Recording, tmp_path: Path) -> None:

@@ -246,7 +246,7 @@ def test_a_deployment_and_a_bag_name_it(tmp_path: Path, rover: CarProfile) -> No
     assert fleet.limits.steering == 0.4
     with pytest.raises(DeploymentError, match=r"fleet\.toml: safety.max_steering: 0.5 is over 0.4, the largest of"):
         load_deployment(fleet_file(tmp_path, FLEET + "[safety]\nmax_steering = 0.5"))
-    assert patterns_of(ROVER.name, tmp_path)[Role.WHEEL] == ("/robots/{car}/wheel_odometry/velocity",)
+    assert patterns_of(ROVER.name, rover)[Role.WHEEL] == ("/robots/{car}/wheel_odometry/velocity",)
     text = 'environment = "svea_overtaking"\nnames = "rover.toml"\ncars = [{ name = "svea7" }, { name = "svea8" }]'
     (tmp_path / "map.toml").write_text(text)
     assert load_map(tmp_path / "map.toml").names == "rover.toml"

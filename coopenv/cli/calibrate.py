@@ -1,0 +1,115 @@
+"""`coopenv calibrate` and `coopenv identify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cli import options
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from coopenv.cars.calibration.findings import Row
+
+
+def calibrate(
+    bags: Annotated[
+        list[Path], typer.Argument(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")
+    ],
+    topics: options.TopicMap = None,
+    out: Annotated[Path, typer.Option(help="Folder of calibration.toml and the figures.")] = Path("out", "calibration"),
+    overrides: options.Overrides = None,
+    no_truth: Annotated[bool, typer.Option("--no-truth", help="Leave out motion capture.")] = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
+    from coopenv.backends.sources import SourceKind, kind_of, open_bags, open_recording
+    from coopenv.base.files import check_file, new_folder, replace_text
+    from coopenv.cars.calibration.drives import drive_of_bag, drive_of_recording
+    from coopenv.cars.calibration.findings import calibrate as calibrated
+    from coopenv.cars.calibration.findings import toml_text
+    from coopenv.runs.console import Progress
+
+    with new_folder(out):
+        check_file(out / "calibration.toml")
+        if topics is not None:
+            drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
+        elif overrides:
+            raise CoopenvError("--set: needs the map of the bags' topics, --map topics.toml")
+        elif len(bags) > 1 or kind_of(bags[0]) is not SourceKind.LOG:
+            raise CoopenvError(f"{bags[0]}: needs the map of its topics, --map topics.toml; a log of coopenv does not")
+        else:
+            drive = drive_of_recording(open_recording(bags[0]), bags[0])
+        with Progress(options.console(stderr=True), "calibrating"):
+            result = calibrated(drive, not no_truth)
+    files = [out / "calibration.toml"]
+    replace_text(files[0], toml_text(result))
+    if not no_figures:
+        from coopenv.viz.error_figures import residual_figure
+        from coopenv.viz.style import save
+
+        files += [
+            save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)
+        ]
+    if as_json:
+        options.print_json({"rows": result.rows, "findings": result.findings, "noise": result.noise})
+        return
+    _print(result.rows)
+    console = options.console(least=100)
+    if any(car.lens is None for car in drive.cars):
+        console.print("Bearings without pixels: intrinsics cannot be estimated.")
+    console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
+    for line in result.findings or ("No constant is wrong.",):
+        console.print(line, soft_wrap=True)
+    console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)
+
+
+def identify(
+    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, with the commands.")],
+    topics: options.TopicMap = None,
+    car: Annotated[str | None, typer.Option(help="Name of the car (default: the first one with commands).")] = None,
+    out: Annotated[Path, typer.Option(help="File of the result.")] = Path("out", "identified.toml"),
+    overrides: options.Overrides = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Estimate actuation, noise and links of a car from one drive, for fake cars that behave like it.
+
+    A deployment file takes the result as `identified`. The second table compares the bag with fakes that get the same
+    commands: Kolmogorov-Smirnov distances, 0 to 1, for the environment as it is, for the result, and by chance.
+    """
+    from coopenv.backends.sources import open_bags
+    from coopenv.base.files import check_file, replace_text
+    from coopenv.cars.calibration.identify import identify as identified
+    from coopenv.cars.calibration.identify import toml_text
+    from coopenv.runs.console import Progress, number_table
+
+    check_file(out)
+    bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    with Progress(options.console(stderr=True), "identifying"):
+        result = identified(bag, car)
+    replace_text(out, toml_text(result))
+    if as_json:
+        options.print_json({"car": result.car, "rows": result.rows, "distances": result.distances})
+        return
+    _print(result.rows)
+    table = number_table(["quantity"], ["samples", "as given", "identified", "by chance"])
+    for row in result.distances:
+        table.add_row(row.quantity, str(row.samples), *(f"{d:.3f}" for d in (row.given, row.identified, row.seeds)))
+    console = options.console(least=100)
+    console.print(table)
+    console.print(f"File: {out}", soft_wrap=True)
+
+
+def _print(rows: Sequence[Row]) -> None:
+    """Print a table of constants."""
+    from coopenv.runs.console import number_table
+
+    table = number_table(["constant", "unit", "finding"], ["given", "estimate", "std. error"])
+    for row in rows:
+        table.add_row(row.name, row.unit, row.finding, f"{row.given:.5g}", f"{row.value:.5g}", f"{row.error:.2g}")
+    options.console(least=100).print(table)

@@ -1,0 +1,61 @@
+"""A gate that stops its car: the way of a fake to a stand, rolling and braking."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from coopenv.cars.deployment import Safety
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
+from coopenv.cars.profile import NEUTRAL, SVEA, Brake, CarProfile, Limits, MotionCommand, Role
+from tests.cars.link.gate import messages
+from tests.helpers.fakes import EXACT, OVERTAKING, Stage
+
+BRAKE = Brake(fields={"z": 620.0}, deceleration=3.0)
+BRAKED = SVEA.model_copy(update={"command": SVEA.command.model_copy(update={"brake": BRAKE})})
+FAST = Limits(speed=1.53, steering=0.5, acceleration=2.0, steering_rate=2.0)
+
+
+def way_to_stand(profile: CarProfile, speed: float, cause: str) -> tuple[float, float, list[MotionCommand]]:
+    """Return time, s, and way, m, from the last command to a stand, and what the gate sent meanwhile."""
+    stage = Stage("svea_overtaking", OVERTAKING[:2], {**EXACT, "dynamics.max_speed": 1.53}, profile=profile)
+    gate = Gate("svea7", FAST, GateClock(lambda: stage.wall + stage.now, lambda: stage.now), profile=profile)
+    assert gate.arrive(Role.ARM, messages.arm(stage.wall + stage.now, "s", gate.nonce, True)) is None
+    told: list[MotionCommand] = []
+
+    def step() -> None:
+        payload = gate.tick()
+        told.append(read_drive(payload, profile.command))
+        stage.network.publish(profile.topic_of("svea7", Role.MANUAL), payload)
+        stage.run(PERIOD * 1e-9)
+
+    for k in range(60):
+        assert gate.arrive(Role.COMMAND, messages.command(stage.wall + stage.now, "s", k, 0.0, speed)) is None
+        step()
+    world, told[:] = stage.cars["svea7"].world, []
+    begin, way = stage.now, world.pose(world.agent)[1].copy()
+    if cause == "stop":
+        gate.arrive(Role.STOP, messages.stop(True))
+    while abs(world.twist[0][0]) > 0.02:
+        step()
+    reached = world.pose(world.agent)[1]
+    return (stage.now - begin) * 1e-9, float(((reached - way) ** 2).sum() ** 0.5), told
+
+
+@pytest.mark.parametrize("speed", [0.41, 1.0, 1.5])
+def test_a_braked_car_stands_sooner_and_inside_the_margin(speed: float) -> None:
+    for cause in ("silence", "stop"):
+        rolling, braking = way_to_stand(SVEA, speed, cause), way_to_stand(BRAKED, speed, cause)
+        for (seconds, way, _), brake in ((rolling, None), (braking, BRAKE)):
+            assert way < Safety().stopping(speed, brake)[1] and seconds < Safety().stopping(speed, brake)[0] + 0.35
+        assert braking[1] < rolling[1] - speed**2 / 2 * (1.0 - 1.0 / 3.0) * 0.6
+        braked = [drive for drive in braking[2] if drive.brake]
+        assert abs(len(braked) * 0.05 - speed / 3.0) <= 0.051
+        assert braking[2][-1] == NEUTRAL or len(braked) * 0.05 >= speed / 3.0 - 0.051
+    assert not any(drive.brake for drive in rolling[2])
+
+
+def test_a_brake_needs_fields_of_the_message() -> None:
+    given = SVEA.command.model_dump() | {"brake": {"fields": {"w": 1.0}, "deceleration": 3.0}}
+    with pytest.raises(ValidationError, match=r"brake.fields: 'w' is no field of neutral"):
+        type(SVEA.command)(**given)
