@@ -10,7 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self
 
-from coopenv.backends.mcap.format import CUT_OFF, MENDED, REPAIR, is_cut_off
+from coopenv.backends.mcap.format import REPAIR
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
 from coopenv.cars import codec
 
@@ -37,24 +37,15 @@ class BagFile:
         check_extra()
         if not path.exists():
             raise DataError(f"no such bag: {path}")
-        if path.is_dir() and not (path / METADATA).is_file():
-            raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         if path.is_file() and path.suffix not in REPAIRS:
             raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(REPAIRS)}")
         self._stack = ExitStack()
         self._parts = [path] if path.is_file() else [part for part in sorted(path.iterdir()) if part.is_file()]
         self._bytes = sum(part.stat().st_size for part in self._parts)
-        for part in self._parts:
-            if part.suffix == ".mcap" and is_cut_off(part):
-                raise DataError(f"{part}: {CUT_OFF}; {MENDED}")
-        from rosbags.highlevel import AnyReader
-
-        from coopenv.backends.mcap.container import Allowance
-
+        if not any(part.suffix in REPAIRS or part.name == METADATA for part in self._parts):
+            raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         try:
-            with limited(Allowance(self._bytes)):
-                reader = AnyReader([path], default_typestore=codec.ros1() if path.suffix == ".bag" else codec.ros2())
-                self._reader = self._stack.enter_context(reader)
+            self._reader = self._open()
             self._complete_types()
             self.topics = {name: info.msgtype or "" for name, info in self._reader.topics.items()}
             """Type of every topic; empty where messages of several types came on it."""
@@ -72,6 +63,38 @@ class BagFile:
     def __exit__(self, *unused: object) -> None:
         """Close the file."""
         self._stack.close()
+
+    def _open(self) -> Any:
+        """Return the reader of rosbags; where an index is missing, what is left of the files."""
+        from rosbags.highlevel import AnyReader
+
+        from coopenv.backends.mcap.container import Allowance
+        from coopenv.cars.bags.remains import Remains, ends_early
+
+        files = [part for part in self._parts if part.suffix in REPAIRS]
+        whole = self.path.is_file() or (self.path / METADATA).is_file()
+        store = codec.ros1() if self.path.suffix == ".bag" else codec.ros2()
+        early = any(map(ends_early, files))
+        with limited(Allowance(self._bytes)):
+            try:
+                if early:
+                    raise EOFError("its end is missing")
+                return self._stack.enter_context(AnyReader([self.path] if whole else files, default_typestore=store))
+            except Exception as error:
+                if is_too_large(error) or not (early or any(part.suffix != ".mcap" for part in files)):
+                    raise
+                reader = AnyReader(files, default_typestore=store)
+                reader.readers = [Remains(part) for part in files]
+                self._stack.enter_context(reader)
+                if not reader.connections:
+                    raise
+                read = (reader.end_time - reader.start_time) * 1e-9
+                warnings.warn(
+                    f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used",
+                    DataWarning,
+                    stacklevel=3,
+                )
+                return reader
 
     def _complete_types(self) -> None:
         """Add the definitions that are ours to give and that the bag lacks."""
