@@ -1,5 +1,6 @@
 """Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all by rosbags, which unpacks within limits."""
 
+import struct
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -9,6 +10,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.backends.mcap.format import REPAIR
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
@@ -83,17 +87,12 @@ class BagFile:
             except Exception as error:
                 if is_too_large(error) or not (early or any(part.suffix != ".mcap" for part in files)):
                     raise
-                reader = AnyReader(files, default_typestore=store)
+                reader: Any = AnyReader(files, default_typestore=store)
                 reader.readers = [Remains(part) for part in files]
                 self._stack.enter_context(reader)
                 if not reader.connections:
                     raise
-                read = (reader.end_time - reader.start_time) * 1e-9
-                warnings.warn(
-                    f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used",
-                    DataWarning,
-                    stacklevel=3,
-                )
+                self._warn_damaged((reader.end_time - reader.start_time) * 1e-9, error)
                 return reader
 
     def _complete_types(self) -> None:
@@ -109,6 +108,27 @@ class BagFile:
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
         DataWarning is given.
         """
+        for connection, received, data in self._raw(topics):
+            yield connection.topic, received, partial(self._decode, data, connection.msgtype)
+
+    def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Return stamps (0: none) and times of reception (n,), ns, of the messages of every topic."""
+        found: dict[str, list[tuple[int, int]]] = {name: [] for name in self.topics}
+        fields = self._reader.typestore.fielddefs
+        headed = {
+            kind: "std_msgs/msg/Header" in str(fields[kind][1][:1]) for kind in self.topics.values() if kind in fields
+        }
+        for connection, received, data in self._raw(self.topics):
+            stamp = 0
+            if headed.get(connection.msgtype) and len(data) >= 12:  # after 4 bytes: encapsulation, or seq of ROS 1
+                order = "<" if data[1] & 1 or not self._reader.is2 else ">"
+                seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
+                stamp = seconds * 10**9 + nanoseconds
+            found[connection.topic].append((stamp, received))
+        tables = {name: np.array(rows, np.int64).reshape(-1, 2).T for name, rows in found.items()}
+        return {name: (stamps, received) for name, (stamps, received) in tables.items()}
+
+    def _raw(self, topics: Collection[str]) -> Iterator[tuple[Any, int, bytes]]:
         from coopenv.backends.mcap.container import Allowance
 
         connections = [c for c in self._reader.connections if c.topic in topics]
@@ -120,19 +140,17 @@ class BagFile:
                     message = next(found, None)
                 if message is None:
                     return
-                connection, received, data = message
-                first = received if first is None else first
-                last = received
-                yield connection.topic, received, partial(self._decode, data, connection.msgtype)
+                last = message[1]
+                first = last if first is None else first
+                yield message
         except Exception as error:
             if last is None or first is None or is_too_large(error):
                 raise self._unreadable(error) from None
-            read = (last - first) * 1e-9
-            warnings.warn(
-                f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used",
-                DataWarning,
-                stacklevel=2,
-            )
+            self._warn_damaged((last - first) * 1e-9, error)
+
+    def _warn_damaged(self, read: float, error: Exception) -> None:
+        text = f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used"
+        warnings.warn(text, DataWarning, stacklevel=3)
 
     def _decode(self, data: bytes, kind: str) -> Any:
         """Return a message of a type. Raises CoopenvError: it makes no sense."""

@@ -1,7 +1,7 @@
 """What is left of a bag whose recording broke off: its messages in the order of the file, without an index.
 
-`Remains` takes the place of the readers of rosbags. The end of a file may be missing in the middle of a chunk; what that
-unpacks to counts as well.
+`Remains` takes the place of the readers of rosbags. A file may break off within a chunk, of which what can be unpacked
+counts as well.
 """
 
 import struct
@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from io import SEEK_CUR, BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple, Self
 
 import apsw
 from mcap.data_stream import ReadDataStream
@@ -106,7 +106,7 @@ def _of_mcap(path: Path, allowance: Allowance) -> Iterator[Entry]:
                 yield Entry(*about, record.log_time, record.data)
 
 
-def _mcap_records(stream: IO[bytes], allowance: Allowance) -> Iterator[Any]:
+def _mcap_records(stream: BinaryIO, allowance: Allowance) -> Iterator[Any]:
     """Yield schemas, channels and messages, also of the chunk in which a file breaks off."""
     while len(head := stream.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", head)
@@ -158,7 +158,8 @@ def _of_sqlite3(path: Path, _: Allowance) -> Iterator[Entry]:
         topics = {key: about for key, *about in database.execute("SELECT id, name, type FROM topics")}
         for topic, received, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
             name, kind = topics[topic]
-            yield Entry(name, kind, *texts.get(kind, ("", "")), received, data)
+            encoding, text = texts.get(kind, ("", ""))
+            yield Entry(name, kind, encoding, text, received, data)
     finally:
         database.close()
         files.unregister()
@@ -179,7 +180,7 @@ def _of_ros1(path: Path, allowance: Allowance) -> Iterator[Entry]:
                 yield Entry(topic, kind, "ros2msg", text, header.get_time("time"), data)
 
 
-def _ros1_records(stream: IO[bytes], allowance: Allowance) -> Iterator[tuple[Any, bytes]]:
+def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[Any, bytes]]:
     """Yield header and data of connections and messages, also of the chunk in which a file breaks off."""
     while stream.read(1):
         stream.seek(-1, SEEK_CUR)

@@ -13,6 +13,7 @@ from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.cars.profile import PREFIX
 from coopenv.cars.transport.base import Arrival, Callback, Transport
 
+AHEAD = 3.0  # s, of a wrong stamp
 _Kind = partial(FaultKind, start=True, duration=True)
 FAKE_FAULTS = {
     "freeze": _Kind("ON", "the computer stops: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),
@@ -21,6 +22,7 @@ FAKE_FAULTS = {
     "delay": _Kind("SECONDS", "by which all messages come later, both ways", None, 0.0, 60.0),
     "clock_offset": _Kind("SECONDS", "that its clock is ahead", None, -1e6, 1e6),
     "clock_drift": _Kind("RATE", "s per second that its clock gains", None, -0.1, 0.1),
+    "wrong_stamps": _Kind("SHARE", f"of the camera's frames whose stamps are {AHEAD:g} s ahead", None, 0.0, 1.0),
     "false_blocks": _Kind("RATE", "per second, blocks of the camera without a marker", None, 0.0, 1e3),
     "duplicate_blocks": _Kind("SHARE", "of blocks that are reported twice", 1.0, 0.0, 1.0),
     "swapped_signatures": _Kind("ON", "blocks of a frame exchange their numbers", 1.0, 1.0, 1.0),

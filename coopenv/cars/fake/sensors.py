@@ -10,7 +10,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.fake.faults import CarFaults
+from coopenv.cars.fake.faults import AHEAD, CarFaults
 from coopenv.cars.fake.world import CarWorld, Neighbours
 from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import Calibration
@@ -177,6 +177,9 @@ class Pixy:
 
     def _camera(self, due: int, stamp: int) -> None:
         blocks = self._frame(due)
+        share = self._faults.value("wrong_stamps", due)
+        if share and self._rng.random() < share:
+            stamp += round(AHEAD * 1e9)
         self._publisher.send(Role.DETECTIONS, stamp, "camera", objects=blocks)
         self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
 
