@@ -311,13 +311,6 @@ def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> Non
         assert_allclose(b.truth.rotation[0, :, 0], [-y, x, z], atol=1e-12)
 
 
-def test_the_map_of_the_page_is_one(tmp_path: Path) -> None:
-    docs = Path(__file__).parents[3] / "docs"
-    pages = [(docs / name).read_text(encoding="utf-8") for name in ("tutorials/logs.md", "bags.md")]
-    first, others = (re.findall(r"```toml[^\n]*\n(.*?)```", page, re.DOTALL) for page in pages)
-    assert opened(tmp_path, "\n".join([first[0], *others])).capabilities.truth
-
-
 def test_a_camera_with_another_rate_is_told(tmp_path: Path) -> None:
     with pytest.warns(DataWarning, match=r'60\.0 frames per second, the environment has 30: .* "rates.camera" = 60\.0'):
         opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
