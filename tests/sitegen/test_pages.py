@@ -194,7 +194,7 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
     elif page == "tutorials/train.md":
         assert program["infos"]["vehicle_1"]["outcome"] == "arrived" and program["worst"] < 0.5
     elif page == "tutorials/logs.md":
-        assert program["env"].possible_agents == ["vehicle_1"]
+        assert program["env"].possible_agents == ["vehicle_1", "vehicle_2"]
 
 
 def test_outputs_are_compared() -> None:
