@@ -196,7 +196,7 @@ class Channel(Section):
     field: str
     """Field of the message."""
     full: Positive
-    """Steering angle (rad, left is positive) or speed (m/s) at full."""
+    """Steering angle (rad, left is positive), turn rate (rad/s) or speed (m/s) at full."""
     change: Number
     """Change of the field from neutral to full."""
 
@@ -219,13 +219,16 @@ class CommandMessage(Section):
     neutral: dict[str, tuple[FieldType, Number]]
     """Fields after the header in their order: type, and value of a standing car. Nested messages are written flat."""
     steering: Channel
-    """Field of the steering angle."""
+    """Field of the steering angle; with `wheelbase`, of the turn rate."""
     speed: Channel
     """Field of the speed."""
     most: float = Field(default=1.0, gt=0.0, le=1.0)
     """Share of full that is sent at most, either way."""
     brake: Brake | None = None
     """With it a gate that stops its car brakes first (none: a stop is neutral alone)."""
+    wheelbase: Positive | None = None
+    """Of a car that takes turn rates, as those with a differential drive do: that of the environment's vehicle, m.
+    Turn rates are speed tan(steering) / wheelbase."""
     timeout: Positive = 0.5
     """Time without a message after which the car goes to neutral by itself, s (assumed by fake cars)."""
 
@@ -247,10 +250,12 @@ class CommandMessage(Section):
 
     def values(self, drive: MotionCommand) -> dict[str, float]:
         """Return the fields of a finite command by name."""
-        found = {name: value for name, (_, value) in self.neutral.items()}
+        found, turn = {name: value for name, (_, value) in self.neutral.items()}, drive.steering
         if drive.brake and self.brake:
             return found | self.brake.fields
-        for channel, value in ((self.steering, drive.steering), (self.speed, drive.speed)):
+        if self.wheelbase is not None:
+            turn = drive.speed * math.tan(drive.steering) / self.wheelbase
+        for channel, value in ((self.steering, turn), (self.speed, drive.speed)):
             found[channel.field] += channel.change * self.share(channel, value)
         return found
 
@@ -262,6 +267,8 @@ class CommandMessage(Section):
             (values[channel.field] - self.neutral[channel.field][1]) / channel.change * channel.full
             for channel in (self.steering, self.speed)
         )
+        if self.wheelbase is not None:
+            steering = math.atan(steering * self.wheelbase / speed) if speed else 0.0
         return MotionCommand(steering, speed)
 
 

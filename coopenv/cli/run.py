@@ -262,21 +262,37 @@ def import_(
     observer: options.LogObserver = None,
     scene: options.LogScene = True,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    propose: Annotated[
+        Path | None, typer.Option(help="TOML file to write: a map of the topics, by their types and names.")
+    ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Say what ROS bags hold, and make a recording of them.
+    """List what ROS bags hold, and make a recording of them.
 
-    Files and folders of ROS 1 and ROS 2. Without --map only their topics are listed.
+    Files and folders of ROS 1 and ROS 2. Without --map: rates, gaps and stamps of their topics; --propose writes a map.
     """
+    if topics is not None and propose is not None:
+        raise CoopenvError("--propose: writes a map, --map names one; give one of them")
     if topics is None:
         if out is not None or overrides:
             raise CoopenvError(f"{'--out' if out else '--set'}: needs the map of the bags' topics, --map topics.toml")
+        from coopenv.base.files import check_new, replace_text
+        from coopenv.cars.bags.doctor import examined, proposed
         from coopenv.cars.bags.files import BagFile
-        from coopenv.cars.bags.log import rows_of
 
+        if propose is not None:
+            check_new(propose, force)
         with ExitStack() as stack:
-            rows = rows_of([stack.enter_context(BagFile(path)) for path in bags])
+            files = [stack.enter_context(BagFile(path)) for path in bags]
+            rows, notes = examined(files)
+            text = "" if propose is None else proposed(files, rows)
         _print(rows, as_json)
+        console = options.console(stderr=as_json)
+        for note in notes:
+            console.print(note, soft_wrap=True)
+        if propose is not None:
+            replace_text(propose, text)
+            console.print(f"{propose}: set its environment and markers", soft_wrap=True)
         return
     from coopenv.backends.sources import open_bags
     from coopenv.base.files import check_new
@@ -316,7 +332,9 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
     numbers = [
         "messages",
         "rate\n[Hz]",
-        *(["used", "bad\nstamps", "longest\ngap [s]", "gaps", "clock\n[ms]", "leads\n[ms]"] if read else []),
+        *(["used"] if read else []),
+        *("bad\nstamps", "longest\ngap [s]", "gaps", "clock\n[ms]"),
+        *(["leads\n[ms]"] if read else []),
     ]
     table = number_table(names, numbers)
     for column in table.columns[: len(names)]:
@@ -324,8 +342,8 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
     for row in rows:
         about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
         offset = None if row.offset is None else 1e3 * row.offset
-        of_read = [(row.used, 0), (row.outlying, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)] if read else []
-        figures = [(row.rate, 1), *of_read]
+        used = [(row.used, 0)] if read else []
+        figures = [(row.rate, 1), *used, (row.outlying, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)]
         shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
         lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
         table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))

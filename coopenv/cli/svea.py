@@ -78,7 +78,8 @@ def fake(
         typer.Option(
             metavar="NAME[=VALUE][@START[+DURATION]]",
             help="What goes wrong, from when on and for how long in s, e.g. loss=0.2@5+10. Faults: freeze, kill, loss, "
-            "delay, clock_offset, clock_drift, false_blocks, duplicate_blocks, swapped_signatures. Repeatable.",
+            "delay, clock_offset, clock_drift, wrong_stamps, false_blocks, duplicate_blocks, swapped_signatures. "
+            "Repeatable.",
         ),
     ] = None,
     connect: options.Connect = None,

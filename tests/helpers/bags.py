@@ -145,19 +145,25 @@ def later(given: Iterable[Message], *, stamps: float = 0.0, received: float = 0.
 
 
 def write(path: Path, given: Iterable[Message], form: str) -> Path:
-    """Write a bag; `form` is ros1, sqlite3 or mcap. Return its path, with the suffix that the form has."""
+    """Write a bag; `form` is ros1, sqlite3 or mcap, and a compression. Return its path, with the form's suffix."""
     ordered = sorted(given, key=lambda m: m.received)
+    form, _, compression = form.partition(" ")
     if form == "ros1":
         from rosbags.rosbag1 import Writer as Writer1
 
         path = path.with_suffix(".bag")
-        with Writer1(path) as bag:
+        writer = Writer1(path)
+        if compression:
+            writer.set_compression(Writer1.CompressionFormat[compression])
+        with writer as bag:
             _fill(bag, ordered, codec.ros1(), lambda message: codec.ros1_of(codec.encode(message), message.__msgtype__))
         return path
-    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    plugin = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as bag:
+    folder = Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
+    if compression:
+        folder.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with folder as bag:
         _fill(bag, ordered, codec.ros2(), codec.encode)
     return path
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from coopenv.observers.registry import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.viz import FIGURE_NAMES
 from sitegen import mirror, pages, reference
-from tests.helpers import bags
 from tests.helpers.sessions import ROOT, blocks, compare, run_page
 
 LINK = re.compile(r"\]\(([^)]+)\)")
@@ -166,8 +166,8 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
     if page in NEEDS:
         module, extra = NEEDS[page]
         pytest.importorskip(module, reason=f"needs the extra {extra!r}")
-    if page == "tutorials/logs.md":  # the reader's bag
-        bags.write(folder / "drive", bags.messages(bags.drive()), "ros1")
+    if page == "tutorials/logs.md":
+        shutil.copytree(ROOT / "examples" / "bags", folder / "examples" / "bags")
     program = run_page(DOCS / page, folder, monkeypatch)
     if page == "tutorials/first_steps.md":
         assert (folder / "lost.png").stat().st_size > 20_000
@@ -194,7 +194,7 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
     elif page == "tutorials/train.md":
         assert program["infos"]["vehicle_1"]["outcome"] == "arrived" and program["worst"] < 0.5
     elif page == "tutorials/logs.md":
-        assert program["env"].possible_agents == ["vehicle_1"]
+        assert program["env"].possible_agents == ["vehicle_1", "vehicle_2"]
 
 
 def test_outputs_are_compared() -> None:

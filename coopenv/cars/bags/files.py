@@ -1,5 +1,6 @@
 """Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all by rosbags, which unpacks within limits."""
 
+import struct
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
@@ -10,7 +11,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self
 
-from coopenv.backends.mcap.format import CUT_OFF, MENDED, REPAIR, is_cut_off
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.backends.mcap.format import REPAIR
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
 from coopenv.cars import codec
 
@@ -37,24 +41,15 @@ class BagFile:
         check_extra()
         if not path.exists():
             raise DataError(f"no such bag: {path}")
-        if path.is_dir() and not (path / METADATA).is_file():
-            raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         if path.is_file() and path.suffix not in REPAIRS:
             raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(REPAIRS)}")
         self._stack = ExitStack()
         self._parts = [path] if path.is_file() else [part for part in sorted(path.iterdir()) if part.is_file()]
         self._bytes = sum(part.stat().st_size for part in self._parts)
-        for part in self._parts:
-            if part.suffix == ".mcap" and is_cut_off(part):
-                raise DataError(f"{part}: {CUT_OFF}; {MENDED}")
-        from rosbags.highlevel import AnyReader
-
-        from coopenv.backends.mcap.container import Allowance
-
+        if not any(part.suffix in REPAIRS or part.name == METADATA for part in self._parts):
+            raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         try:
-            with limited(Allowance(self._bytes)):
-                reader = AnyReader([path], default_typestore=codec.ros1() if path.suffix == ".bag" else codec.ros2())
-                self._reader = self._stack.enter_context(reader)
+            self._reader = self._open()
             self._complete_types()
             self.topics = {name: info.msgtype or "" for name, info in self._reader.topics.items()}
             """Type of every topic; empty where messages of several types came on it."""
@@ -73,6 +68,33 @@ class BagFile:
         """Close the file."""
         self._stack.close()
 
+    def _open(self) -> Any:
+        """Return the reader of rosbags; where an index is missing, what is left of the files."""
+        from rosbags.highlevel import AnyReader
+
+        from coopenv.backends.mcap.container import Allowance
+        from coopenv.cars.bags.remains import Remains, ends_early
+
+        files = [part for part in self._parts if part.suffix in REPAIRS]
+        whole = self.path.is_file() or (self.path / METADATA).is_file()
+        store = codec.ros1() if self.path.suffix == ".bag" else codec.ros2()
+        early = any(map(ends_early, files))
+        with limited(Allowance(self._bytes)):
+            try:
+                if early:
+                    raise EOFError("its end is missing")
+                return self._stack.enter_context(AnyReader([self.path] if whole else files, default_typestore=store))
+            except Exception as error:
+                if is_too_large(error) or not (early or any(part.suffix != ".mcap" for part in files)):
+                    raise
+                reader: Any = AnyReader(files, default_typestore=store)
+                reader.readers = [Remains(part) for part in files]
+                self._stack.enter_context(reader)
+                if not reader.connections:
+                    raise
+                self._warn_damaged((reader.end_time - reader.start_time) * 1e-9, error)
+                return reader
+
     def _complete_types(self) -> None:
         """Add the definitions that are ours to give and that the bag lacks."""
         store, known = self._reader.typestore, codec.ros1() if not self._reader.is2 else codec.ros2()
@@ -86,6 +108,27 @@ class BagFile:
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
         DataWarning is given.
         """
+        for connection, received, data in self._raw(topics):
+            yield connection.topic, received, partial(self._decode, data, connection.msgtype)
+
+    def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Return stamps (0: none) and times of reception (n,), ns, of the messages of every topic."""
+        found: dict[str, list[tuple[int, int]]] = {name: [] for name in self.topics}
+        fields = self._reader.typestore.fielddefs
+        headed = {
+            kind: "std_msgs/msg/Header" in str(fields[kind][1][:1]) for kind in self.topics.values() if kind in fields
+        }
+        for connection, received, data in self._raw(self.topics):
+            stamp = 0
+            if headed.get(connection.msgtype) and len(data) >= 12:  # after 4 bytes: encapsulation, or seq of ROS 1
+                order = "<" if data[1] & 1 or not self._reader.is2 else ">"
+                seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
+                stamp = seconds * 10**9 + nanoseconds
+            found[connection.topic].append((stamp, received))
+        tables = {name: np.array(rows, np.int64).reshape(-1, 2).T for name, rows in found.items()}
+        return {name: (stamps, received) for name, (stamps, received) in tables.items()}
+
+    def _raw(self, topics: Collection[str]) -> Iterator[tuple[Any, int, bytes]]:
         from coopenv.backends.mcap.container import Allowance
 
         connections = [c for c in self._reader.connections if c.topic in topics]
@@ -97,19 +140,17 @@ class BagFile:
                     message = next(found, None)
                 if message is None:
                     return
-                connection, received, data = message
-                first = received if first is None else first
-                last = received
-                yield connection.topic, received, partial(self._decode, data, connection.msgtype)
+                last = message[1]
+                first = last if first is None else first
+                yield message
         except Exception as error:
             if last is None or first is None or is_too_large(error):
                 raise self._unreadable(error) from None
-            read = (last - first) * 1e-9
-            warnings.warn(
-                f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used",
-                DataWarning,
-                stacklevel=2,
-            )
+            self._warn_damaged((last - first) * 1e-9, error)
+
+    def _warn_damaged(self, read: float, error: Exception) -> None:
+        text = f"{self.path}: damaged after {read:.1f} s ({error_text(error)}); what came before it is used"
+        warnings.warn(text, DataWarning, stacklevel=3)
 
     def _decode(self, data: bytes, kind: str) -> Any:
         """Return a message of a type. Raises CoopenvError: it makes no sense."""

@@ -53,7 +53,7 @@ class FakeSettings(Section):
 
 
 USUAL = FakeSettings()
-
+AHEAD = 3.0  # s, of a wrong stamp
 _Kind = partial(FaultKind, start=True, duration=True)
 FAKE_FAULTS = {
     "freeze": _Kind("ON", "the computer stops: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),
@@ -62,6 +62,7 @@ FAKE_FAULTS = {
     "delay": _Kind("SECONDS", "by which all messages come later, both ways", None, 0.0, 60.0),
     "clock_offset": _Kind("SECONDS", "that its clock is ahead", None, -1e6, 1e6),
     "clock_drift": _Kind("RATE", "s per second that its clock gains", None, -0.1, 0.1),
+    "wrong_stamps": _Kind("SHARE", f"of the camera's frames whose stamps are {AHEAD:g} s ahead", None, 0.0, 1.0),
     "false_blocks": _Kind("RATE", "per second, blocks of the camera without a marker", None, 0.0, 1e3),
     "duplicate_blocks": _Kind("SHARE", "of blocks that are reported twice", 1.0, 0.0, 1.0),
     "swapped_signatures": _Kind("ON", "blocks of a frame exchange their numbers", 1.0, 1.0, 1.0),

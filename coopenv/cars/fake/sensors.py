@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.codec import encode, header, make
-from coopenv.cars.fake.faults import CarFaults, FakeSettings
+from coopenv.cars.codec import encode, header, make, ros2
+from coopenv.cars.fake.faults import AHEAD, CarFaults, FakeSettings
 from coopenv.cars.fake.world import CarWorld, Neighbours
-from coopenv.cars.profile import SVEA, CarProfile, Role
+from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.readings import Calibration
 from coopenv.cars.transport.base import Transport
 from coopenv.estimation.lens import distort
@@ -46,15 +45,17 @@ class SensorPublisher:
         self.name, self._profile, self._network = name, profile, network
 
     def send(self, role: Role, stamp: int, frame: str, /, **fields: Any) -> None:
-        """Publish a message by its fields; a stamp in ns.
+        """Publish a message by its fields, which are those of SVEA's type; a stamp in ns.
 
-        Raises:
-            CoopenvError: the profile has another type for the role than SVEA's.
+        Types without covariances, or without a twist, get what they have room for.
         """
-        topic, kind = self._profile.topics[role], SVEA.topics[role].type
-        if kind != topic.type:
-            raise CoopenvError(f"profile: topics.{role}.type: {topic.type}: fake cars have {kind} alone")
-        payload = encode(make(kind, header=header(stamp, frame), **fields))
+        topic = self._profile.topics[role]
+        known = {name: node[1] for name, node in ros2().fielddefs[topic.type][1]}
+        for name in fields.keys() & {"pose", "twist"}:
+            if name in known and "WithCovariance" not in str(known[name]):
+                fields[name] = fields[name][name]
+        held = {name: value for name, value in fields.items() if name in known}
+        payload = encode(make(topic.type, header=header(stamp, frame), **held))
         name = self._profile.topic_of(self.name, role)
         self._network.publish(name, payload, urgent=topic.urgent, reliable=topic.reliable)
 
@@ -183,6 +184,9 @@ class Pixy:
 
     def _camera(self, due: int, stamp: int) -> None:
         blocks = self._frame(due)
+        share = self._faults.value("wrong_stamps", due)
+        if share and self._rng.random() < share:
+            stamp += round(AHEAD * 1e9)
         self._publisher.send(Role.DETECTIONS, stamp, "camera", objects=blocks)
         self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, Remote, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
 from coopenv.cars.gate.process import GateConnection
-from coopenv.cars.profile import FOLDER, USUAL, CarProfile, MotionCommand, Role, load_profile
+from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
 from coopenv.cars.transport.base import Arrival
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
 from tests.helpers.hub import Hub
@@ -223,6 +224,35 @@ def test_a_second_make_drives_a_fake_and_is_read(rover: CarProfile) -> None:
         backend.close()
 
 
+def test_a_differential_drive_by_its_profile_alone() -> None:
+    """The turn rate on cmd_vel is that of the bicycle, and a fake of it drives the same curve as one of SVEA."""
+    robot, turns = load_profile("diffdrive"), {}
+    for profile in (robot, SVEA):
+        stage = Stage("svea_overtaking", OVERTAKING, EXACT, profile=profile)
+        stage.drive("svea7", 0.3, 0.25, 2.0)
+        wheel, imu = stage.arrivals("svea7", Role.WHEEL)[-1], stage.arrivals("svea7", Role.IMU)[-1]
+        twist = wheel.twist.twist
+        turns[profile.topics[Role.MANUAL].type] = twist.linear.x, imu.angular_velocity.z
+        if profile is robot:
+            sent = stage.arrivals("svea7", Role.MANUAL)[-1].twist
+            assert sent.linear.x == pytest.approx(0.3)
+            assert sent.angular.z == pytest.approx(0.3 * math.tan(0.25) / 0.324)
+            backend = Svea(stage.fleet, bind(stage.scenario, OVERTAKING, MARKERS, "t", None, robot), Hub().connect())
+            read = [sample for arrival in stage.hub_arrivals for sample in backend.intake.samples(arrival)]
+            assert {sample.role for sample in read} == {Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.TRUTH}
+            assert not backend.intake.rejected["svea7"]
+            backend.close()
+    assert turns["geometry_msgs/msg/TwistStamped"] == pytest.approx(turns["mavros_msgs/msg/ManualControl"], abs=1e-4)
+
+
+@pytest.mark.parametrize("drive", [MotionCommand(0.3, 0.4), MotionCommand(-0.2, -0.3), MotionCommand(0.0, 0.5)])
+def test_turn_rates_go_back_to_steering_angles(drive: MotionCommand) -> None:
+    message = load_profile("diffdrive").command
+    back = message.drive(message.values(drive))
+    assert (back.steering, back.speed) == pytest.approx((drive.steering, drive.speed))
+    assert message.drive(message.values(MotionCommand(0.3, 0.0))) == MotionCommand()
+
+
 def test_its_gate_sends_its_own_command_message(rover: CarProfile) -> None:
     hub, sent, now = Hub(), list[Arrival](), [time.time_ns()]
     hub.connect().subscribe("robots/svea7/drive", sent.append)
@@ -293,5 +323,5 @@ def test_types_that_cannot_be_read_are_refused(rover: CarProfile) -> None:
 
 
 def test_every_shipped_profile_is_valid() -> None:
-    assert [file.stem for file in FOLDER.glob("*.toml")] == ["svea"]
-    assert isinstance(load_profile("svea"), CarProfile)
+    names = sorted(file.stem for file in FOLDER.glob("*.toml"))
+    assert names == ["diffdrive", "svea"] and all(isinstance(load_profile(name), CarProfile) for name in names)
