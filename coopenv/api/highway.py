@@ -85,7 +85,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         declared = self._load(self._overrides).highway
         if declared is None:
             raise CoopenvError(f'EstimatedKinematics: {scenario} has not backend = "highway"')
-        self._most = declared.most_vehicles
+        self._most = max(1, declared.most_vehicles)  # doubled as needed
         self._engines: dict[tuple[int, int], Engine] = {}
         self._rng = np.random.default_rng()
         self._cars: list[Any] = []  # connected ones, then the agent's, which receives from all of them
