@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
@@ -50,25 +50,30 @@ class Kind(NamedTuple):
     unit: str
     prior: float  # standard deviation; rad for deg
     step: float  # of differences
+    part: str = ""  # title of the finding that names it
 
 
 PER_CAR = (
-    *(Kind(f"camera.{name}", "deg", 0.2, 1e-6) for name in ("roll", "pitch", "yaw")),
-    *(Kind(f"camera.{name}", "m", 0.3, 1e-6) for name in "xyz"),
-    *(Kind(f"camera.{name}", "px", 40.0, 1e-4) for name in ("fx", "fy", "cx", "cy")),
-    *(Kind(f"camera.{name}", "", 0.5, 1e-7) for name in ("k1", "k2")),
-    *(Kind(f"camera.{name}", "", 0.02, 1e-7) for name in ("p1", "p2")),
-    Kind("camera.k3", "", 0.2, 1e-7),
-    Kind("wheel.scale", "", 0.15, 1e-7),
-    Kind("gyro.bias", "rad/s", 0.1, 1e-7),
-    Kind("camera.offset", "s", 0.5, 1e-5),
-    Kind("wheel.offset", "s", 0.05, 1e-5),
-    Kind("truth.offset", "s", 0.5, 1e-5),
-    Kind("truth.body_yaw", "deg", 0.2, 1e-6),
-    *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6) for axis in "xy"),
+    *(Kind(f"camera.{name}", "deg", 0.2, 1e-6, "camera orientation") for name in ("roll", "pitch", "yaw")),
+    *(Kind(f"camera.{name}", "m", 0.3, 1e-6, "camera position") for name in "xyz"),
+    *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "focal length") for name in ("fx", "fy")),
+    *(Kind(f"camera.{name}", "px", 40.0, 1e-4, "principal point") for name in ("cx", "cy")),
+    *(Kind(f"camera.{name}", "", 0.5, 1e-7, "lens distortion") for name in ("k1", "k2")),
+    *(Kind(f"camera.{name}", "", 0.02, 1e-7, "lens distortion") for name in ("p1", "p2")),
+    Kind("camera.k3", "", 0.2, 1e-7, "lens distortion"),
+    Kind("wheel.scale", "", 0.15, 1e-7, "wheel scale"),
+    Kind("gyro.bias", "rad/s", 0.1, 1e-7, "gyro bias"),
+    Kind("camera.offset", "s", 0.5, 1e-5, "stamps"),
+    Kind("wheel.offset", "s", 0.05, 1e-5, "stamps"),
+    Kind("truth.offset", "s", 0.5, 1e-5, "stamps"),
+    Kind("truth.body_yaw", "deg", 0.2, 1e-6, "body of motion capture"),
+    *(Kind(f"truth.body_{axis}", "m", 0.1, 1e-6, "body of motion capture") for axis in "xy"),
 )
 """Constants of a car."""
-FRAME = (Kind("truth.frame_yaw", "deg", 0.2, 1e-6), *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6) for axis in "xy"))
+FRAME = (
+    Kind("truth.frame_yaw", "deg", 0.2, 1e-6, "frame of motion capture"),
+    *(Kind(f"truth.frame_{axis}", "m", 0.3, 1e-6, "frame of motion capture") for axis in "xy"),
+)
 ROT, LEVER, LENS, SCALE, BIAS = slice(0, 3), slice(3, 6), slice(6, 15), 15, 16
 CAMERA_TIME, WHEEL_TIME, TRUTH_TIME, BODY = 17, 18, 19, slice(20, 23)
 NUISANCE = (SCALE, BIAS)
@@ -104,7 +109,6 @@ class Fit:
     poses: tuple[Array, ...]  # per car (M, 3): x, y, yaw at keyframes
     sigma: Array  # (C, 3) sightings, places and yaws of motion capture
     free: Mask  # (G,)
-    cost: float = np.inf
 
 
 class Batch:
@@ -114,10 +118,19 @@ class Batch:
         """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
         self.drive, self.cars, self.places = drive, drive.cars, drive.places
         self.truth = [truth and len(car.truth_time) > 1 for car in self.cars]
-        marker = Kind("", "m", 0.3, 1e-6)
-        self.kinds = [kind._replace(name=f"{car.name}.{kind.name}") for car in self.cars for kind in PER_CAR]
-        self.kinds += [marker._replace(name=f"marker.{name}.{axis}") for name in drive.landmarks for axis in "xyz"]
-        self.kinds += FRAME
+        self.kinds = [
+            *(
+                kind._replace(name=f"{car.name}.{kind.name}", part=f"{car.name}: {kind.part}")
+                for car in self.cars
+                for kind in PER_CAR
+            ),
+            *(
+                Kind(f"marker.{name}.{axis}", "m", 0.3, 1e-6, f"marker {name}: position")
+                for name in drive.landmarks
+                for axis in "xyz"
+            ),
+            *FRAME,
+        ]
         self.markers = len(PER_CAR) * len(self.cars)
         self.frame = len(self.kinds) - len(FRAME)
         self.prior = np.array([kind.prior for kind in self.kinds])
@@ -293,33 +306,28 @@ class Batch:
 
     def solved(self, fit: Fit, columns: NDArray[np.int64]) -> "System":
         """Return the normal equations of constants, from which poses are eliminated."""
-        G = len(columns)
-        S, g, scores = np.diag(1.0 / self.prior[columns] ** 2), -fit.x[columns] / self.prior[columns] ** 2, []
-        back = []
+        S, g = np.diag(1.0 / self.prior[columns] ** 2), -fit.x[columns] / self.prior[columns] ** 2
+        scores, back = [], []
         for c in range(len(self.cars)):
             own = (columns >= self.own(c).start) & (columns < self.own(c).stop)
             mine = np.flatnonzero(own | (columns >= self.markers))
             r, W, P, J = self.linearised(c, fit, columns[mine])
             PW = P.T.multiply(W).tocsr()
-            information = (PW @ P).tocsr()
-            bands = np.zeros((6, information.shape[0]))
-            for d in range(6):
-                bands[d, : information.shape[0] - d] = information.diagonal(-d)
+            information = PW @ P
+            bands = np.array([np.append(information.diagonal(-d), np.zeros(d)) for d in range(6)])
             bands[0] += 1e-6
             cross = PW @ np.column_stack([J, r])
-            solution = cho_solve_banded((cholesky_banded(bands, lower=True), True), cross)
+            solution = solveh_banded(bands, cross, lower=True)
             S[np.ix_(mine, mine)] += (J.T * W) @ J - cross[:, :-1].T @ solution[:, :-1]
             effective = J - P @ solution[:, :-1]
             rest = r - P @ solution[:, -1]
             g[mine] -= (effective.T * W) @ r
-            score = np.zeros((int(np.ptp(self.times(c)) / STRETCH) + 1, G))
-            stretch = ((self.times(c) - self.times(c).min()) / STRETCH).astype(int)
-            part = effective * (W * rest)[:, None]
-            for n, column in enumerate(mine):
-                score[:, column] = np.bincount(stretch, part[:, n], minlength=len(score))
+            part = by_stretch(self.times(c), effective, W * rest)
+            score = np.zeros((len(part), len(columns)))
+            score[:, mine] = part
             scores.append(score)
             back.append((mine, solution))
-        return System(columns, S, g, np.concatenate(scores), back)
+        return System(S, g, np.concatenate(scores), back)
 
     def times(self, c: int) -> Array:
         """Return when the rows of a car's residuals are, s."""
@@ -333,7 +341,7 @@ class Batch:
         for _ in range(most):
             sigma = self.scales(fit.x, fit.poses)
             before = self.cost(fit.x, fit.poses, sigma, fit.free)
-            fit = replace(fit, sigma=sigma, cost=before)
+            fit = replace(fit, sigma=sigma)
             system = self.solved(fit, columns)
             change = np.linalg.solve(system.S, system.g)
             moves = [-(y[:, -1] + y[:, :-1] @ change[mine]).reshape(-1, 3) for mine, y in system.back]
@@ -346,7 +354,7 @@ class Batch:
                     break
             else:
                 return fit
-            fit = replace(fit, x=x, poses=poses, cost=cost)
+            fit = replace(fit, x=x, poses=poses)
             if before - cost < 1e-4 * (1.0 + 1e-3 * before):
                 break
         return fit
@@ -439,23 +447,23 @@ class Batch:
 class System(NamedTuple):
     """Normal equations of constants."""
 
-    columns: NDArray[np.int64]
     S: Array  # information
     g: Array
     scores: Array  # (stretches, G)
     back: list[tuple[NDArray[np.int64], Array]]  # per car: its constants, and what the poses follow by
 
-    def covariance(self, prior: Array) -> Array:
-        """Return the covariance of the constants; `prior` are their standard deviations."""
-        return sandwich(self.S, self.scores, prior[self.columns])
+
+def by_stretch(time: Array, J: Array, r: Array) -> Array:
+    """Return the scores (stretches, G) of derivatives (n, G) and weighted residuals (n,) at times, s."""
+    stretch = ((time - time.min()) / STRETCH).astype(int)
+    return np.stack([np.bincount(stretch, column * r) for column in J.T], axis=-1).astype(np.float64)
 
 
-def sandwich(S: Array, scores: Array, prior: Array) -> Array:
-    """Return the covariance by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
+def standard_errors(S: Array, scores: Array, prior: Array) -> Array:
+    """Return those by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
     inverse = np.linalg.inv(S)
     robust = inverse @ (scores.T @ scores + np.diag(prior**-2)) @ inverse
-    more = np.sqrt(np.maximum(robust.diagonal() / inverse.diagonal(), 1.0))
-    return np.asarray(inverse * np.outer(more, more))
+    return np.sqrt(np.maximum(robust.diagonal(), inverse.diagonal()))
 
 
 def _flat(parts: tuple[Array, Array, Array]) -> Array:

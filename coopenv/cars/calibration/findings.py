@@ -7,7 +7,7 @@ from there until none is worth its penalty.
 Source: Schwarz, Estimating the dimension of a model, Annals of Statistics 6, 1978.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import log
@@ -28,6 +28,7 @@ from coopenv.cars.calibration.batch import (
     WHEEL_TIME,
     Batch,
     Fit,
+    standard_errors,
     stated_rate,
 )
 from coopenv.cars.calibration.drives import Drive
@@ -71,41 +72,26 @@ class Calibrated:
     noise: dict[str, float]  # measured, by key of an environment
 
 
-PARTS = {
-    "camera orientation": ("camera.roll", "camera.pitch", "camera.yaw"),
-    "camera position": ("camera.x", "camera.y", "camera.z"),
-    "focal length": ("camera.fx", "camera.fy"),
-    "principal point": ("camera.cx", "camera.cy"),
-    "lens distortion": ("camera.k1", "camera.k2", "camera.p1", "camera.p2", "camera.k3"),
-    "wheel scale": ("wheel.scale",),
-    "gyro bias": ("gyro.bias",),
-    "stamps": ("camera.offset", "wheel.offset", "truth.offset"),
-    "body of motion capture": ("truth.body_yaw", "truth.body_x", "truth.body_y"),
-}
-"""Constants of a car that are wrong together, and that one finding names together."""
-ALSO = (
-    *(PARTS["camera orientation"] + PARTS["camera position"], PARTS["focal length"] + PARTS["principal point"]),
-    PARTS["focal length"] + PARTS["principal point"] + PARTS["lens distortion"],
-    ("camera.offset", "truth.offset"),
-)
-"""Further hypotheses."""
+INTRINSICS = ("focal length", "principal point", "lens distortion")
+TOGETHER = (("camera orientation", "camera position"), INTRINSICS[:2], INTRINSICS)
+"""Parts of a car that may be wrong at the same time."""
 
 
 def parts_of(batch: Batch) -> dict[str, list[int]]:
     """Return the constants that one finding names together, by its title."""
-    number = {kind.name: n for n, kind in enumerate(batch.kinds)}
-    found = {f"{car.name}: {title}": [number[f"{car.name}.{name}"] for name in names]
-             for car in batch.cars for title, names in PARTS.items()}  # fmt: skip
-    for i, name in enumerate(batch.drive.landmarks):
-        found[f"marker {name}: position"] = list(range(batch.marker(i).start, batch.marker(i).stop))
-    return found | {"frame of motion capture": list(range(batch.frame, len(batch.kinds)))}
+    found: dict[str, list[int]] = {}
+    for n, kind in enumerate(batch.kinds):
+        found.setdefault(kind.part, []).append(n)
+    return found
 
 
 def hypotheses(batch: Batch) -> list[NDArray[np.int64]]:
     """Return the groups of constants that may be wrong."""
-    number = {kind.name: n for n, kind in enumerate(batch.kinds)}
-    groups = [*parts_of(batch).values()]
-    groups += [[number[f"{car.name}.{name}"] for name in names] for car in batch.cars for names in ALSO]
+    parts = parts_of(batch)
+    groups = [*parts.values()]
+    for c, car in enumerate(batch.cars):
+        groups += [[n for title in titles for n in parts[f"{car.name}: {title}"]] for titles in TOGETHER]
+        groups.append([batch.own(c).start + n for n in (CAMERA_TIME, TRUTH_TIME)])
     groups += [[n] for n, kind in enumerate(batch.kinds[: batch.markers]) if kind.unit in ("deg", "m", "s")]
     return [np.array(group) for group in groups if batch.known[group].all()]
 
@@ -164,10 +150,9 @@ def _calibrated(batch: Batch) -> Calibrated:
         fit = tried[best]
     error = errors(batch, fit)
     kept = given.free | wrong(batch, fit, error)
-    for c in range(len(batch.cars)):  # coefficients of a lens are right or wrong together
-        lens = kept[batch.own(c)][LENS]
-        for part in (slice(0, 2), slice(2, 4), slice(4, 9)):
-            lens[part] = lens[part].any()
+    for title, part in parts_of(batch).items():  # coefficients of a lens are right or wrong together
+        if title.endswith(INTRINSICS):
+            kept[part] = kept[part].any()
     fit = batch.fit(replace(fit, free=kept, x=np.where(kept, fit.x, 0.0)))
     return _result(batch, given, fit, pairs)
 
@@ -192,9 +177,10 @@ def gains(
 
 def errors(batch: Batch, fit: Fit) -> Array:
     """Return the standard errors (G,) of the free constants; infinite for others."""
-    system = batch.solved(fit, np.flatnonzero(fit.free))
+    columns = np.flatnonzero(fit.free)
+    system = batch.solved(fit, columns)
     error = np.full(len(fit.x), np.inf)
-    error[system.columns] = np.sqrt(system.covariance(batch.prior).diagonal())
+    error[columns] = standard_errors(system.S, system.scores, batch.prior[columns])
     for c, car in enumerate(batch.cars):  # a stamp may mean the begin or the end of a sample's period
         period = float(np.median(np.diff(car.wheel_time))) / np.sqrt(12.0)
         times = batch.own(c).start + np.array([CAMERA_TIME, WHEEL_TIME, TRUTH_TIME])
@@ -287,29 +273,22 @@ def overrides(result: Calibrated) -> dict[str, float | list[float]]:
 
 def toml_text(result: Calibrated) -> str:
     """Return overrides, clock offsets and all constants with their standard errors as TOML."""
-    lines = [
-        "# Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks].",
-        "",
-        "[overrides]",
-    ]
-    lines += [f'"{key}" = {value}' for key, value in overrides(result).items()]
     offsets: dict[str, float] = {}
     for c, car in enumerate(result.batch.cars):
         values = (result.batch.base + result.fit.x)[result.batch.own(c)][CAMERA_TIME : TRUTH_TIME + 1]
-        offsets |= {
-            topic: float(value) for (topic, _), value in zip(car.topics, values, strict=True) if topic and value
-        }
-    lines += [
-        "",
-        "[clocks]",
-        "offsets = {" + ", ".join(f' "{key}" = {value:.5f}' for key, value in offsets.items()) + " }",
-    ]
-    return "\n".join([*lines, *constants(result.rows)]) + "\n"
+        pairs = zip(car.topics, values, strict=True)
+        offsets |= {topic: round(float(value), 5) for (topic, _), value in pairs if topic and value}
+    first = "Written by coopenv calibrate. Key `calibration` of a bag's map uses [overrides] and [clocks]."
+    return tables_text(first, {"overrides": overrides(result), "clocks.offsets": offsets}, result.rows)
 
 
-def constants(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the lines of a table of constants in TOML."""
-    yield from ("", "[constants]")
+def tables_text(first: str, tables: Mapping[str, Mapping[str, object]], rows: Sequence[Row]) -> str:
+    """Return tables, and one of constants, as TOML after a comment."""
+    lines = [f"# {first}"]
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f'"{key}" = {value}' for key, value in table.items())]
+    lines += ["", "[constants]"]
     for row in rows:
         numbers = f"given = {row.given:.7g}, value = {row.value:.7g}, standard_error = {row.error:.3g}"
-        yield f'"{row.name}" = {{ {numbers}, unit = "{row.unit}", finding = "{row.finding}" }}'
+        lines.append(f'"{row.name}" = {{ {numbers}, unit = "{row.unit}", finding = "{row.finding}" }}')
+    return "\n".join(lines) + "\n"

@@ -10,7 +10,7 @@ from scipy.stats import ks_2samp
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.cars.calibration.batch import deviation, stated_rate
 from coopenv.cars.calibration.drives import tracks_of
-from coopenv.cars.calibration.findings import Row, constants
+from coopenv.cars.calibration.findings import Row, tables_text
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
 from coopenv.cars.fake.faults import USUAL, FakeSettings
 from coopenv.cars.fake.replay import Sent, replay
@@ -209,7 +209,5 @@ def tables(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
 def toml_text(result: Identified) -> str:
     """Return overrides, settings of the fake, and all constants with their standard errors as TOML."""
     overrides, fake = tables(result.rows)
-    lines = ["# Written by coopenv identify. Key `identified` of a deployment file uses [overrides] and [fake].", ""]
-    lines += ["[overrides]", *(f'"{key}" = {value}' for key, value in overrides.items())]
-    lines += ["", "[fake]", *(f"{key} = {value}" for key, value in fake.items())]
-    return "\n".join([*lines, *constants(result.rows)]) + "\n"
+    first = "Written by coopenv identify. Key `identified` of a deployment file uses [overrides] and [fake]."
+    return tables_text(first, {"overrides": overrides, "fake": fake}, result.rows)

@@ -14,7 +14,7 @@ import warp as wp
 from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
-from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, STRETCH, Kind, deviation, sandwich
+from coopenv.cars.calibration.batch import LEAST_PLACE, LOSS, Kind, by_stretch, deviation, standard_errors
 from coopenv.estimation.poses import Array, Mask
 from coopenv.world.dynamics import follow_commands
 from coopenv.world.launch import kernel, launch, start_warp
@@ -177,9 +177,8 @@ def constants_of(response: Response, given: Array, dead: float) -> Constants:
         starts.append(_fitted(response, given, x, dead, 1))
     fit = _fitted(response, given, min(starts, key=lambda start: start.cost).x, dead, PASSES)
     free, x, error = response.free, fit.x, np.zeros(len(KINDS))
-    stretch = (np.concatenate([time for time, _ in response.series]) / STRETCH).astype(int)
-    scores = np.stack([np.bincount(stretch, column * fit.r) for column in fit.J.T], axis=-1).astype(np.float64)
-    error[free] = np.sqrt(sandwich(fit.J.T @ fit.J + np.diag(PRIOR[free] ** -2), scores, PRIOR[free]).diagonal())
+    scores = by_stretch(np.concatenate([time for time, _ in response.series]), fit.J, fit.r)
+    error[free] = standard_errors(fit.J.T @ fit.J + np.diag(PRIOR[free] ** -2), scores, PRIOR[free])
     without = np.tile(x, (1 + len(reached), 1))
     without[1:, LIMITS] *= 1.0 + 9.0 * np.eye(len(reached))
     rows = response.rows(without, np.full(len(without), fit.dead))
