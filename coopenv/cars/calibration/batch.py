@@ -17,10 +17,13 @@ Statistical Institute 52, 1987; White, Maximum likelihood estimation of misspeci
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import product
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
@@ -116,8 +119,14 @@ class Batch:
 
     def __init__(self, drive: Drive, truth: bool) -> None:
         """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
-        self.drive, self.cars, self.places = drive, drive.cars, drive.places
-        self.truth = [truth and len(car.truth_time) > 1 for car in self.cars]
+        self.drive, self.places = drive, drive.places
+        self.truth = [truth and len(car.truth_time) > 1 for car in drive.cars]
+        none: dict[str, Any] = {
+            "truth_time": np.zeros(0),
+            "truth": np.zeros(0, dtype=complex),
+            "truth_yaw": np.zeros(0),
+        }
+        self.cars = [car if has else replace(car, **none) for car, has in zip(drive.cars, self.truth, strict=True)]
         self.kinds = [
             *(
                 kind._replace(name=f"{car.name}.{kind.name}", part=f"{car.name}: {kind.part}")
@@ -182,9 +191,8 @@ class Batch:
             speed += np.interp(time, car.wheel_time + own[WHEEL_TIME], self.slow[c])
             speed -= np.interp(time, car.wheel_time, self.slow[c])
         speed /= 1.0 + own[SCALE]
-        yaw = np.concatenate([[0.0], np.cumsum(0.5 * GRID * (rate[1:] + rate[:-1]))])
-        going = speed * np.exp(1j * yaw)
-        place = np.concatenate([[0.0], np.cumsum(0.5 * GRID * (going[1:] + going[:-1]))])
+        yaw = cumulative_trapezoid(rate, dx=GRID, initial=0.0)
+        place = cumulative_trapezoid(speed * np.exp(1j * yaw), dx=GRID, initial=0.0)
         return Path(time, yaw, place, averaged(rate, GRID), averaged(speed, GRID))
 
     def residuals(self, c: int, x: Array, pose: Array, near: Array | None = None) -> tuple[Array, Array, Array]:
@@ -209,8 +217,6 @@ class Batch:
         step, bend = path.step(keys[:-1], keys[1:])
         gap = np.exp(-1j * yaw[:-1]) * np.diff(place) - step
         odometry = np.stack([gap.real, gap.imag, np.diff(yaw) - bend], axis=-1)
-        if not self.truth[c]:
-            return seen, odometry, np.zeros((0, 3))
         when = car.truth_time + start[TRUTH_TIME]
         k = self.nearest(c, when)
         moved, turned = path.step(keys[k], when, own[TRUTH_TIME] - start[TRUTH_TIME])
@@ -259,13 +265,12 @@ class Batch:
 
     def scales(self, x: Array, poses: Sequence[Array]) -> Array:
         """Return the standard deviations (C, 3) that residuals have, by their medians."""
-        found = np.ones((len(self.cars), 3))
+        found = []
         for c, car in enumerate(self.cars):
             seen, _, truth = self.residuals(c, x, poses[c])
-            found[c, 0] = max(deviation(seen), LEAST_ANGLE if car.lens is None else LEAST_PIXEL)
-            if len(truth):
-                found[c, 1:] = max(deviation(truth[:, :2]), LEAST_PLACE), max(deviation(truth[:, 2:]), LEAST_YAW)
-        return found
+            least = LEAST_ANGLE if car.lens is None else LEAST_PIXEL, LEAST_PLACE, LEAST_YAW
+            found.append(np.maximum([deviation(part) for part in (seen, truth[:, :2], truth[:, 2:])], least))
+        return np.array(found)
 
     def cost(self, x: Array, poses: Sequence[Array], sigma: Array, free: Mask, near: Array | None = None) -> float:
         """Return the cost of constants and poses, that of the priors included; `near` as for `residuals`."""
@@ -279,30 +284,26 @@ class Batch:
         r = _flat(parts)
         car, M = self.cars[c], len(pose)
         own = fit.x[self.own(c)]
-        late = self.nearest(c, car.truth_time + own[TRUTH_TIME]) if self.truth[c] else np.zeros(0, np.int64)
+        late = self.nearest(c, car.truth_time + own[TRUTH_TIME])
         seen = self.nearest(c, car.time + own[CAMERA_TIME])
         key = np.concatenate([np.repeat(seen, 2), np.repeat(np.arange(M - 1), 3), np.repeat(late, 3)])
         after = np.zeros(len(r), dtype=np.int64)  # odometry depends on the next keyframe, too
         after[parts[0].size : parts[0].size + parts[1].size] = 1
-        entries = []
-        for parity in (0, 1):
-            for axis in range(3):
-                moved = pose.copy()
-                moved[parity::2, axis] += 1e-6
-                change = (_flat(self.residuals(c, fit.x, moved)) - r) / 1e-6
-                entries.append(
-                    (
-                        3 * (key + after * (key % 2 != parity)) + axis,
-                        np.where((key % 2 == parity) | (after > 0), change, 0.0),
-                    )
-                )
+        column, value = [], []
+        for parity, axis in product((0, 1), range(3)):
+            moved = pose.copy()
+            moved[parity::2, axis] += 1e-6
+            change = (_flat(self.residuals(c, fit.x, moved)) - r) / 1e-6
+            column.append(3 * (key + after * (key % 2 != parity)) + axis)
+            value.append(np.where((key % 2 == parity) | (after > 0), change, 0.0))
+        place = np.tile(np.arange(len(r)), 6), np.concatenate(column)
+        P = csr_array((np.concatenate(value), place), shape=(len(r), 3 * M))
         J = np.zeros((len(r), len(columns)))
-        for n, column in enumerate(columns):
+        for n, constant in enumerate(columns):
             x = fit.x.copy()
-            x[column] += self.steps[column]
-            J[:, n] = (_flat(self.residuals(c, x, pose, fit.x)) - r) / self.steps[column]
-        column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
-        return r, W, csr_array((value, (np.tile(np.arange(len(r)), 6), column)), shape=(len(r), 3 * M)), J
+            x[constant] += self.steps[constant]
+            J[:, n] = (_flat(self.residuals(c, x, pose, fit.x)) - r) / self.steps[constant]
+        return r, W, P, J
 
     def solved(self, fit: Fit, columns: NDArray[np.int64]) -> "System":
         """Return the normal equations of constants, from which poses are eliminated."""
@@ -332,8 +333,7 @@ class Batch:
     def times(self, c: int) -> Array:
         """Return when the rows of a car's residuals are, s."""
         car = self.cars[c]
-        truth = car.truth_time if self.truth[c] else np.zeros(0)
-        return np.concatenate([np.repeat(car.time, 2), np.repeat(self.keys[c][:-1], 3), np.repeat(truth, 3)])
+        return np.concatenate([np.repeat(car.time, 2), np.repeat(self.keys[c][:-1], 3), np.repeat(car.truth_time, 3)])
 
     def fit(self, begin: Fit, most: int = 25) -> Fit:
         """Return the fit from a start, of the constants that are free there."""
@@ -394,54 +394,51 @@ class Batch:
         return total
 
     def resected(self, c: int, labels: NDArray[np.int64]) -> tuple[Array, float]:
-        """Return poses (M, 3) at the keyframes from the sightings of windows, and their mean misfit.
-
-        With a heading given, the position is linear in the sightings: all headings are tried.
-        """
+        """Return poses (M, 3) at the keyframes from the sightings of windows, and their mean misfit."""
         car, path = self.cars[c], self.path(c, np.zeros(len(self.kinds)))
-        keys, target = self.keys[c], labels[car.target]
-        good, total = [], 0.0
+        keys, target, good = self.keys[c], labels[car.target], []
         for begin in np.arange(keys[0], keys[-1], WINDOW):
             inside = np.flatnonzero((car.time >= begin) & (car.time < begin + WINDOW))
             if len(inside) < 20 or len(np.unique(target[inside])) < 2:
                 continue
             inside = inside[:: max(1, len(inside) // 150)]
-            origin = np.full(len(inside), begin + 0.5 * WINDOW)
-            moved, turned = path.step(origin, car.time[inside])
-            unit = car.ray[inside] @ car.mounting.T
-            lever = np.exp(1j * turned) * complex(*car.lever[:2]) + moved
-            flat = np.exp(1j * turned) * (unit[:, 0] + 1j * unit[:, 1])
-            unit = np.stack([flat.real, flat.imag, unit[:, 2]], axis=-1)
-            S, point = skew(unit), self.places[target[inside]]
-            best = (np.inf, 0.0, 0j)
-            coarse = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
-            for step in (0.0, 0.02, 0.004):
-                for heading in coarse if not step else best[1] + step * np.arange(-5, 6):
-                    q = np.exp(-1j * heading) * (point[:, 0] + 1j * point[:, 1]) - lever
-                    to = np.stack([q.real, q.imag, point[:, 2] - car.height - car.lever[2]], axis=-1)
-                    weight = np.ones(len(inside))
-                    for _ in range(2):
-                        b = np.einsum("nij,nj->ni", S, to)
-                        A = S[:, :, :2]
-                        AW = A * weight[:, None, None]
-                        shift = np.linalg.lstsq(np.einsum("nij,nik->jk", AW, A), np.einsum("nij,ni->j", AW, b))[0]
-                        ahead = to - [shift[0], shift[1], 0.0]
-                        far = np.linalg.norm(ahead, axis=-1)
-                        weight = 1.0 / np.maximum(far, 0.1) ** 2
-                    misfit = _misfit(unit, ahead)
-                    if misfit < best[0]:
-                        best = misfit, heading, np.exp(1j * heading) * complex(*shift)
-            total += best[0]
-            good.append((begin + 0.5 * WINDOW, *best[1:]))
+            middle = begin + 0.5 * WINDOW
+            moved, turned = path.step(np.full(len(inside), middle), car.time[inside])
+            turn = Rotation.from_euler("z", turned[:, None])
+            lever = turn.apply(car.lever) + np.stack([moved.real, moved.imag, 0.0 * turned], axis=-1)
+            point = self.places[target[inside]] - [0.0, 0.0, car.height]
+            good.append((middle, *_seen_from(turn.apply(car.ray[inside] @ car.mounting.T), lever, point)))
         if not good:
             raise DataError(
                 f"{car.name}: two static landmarks are never seen within {WINDOW:g} s; no pose can be found"
             )
-        near = np.argmin(np.abs(np.array([at for at, *_ in good]) - keys[:, None]), axis=1)
-        at, heading, place = (np.array([entry[n] for entry in good])[near] for n in range(3))
-        moved, turned = path.step(at.real, keys)
-        now, yaw = place + np.exp(1j * heading) * moved, heading + turned
-        return np.stack([now.real, now.imag, np.unwrap(yaw)], axis=-1), total / len(good)
+        when, misfit, heading, place = map(np.array, zip(*good, strict=True))
+        near = np.argmin(np.abs(when - keys[:, None]), axis=1)
+        moved, turned = path.step(when[near], keys)
+        now, yaw = place[near] + np.exp(1j * heading[near]) * moved, heading[near] + turned
+        return np.stack([now.real, now.imag, np.unwrap(yaw)], axis=-1), float(misfit.mean())
+
+
+def _seen_from(unit: Array, lever: Array, point: Array) -> tuple[float, float, complex]:
+    """Return misfit, heading and place of a body by rays (n, 3) from its `lever` (n, 3), m, to points (n, 3), m.
+
+    With a heading given, the place is linear in the sightings: all headings are tried, then finer ones.
+    """
+    across = skew(unit)
+
+    def fitted(heading: float) -> tuple[float, float, complex]:
+        to = Rotation.from_euler("z", -heading).apply(point) - lever
+        b, far = (across @ to[:, :, None]), np.ones((len(to), 1, 1))
+        for _ in range(2):
+            shift = np.linalg.lstsq((across[:, :, :2] / far).reshape(-1, 2), (b / far).ravel())[0]
+            ahead = to - [*shift, 0.0]
+            far = np.maximum(np.linalg.norm(ahead, axis=-1), 0.1)[:, None, None]
+        return _misfit(unit, ahead), heading, np.exp(1j * heading) * complex(*shift)
+
+    tried: NDArray[Any] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    for step in (0.02, 0.004):
+        tried = min(map(fitted, tried), key=itemgetter(0))[1] + step * np.arange(-5, 6)
+    return min(map(fitted, tried), key=itemgetter(0))
 
 
 class System(NamedTuple):
@@ -463,7 +460,7 @@ def standard_errors(S: Array, scores: Array, prior: Array) -> Array:
     """Return those by an information and the scores (stretches, G); `prior`: (G,) standard deviations."""
     inverse = np.linalg.inv(S)
     robust = inverse @ (scores.T @ scores + np.diag(prior**-2)) @ inverse
-    return np.sqrt(np.maximum(robust.diagonal(), inverse.diagonal()))
+    return np.asarray(np.sqrt(np.maximum(robust.diagonal(), inverse.diagonal())))
 
 
 def _flat(parts: tuple[Array, Array, Array]) -> Array:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 
 from coopenv.base.errors import DataError
@@ -123,19 +124,13 @@ class Response:
 
     def limits(self) -> Array:
         """Return the largest deceleration, acceleration, steering rate, speed and steering that were reached."""
-        (time, wheel), (late, gyro), _ = self.series
+        (time, _), (late, _), _ = self.series
         grid = np.arange(max(time[0], late[0]), min(time[-1], late[-1]), INTERVAL / 4)
-        v, turn = (_mean_at(grid, t, value) for t, value in ((time, wheel), (late, gyro)))
+        ways = (np.interp(grid, t, cumulative_trapezoid(value, t, initial=0.0)) for t, value in self.series[:2])
+        v, turn = (np.diff(way) / (INTERVAL / 4) for way in ways)
         angle = np.arctan(self._wheelbase * turn / np.maximum(np.abs(v), 0.1))
         slope, bend = np.diff(np.abs(v)) / (INTERVAL / 4), np.abs(np.diff(angle)) / (INTERVAL / 4)
         return np.array([-slope.min(), slope.max(), np.quantile(bend, 0.95), np.abs(v).max(), np.abs(angle).max()])
-
-
-def _mean_at(grid: Array, time: Array, value: Array) -> Array:
-    """Return the means of samples over a grid's steps."""
-    passed = np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (value[1:] + value[:-1]))])
-    half = (grid[1] - grid[0]) / 2
-    return np.asarray((np.interp(grid + half, time, passed) - np.interp(grid - half, time, passed)) / (2 * half))
 
 
 def _speed_by_truth(tracks: Mapping[str, Any]) -> tuple[Array, Array]:
