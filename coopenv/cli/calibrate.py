@@ -24,7 +24,6 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="Folder of calibration.toml and the figures.")] = Path("out", "calibration"),
     overrides: options.Overrides = None,
     no_truth: Annotated[bool, typer.Option("--no-truth", help="Leave out motion capture.")] = False,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate cameras, odometry, clocks and markers of cars from one drive, and print which constants are wrong."""
@@ -34,6 +33,8 @@ def calibrate(
     from coopenv.cars.calibration.findings import calibrate as calibrated
     from coopenv.cars.calibration.findings import toml_text
     from coopenv.runs.console import Progress
+    from coopenv.viz.error_figures import residual_figure
+    from coopenv.viz.style import save
 
     with new_folder(out):
         check_file(out / "calibration.toml")
@@ -49,13 +50,7 @@ def calibrate(
             result = calibrated(drive, not no_truth)
     files = [out / "calibration.toml"]
     replace_text(files[0], toml_text(result))
-    if not no_figures:
-        from coopenv.viz.error_figures import residual_figure
-        from coopenv.viz.style import save
-
-        files += [
-            save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)
-        ]
+    files += [save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)]
     if as_json:
         options.print_json({"rows": result.rows, "findings": result.findings, "noise": result.noise})
         return

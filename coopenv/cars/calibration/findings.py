@@ -99,21 +99,14 @@ def hypotheses(batch: Batch) -> list[NDArray[np.int64]]:
 def exchanged(batch: Batch) -> list[tuple[int, int]]:
     """Return pairs of markers that are exchanged, and exchange their places in the batch."""
     found: list[tuple[int, int]] = []
-    seen = [i for i in range(len(batch.places)) if batch.known[batch.marker(i)].any()]
-    for _ in range(2):
-        pairs = list(combinations(seen, 2))
-        labels = np.arange(len(batch.places))
-        best, now = None, batch.misfit(labels)
-        least = now
-        for i, j in pairs:
-            other = labels.copy()
-            other[[i, j]] = j, i
-            if (misfit := batch.misfit(other)) < least:
-                best, least = (i, j), misfit
-        if best is None or least > 0.7 * now:
+    labels = np.arange(len(batch.places))
+    seen = [i for i in labels.tolist() if batch.known[batch.marker(i)].any()]
+    others = {(i, j): np.where(labels == i, j, np.where(labels == j, i, labels)) for i, j in combinations(seen, 2)}
+    for _ in range(2 if others else 0):
+        misfit, best = min((batch.misfit(other), pair) for pair, other in others.items())
+        if misfit > 0.7 * batch.misfit(labels):
             break
-        batch.places = batch.places.copy()
-        batch.places[[*best]] = batch.places[[*best[::-1]]]
+        batch.places = batch.places[others[best]]
         batch.base[batch.markers : batch.frame] = batch.places.ravel()
         found.append(best)
     return found
