@@ -128,15 +128,15 @@ def calibrate(drive: Drive, truth: bool = True) -> Calibrated:
 def _calibrated(batch: Batch) -> Calibrated:
     pairs = exchanged(batch)
     given = fit = batch.fit(batch.begin())
-    count = sum(len(batch.times(c)) for c in range(len(batch.cars)))
+    penalty = 0.5 * log(sum(len(batch.times(c)) for c in range(len(batch.cars))))
     groups = hypotheses(batch)
     for _ in range(MOST):
-        ranked = sorted(gains(batch, fit, groups, count), key=lambda entry: -entry[0])[:TRIED]
+        ranked = sorted(gains(batch, fit, groups, penalty), key=lambda entry: -entry[0])[:TRIED]
         tried = [batch.fit(replace(fit, free=fit.free | np.isin(np.arange(len(fit.x)), group))) for _, group in ranked]
         if not tried:
             break
         sigma = np.min([found.sigma for found in (fit, *tried)], axis=0)
-        costs = [batch.cost(f.x, f.poses, sigma, f.free) + penalty(f.free & ~fit.free, count) for f in tried]
+        costs = [batch.cost(f.x, f.poses, sigma, f.free) + penalty * int((f.free & ~fit.free).sum()) for f in tried]
         best = int(np.argmin(costs))
         if batch.cost(fit.x, fit.poses, sigma, fit.free) - costs[best] < LEAST_GAIN:
             break
@@ -150,22 +150,17 @@ def _calibrated(batch: Batch) -> Calibrated:
     return _result(batch, given, fit, pairs)
 
 
-def penalty(more: Mask, count: int) -> float:
-    """Return by how much further constants have to lower the cost of so many residuals."""
-    return 0.5 * log(count) * int(more.sum())
-
-
 def gains(
-    batch: Batch, fit: Fit, groups: Sequence[NDArray[np.int64]], count: int
+    batch: Batch, fit: Fit, groups: Sequence[NDArray[np.int64]], penalty: float
 ) -> Iterator[tuple[float, NDArray[np.int64]]]:
-    """Yield by how much each group would lower the cost, less its penalty, if the residuals were linear."""
+    """Yield by how much each group would lower the cost, less a penalty per constant, if the residuals were linear."""
     columns = np.flatnonzero(batch.known)
     system = batch.solved(fit, columns)
     for group in groups:
         both = np.flatnonzero(fit.free[columns] | np.isin(columns, group))
         if (more := ~fit.free[group]).any():
             gain = 0.5 * float(system.g[both] @ np.linalg.solve(system.S[np.ix_(both, both)], system.g[both]))
-            yield gain - penalty(more, count), group
+            yield gain - penalty * int(more.sum()), group
 
 
 def errors(batch: Batch, fit: Fit) -> Array:

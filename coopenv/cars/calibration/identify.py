@@ -105,8 +105,7 @@ def _noise(bag: "Bag", vehicle: int, response: Response, rest: Sequence[Array]) 
 
 def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
     """Yield rates, jitter, loss and delay of the sensors' messages, and noise and misses of the camera."""
-    usual, camera = USUAL, bag.scenario.cameras[vehicle]
-    steps, delays = [], []
+    camera, steps, delays = bag.scenario.cameras[vehicle], [], []
     for role in SENSORS:
         stamp, received = _times(sent.get(role, ()))
         if len(stamp) > PARTS:
@@ -114,14 +113,14 @@ def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
             delays.append(received - stamp)
             if role in (Role.WHEEL, Role.IMU):
                 name, near = f"fake.{role}_rate", np.diff(stamp)[steps[-1] < 1.5]
-                yield _level(name, "Hz", getattr(usual, f"{role}_rate"), lambda part: 1.0 / float(part.mean()), near)
+                yield _level(name, "Hz", getattr(USUAL, f"{role}_rate"), lambda part: 1.0 / float(part.mean()), near)
     step, delay = np.concatenate(steps), np.concatenate(delays)
     count, near = np.maximum(np.rint(step), 1.0), step[step < 1.5]
-    yield _level("fake.loss", "", usual.loss, lambda part: min(1.0 - len(part) / float(part.sum()), MOST), count)
-    yield _level("fake.jitter", "", usual.jitter, lambda part: min(np.sqrt(1.5) * float(part.std()), MOST), near)
-    late = _level("fake.delay", "s", usual.delay, lambda part: _exponential(part)[0], delay)
+    yield _level("fake.loss", "", USUAL.loss, lambda part: min(1.0 - len(part) / float(part.sum()), MOST), count)
+    yield _level("fake.jitter", "", USUAL.jitter, lambda part: min(np.sqrt(1.5) * float(part.std()), MOST), near)
+    late = _level("fake.delay", "s", USUAL.delay, lambda part: _exponential(part)[0], delay)
     yield late if 0.0 <= late.value < LATEST else replace(late, value=0.0, finding="another clock")
-    yield _level("fake.delay_spread", "s", usual.delay_spread, lambda part: _exponential(part)[1], delay)
+    yield _level("fake.delay_spread", "s", USUAL.delay_spread, lambda part: _exponential(part)[1], delay)
     bend, missed = _sightings(sent)
     if len(bend) > PARTS:
         rounding = float(camera.quantise) / 12.0 / camera.focal_length[0] ** 2
