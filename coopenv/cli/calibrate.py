@@ -68,7 +68,7 @@ def identify(
     bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, with the commands.")],
     topics: options.TopicMap = None,
     car: Annotated[str | None, typer.Option(help="Name of the car (default: the first one with commands).")] = None,
-    out: Annotated[Path, typer.Option(help="File of the result.")] = Path("out", "identified.toml"),
+    out: Annotated[Path, typer.Option(help="File of the result.")] = Path("identified.toml"),
     overrides: options.Overrides = None,
     as_json: options.AsJson = False,
 ) -> None:

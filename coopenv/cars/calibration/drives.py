@@ -163,7 +163,10 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> 
     topics = (next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES)
     tracks = {key: value for key, value in tracks_of(samples).items() if "command" not in key}
     found = {"time": time, "target": target.astype(np.int64), "topics": tuple(topics), **tracks}
-    return car_of(bag.scenario, name, vehicle, bag.log.lenses.get(name), np.stack(ray, axis=-1), bag.where, **found)
+    lens = bag.log.lenses.get(name)
+    if lens is not None and len(lens.distortion) != 5:  # only that model's coefficients are estimated
+        lens = None
+    return car_of(bag.scenario, name, vehicle, lens, np.stack(ray, axis=-1), bag.where, **found)
 
 
 def _columns(rows: Sequence[Any], count: int) -> list[Any]:
