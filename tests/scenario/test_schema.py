@@ -78,7 +78,9 @@ def test_unknown_keys_at_every_level() -> None:
 
 
 def test_an_unknown_key_like_none_lists_what_is_allowed() -> None:
-    assert complaint(changed("topology.zzzzzz", 1)) == "topology.zzzzzz: unknown key; allowed: acyclic, mode, most_nearby"
+    assert (
+        complaint(changed("topology.zzzzzz", 1)) == "topology.zzzzzz: unknown key; allowed: acyclic, mode, most_nearby"
+    )
 
 
 @pytest.mark.parametrize(
