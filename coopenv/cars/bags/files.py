@@ -255,6 +255,10 @@ class _Counted:
         return self
 
     def __exit__(self, *unused: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
         self._stream.close()
 
     def read(self, size: int = -1) -> bytes:
