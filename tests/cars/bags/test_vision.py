@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.cars.bags import Bag
-from coopenv.cars.fake.frames import FrameRenderer, PlacedTag
 from coopenv.cars.readings import Calibration, rays
 from coopenv.cars.vision import Lens, VisionSettings, find_tags, gray_of
 from coopenv.estimation.lens import distort, undistort
@@ -20,6 +19,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA
 from tests.helpers import bags
+from tests.helpers.frames import FrameRenderer, PlacedTag
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
 
