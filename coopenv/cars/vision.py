@@ -8,6 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
+from scipy.ndimage import map_coordinates
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
 from coopenv.base.installation import needing
@@ -228,14 +229,10 @@ def find_tags(gray: NDArray[np.uint8], family: str, lens: Lens) -> list[Tag]:
     ahead = np.einsum("msk,mski->mi", weights, units)
     with np.errstate(all="ignore"):
         centre /= np.linalg.norm(centre, axis=-1, keepdims=True) * np.sign((centre * ahead).sum(axis=-1))[:, None]
-    areas = [float(abs(_across(q[2] - q[0], q[3] - q[1]))) for q in corners]
+    areas = [opencv().contourArea(quad) for quad in corners.astype(np.float32)]
     full = (np.count_nonzero(weights, axis=-1) >= LEAST).all(axis=-1) & np.isfinite(centre).all(axis=-1)
     rows = zip(numbers.ravel().tolist(), areas, centre, corners[..., 1].mean(axis=-1).tolist(), full, strict=True)
     return [Tag(number, area, ray if whole else None, row) for number, area, ray, row, whole in rows]
-
-
-def _across(a: Array, b: Array) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
 
 
 ALONG = np.linspace(0.12, 0.88, 16)
@@ -264,20 +261,11 @@ def _edges(gray: NDArray[np.uint8], corners: Array, cells: int) -> tuple[Array, 
     offset = np.zeros(points.shape[:-1])
     for _ in range(2):
         across = offset[..., None] + reach
-        shade = _shades(gray, points[..., None, :] + across[..., None] * normals[:, :, None, None])
+        places = points[..., None, :] + across[..., None] * normals[:, :, None, None]
+        shade = map_coordinates(gray, (places[..., 1], places[..., 0]), np.float64, order=1, mode="nearest")
         rise = np.maximum(np.diff(shade, axis=-1), 0.0)
         weights = rise.sum(axis=-1)
         middle = 0.5 * (across[..., 1:] + across[..., :-1])
         measured = (rise * middle).sum(axis=-1) / np.maximum(weights, 1e-9)
         offset = measured @ SMOOTH
     return points + measured[..., None] * normals[:, :, None], weights
-
-
-def _shades(gray: NDArray[np.uint8], places: Array) -> Array:
-    """Return the shades at places (..., 2) between pixels."""
-    height, width = gray.shape
-    x, y = places[..., 0].clip(0, width - 1.001), places[..., 1].clip(0, height - 1.001)
-    u, v = x.astype(np.intp), y.astype(np.intp)
-    a, b = x - u, y - v
-    above = (1.0 - a) * gray[v, u] + a * gray[v, u + 1]
-    return np.asarray((1.0 - b) * above + b * ((1.0 - a) * gray[v + 1, u] + a * gray[v + 1, u + 1]))
