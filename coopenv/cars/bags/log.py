@@ -263,11 +263,11 @@ class TopicRow:
 
 def rows_of(
     files: Sequence[BagFile],
-    chosen: Collection[Chosen] = (),
-    samples: Sequence[Sample] = (),
-    clocks: Clocks | None = None,
-    tracks: Sequence[Track] = (),
-    leads: Leads | None = None,
+    chosen: Collection[Chosen],
+    samples: Sequence[Sample],
+    clocks: Clocks,
+    tracks: Sequence[Track],
+    leads: Leads,
 ) -> tuple[TopicRow, ...]:
     """Return a row per topic, those that are read before the others."""
     read_as = {entry.topic: entry for entry in chosen}
@@ -280,14 +280,13 @@ def rows_of(
         kind = next(file.topics[name] for file in files if name in file.topics)
         count = sum(file.counts.get(name, 0) for file in files)
         seconds = max(file.seconds for file in files if name in file.topics)
-        entry = read_as.get(name)
-        if entry is None or clocks is None:
+        if (entry := read_as.get(name)) is None:
             rows.append(TopicRow(name, kind, count, (count - 1) / seconds if count > 1 and seconds > 0.0 else None))
             continue
         stamps = np.array(times.get((entry.car, entry.sample_role), []), dtype=np.int64)
         own = [track for track in tracks if track.chosen is entry]
         delays = [behind + clocks.shifts[t.source].added / NS for t in own if (behind := t.behind(clocks)) is not None]
-        (rate, gap, gaps), lead, bad = regularity(stamps), (leads or {}).get(name), sum(track.outlying for track in own)
+        (rate, gap, gaps), lead, bad = regularity(stamps), leads.get(name), sum(track.outlying for track in own)
         read = (entry.car, entry.role.value, len(stamps), gap, gaps, min(delays, default=None), bad)
         by_content = () if lead is None else (lead.seconds, lead.error, lead.reference)
         rows.append(TopicRow(name, kind, count, rate, *read, *by_content))
