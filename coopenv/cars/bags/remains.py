@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from io import SEEK_CUR, BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, Self
 
 import apsw
 from mcap.data_stream import ReadDataStream
@@ -34,15 +34,8 @@ def ends_early(path: Path) -> bool:
     return path.suffix == ".mcap" and is_cut_off(path)
 
 
-class Entry(NamedTuple):
-    """One message of a file."""
-
-    topic: str
-    kind: str
-    encoding: str  # of the definition: ros2msg, ros2idl, or empty without one
-    definition: str
-    received: int  # ns
-    data: bytes
+Entries = Iterator[tuple[tuple[str, str, str, str], int, bytes]]
+"""Messages: (topic, type, encoding of its definition, definition), time of reception (ns), bytes."""
 
 
 class Remains:
@@ -55,15 +48,13 @@ class Remains:
 
     def __enter__(self) -> Self:
         """Go through the file once. Raises TooLargeError: it unpacks to too much."""
-        counts: Counter[tuple[str, ...]] = Counter()
-        for entry in self._entries():
-            counts[entry[:4]] += 1
-            self.start_time = min(self.start_time, entry.received)
-            self.end_time = max(self.end_time, entry.received)
+        counts: Counter[tuple[str, str, str, str]] = Counter()
+        for about, received, _ in self._entries():
+            counts[about] += 1
+            self.start_time, self.end_time = min(self.start_time, received), max(self.end_time, received)
         ext: Any = None
         self.connections = []
-        for number, (key, count) in enumerate(counts.items()):
-            topic, kind, encoding, text = key
+        for number, ((topic, kind, encoding, text), count) in enumerate(counts.items()):
             definition = MessageDefinition(FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
             self.connections.append(Connection(number, topic, kind, definition, "", count, ext, self))
         self.topics = {c.topic: TopicInfo(c.msgtype, c.msgdef, c.msgcount, [c]) for c in self.connections}
@@ -75,11 +66,11 @@ class Remains:
     def messages(self, connections: Collection[Any], **unused: object) -> Iterator[tuple[Any, int, bytes]]:
         """Yield connection, time of reception (ns) and bytes of messages."""
         wanted = {(c.topic, c.msgtype): c for c in connections}
-        for entry in self._entries():
-            if (connection := wanted.get((entry.topic, entry.kind))) is not None:
-                yield connection, entry.received, entry.data
+        for about, received, data in self._entries():
+            if (connection := wanted.get(about[:2])) is not None:
+                yield connection, received, data
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Entries:
         """Yield messages up to where the file makes no sense."""
         try:
             yield from FORMS[self.path.suffix](self.path, Allowance(self.path.stat().st_size))
@@ -89,7 +80,7 @@ class Remains:
             return
 
 
-def _of_mcap(path: Path, allowance: Allowance) -> Iterator[Entry]:
+def _of_mcap(path: Path, allowance: Allowance) -> Entries:
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
     with path.open("rb") as stream:
@@ -103,7 +94,7 @@ def _of_mcap(path: Path, allowance: Allowance) -> Iterator[Entry]:
                 channel = channels[record.channel_id]
                 schema = schemas[channel.schema_id]
                 about = channel.topic, schema.name, schema.encoding, schema.data.decode()
-                yield Entry(*about, record.log_time, record.data)
+                yield about, record.log_time, record.data
 
 
 def _mcap_records(stream: BinaryIO, allowance: Allowance) -> Iterator[Any]:
@@ -146,27 +137,26 @@ class _Files(apsw.VFS):
         return _File("", name, flags)
 
 
-def _of_sqlite3(path: Path, _: Allowance) -> Iterator[Entry]:
+def _of_sqlite3(path: Path, _: Allowance) -> Entries:
     files, flags = _Files(), apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
     database = apsw.Connection(f"{path.absolute().as_uri()}?immutable=1", flags=flags, vfs=VFS)
     try:
         database.pragma("writable_schema", True)  # or it refuses files that are shorter than their header states
-        texts: dict[Any, tuple[Any, ...]] = {}
+        texts: dict[str, tuple[str, str]] = {}
         if database.table_exists(None, "message_definitions"):
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            texts = {kind: about for kind, *about in database.execute(query)}
+            texts = {kind: (encoding, text) for kind, encoding, text in database.execute(query)}
         topics = {key: about for key, *about in database.execute("SELECT id, name, type FROM topics")}
         for topic, received, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
             name, kind = topics[topic]
-            encoding, text = texts.get(kind, ("", ""))
-            yield Entry(name, kind, encoding, text, received, data)
+            yield (name, kind, *texts.get(kind, ("", ""))), received, data
     finally:
         database.close()
         files.unregister()
 
 
-def _of_ros1(path: Path, allowance: Allowance) -> Iterator[Entry]:
-    known: dict[int, tuple[str, str, str]] = {}
+def _of_ros1(path: Path, allowance: Allowance) -> Entries:
+    known: dict[int, tuple[str, str, str, str]] = {}
     with path.open("rb") as stream:
         stream.readline()
         for header, data in _ros1_records(stream, allowance):
@@ -174,10 +164,10 @@ def _of_ros1(path: Path, allowance: Allowance) -> Iterator[Entry]:
             if header.get_uint8("op") == RecordType.CONNECTION:
                 about = Header.read(BytesIO(struct.pack("<I", len(data)) + data))
                 kind = normalize_msgtype(about.get_string("type"))
-                known[number] = normalize(header.get_string("topic")), kind, about.get_string("message_definition")
+                topic, text = normalize(header.get_string("topic")), about.get_string("message_definition")
+                known[number] = topic, kind, "ros2msg", text
             else:
-                topic, kind, text = known[number]
-                yield Entry(topic, kind, "ros2msg", text, header.get_time("time"), data)
+                yield known[number], header.get_time("time"), data
 
 
 def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[Any, bytes]]:
@@ -196,7 +186,7 @@ def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[Any,
             yield header, data
 
 
-FORMS: dict[str, Callable[[Path, Allowance], Iterator[Entry]]] = {
+FORMS: dict[str, Callable[[Path, Allowance], Entries]] = {
     ".mcap": _of_mcap,
     ".db3": _of_sqlite3,
     ".bag": _of_ros1,
