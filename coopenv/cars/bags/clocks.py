@@ -99,6 +99,15 @@ def delay_of(stamps: Times, received: Times) -> Delay:
     return Delay(round(float(np.quantile(level - drift * at, 0.2))) + int(low[0]), drift, middle)
 
 
+def checked(stamps: Times, received: Times) -> tuple[NDArray[np.bool_], Delay | None]:
+    """Return which stamps (n,), 0 for none, are wrong, and the delay by the others; None: there are none."""
+    wrong = np.zeros(len(stamps), bool)
+    if not (given := stamps != 0).any():
+        return wrong, None
+    wrong[given] = outlying(stamps[given], received[given])
+    return wrong, delay_of(stamps[given & ~wrong], received[given & ~wrong])
+
+
 HOLE = 0.25  # s between two messages over which nothing is compared
 INTERVAL = 0.4  # s over which turns and distances are compared
 SEARCHED, STEP = 1.0, 0.02

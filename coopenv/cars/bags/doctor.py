@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.bags.clocks import delay_of, outlying
+from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import NS, TopicRow, regularity
 from coopenv.cars.bags.topic_map import READ
@@ -34,14 +34,12 @@ def examined(files: Sequence[BagFile]) -> tuple[tuple[TopicRow, ...], tuple[str,
         rate, gap, gaps = regularity(received)
         wrong, offset = 0, None
         for stamps, arrived in parts:
-            given = stamps != 0
-            if not given.any():
+            bad, delay = checked(stamps, arrived)
+            if delay is None:
                 continue
-            bad = outlying(stamps[given], arrived[given])
-            delay = delay_of(stamps[given][~bad], arrived[given][~bad])
             wrong, offset = wrong + int(bad.sum()), delay.offset / NS
-            if not given.all():
-                notes.append(f"{name}: {int((~given).sum())} of {len(given)} stamps are 0")
+            if not stamps.all():
+                notes.append(f"{name}: {int((stamps == 0).sum())} of {len(stamps)} stamps are 0")
             if abs(delay.drift) > DRIFTING:
                 notes.append(f"{name}: its clock drifts by {1e6 * delay.drift:+.0f} us per s")
             if delay.jump:

@@ -23,7 +23,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.bags.clocks import Delay, Leads, delay_of, jumps, leads_of, moves_of, outlying
+from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, select
 from coopenv.cars.codec import encode, stamp_of
@@ -171,10 +171,7 @@ class Track:
         for k, behind in self.jumps:
             stamps[np.flatnonzero(given)[k:]] += behind
         self.entries = [replace(e, stamp=int(s)) for e, s in zip(self.entries, stamps, strict=True)]
-        wrong = np.zeros(len(given), bool)
-        if given.any():
-            wrong[given] = outlying(stamps[given], received[given])
-            self.delay = delay_of(stamps[given & ~wrong], received[given & ~wrong])
+        wrong, self.delay = checked(stamps, received)
         self.outlying = int(wrong.sum())
         self.entries = [entry for entry, off in zip(self.entries, wrong, strict=True) if not off]
 
