@@ -1,4 +1,4 @@
-"""Square tags, AprilTag and ArUco, in frames of a camera, and what other detectors say of them."""
+"""Square tags, AprilTag and ArUco, in frames of a camera, and tags by other detectors."""
 
 import os
 from collections.abc import Callable

@@ -277,7 +277,7 @@ CAMERAS = (Role.DETECTIONS, Role.BEARINGS)
 def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Binding) -> dict[str, Lead]:
     """Return by how much the stamps of the topics of vehicles are early by what they measure.
 
-    The reference is motion capture, or the camera where there is none; topics whose motion does not tell are left out.
+    The reference is motion capture, or the camera where there is none; topics without enough motion are left out.
     """
     found: dict[str, Lead] = {}
     start = samples[0].stamp if samples else 0

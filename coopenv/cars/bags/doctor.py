@@ -71,7 +71,7 @@ def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
 
 
 def cars_of(rows: Sequence[TopicRow]) -> dict[str, dict[Role, str]]:
-    """Return the topics by role of every car with a camera, by the part of the names that tells the cars apart."""
+    """Return the topics by role of every car with a camera, by the part of the names that differs between cars."""
     roles = {row.topic: role for row in rows if (role := role_of(row)) is not None}
     cameras = next((t for r in (Role.DETECTIONS, Role.BEARINGS) if (t := [n for n in roles if roles[n] is r])), [])
     if not cameras:

@@ -164,8 +164,7 @@ def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> 
     tracks = {key: value for key, value in tracks_of(samples).items() if "command" not in key}
     found = {"time": time, "target": target.astype(np.int64), "topics": tuple(topics), **tracks}
     lens = bag.log.lenses.get(name)
-    if lens is not None and len(lens.distortion) != 5:  # only that model's coefficients are estimated
-        lens = None
+    lens = lens if lens and len(lens.distortion) == 5 else None  # only that model's coefficients are estimated
     return car_of(bag.scenario, name, vehicle, lens, np.stack(ray, axis=-1), bag.where, **found)
 
 

@@ -126,9 +126,8 @@ def _links(sent: Sent, bag: "Bag", vehicle: int) -> Iterator[Row]:
         rounding = float(camera.quantise) / 12.0 / camera.focal_length[0] ** 2
         scale = bag.scenario.noises[vehicle].bearing.scale
         measure = lambda part: float(np.sqrt(max((part**2).mean() / 6.0 - rounding, 0.0)))  # noqa: E731
-        yield _level(
-            "noise.bearing.scale", "rad", scale, measure, bend[np.abs(bend) < CUT * np.quantile(abs(bend), 0.9)]
-        )
+        near = bend[np.abs(bend) < CUT * np.quantile(np.abs(bend), 0.9)]
+        yield _level("noise.bearing.scale", "rad", scale, measure, near)
         yield _level("camera.miss_probability", "", camera.miss_probability, lambda part: float(part.mean()), missed)
 
 
@@ -184,9 +183,8 @@ def _distances(bag: "Bag", car: str, rows: Sequence[Row], sent: Sent, drives: Se
     truth = (s for s in bag.log.samples if (s.car, s.role) == (car, Role.TRUTH) and s.stamp >= drives[0].stamp)
     pose = next((s.value for s in truth if isinstance(s.value, CarPose)), None)
     shift = {role: round(bag.log.added[car, role][1] * 1e9) for role in sent}
-    inside = {
-        role: [s for s in sent[role] if drives[0].stamp <= s.stamp + shift[role] < commands[-1][0]] for role in sent
-    }
+    first, last = drives[0].stamp, commands[-1][0]
+    inside = {role: [s for s in sent[role] if first <= s.stamp + shift[role] < last] for role in sent}
     overrides, fake = tables(rows)
     changed = replace(bag.binding, scenario=load_scenario(bag.map.environment_path, {**bag.changes, **overrides}))
     makes = (bag.binding, USUAL, 0), (changed, FakeSettings(**fake), 0), (changed, FakeSettings(**fake), 1)

@@ -44,6 +44,7 @@ KINDS = (
     Kind("fake.gyro_bias", "rad/s", 0.1, 1e-6),
     Kind("fake.wheel_scale", "", 0.15, 1e-6),
 )
+NAMES = [kind.name.split(".")[1] for kind in KINDS]
 LIMITS = slice(4, 9)
 SIGNED = ("fake.steering_offset", "fake.gyro_bias", "fake.wheel_scale")
 DEAD_BAND = "dynamics.dead_band"
@@ -68,8 +69,8 @@ class Response:
             )
         late = np.flatnonzero(np.diff(time, append=np.inf) > timeout)
         self._when = np.insert(time, late + 1, time[late] + timeout)
-        told = [np.insert(tracks[f"command_{name}"], late + 1, 0.0) for name in ("speed", "steering")]
-        self.told = np.stack(told, axis=-1)
+        parts = [np.insert(tracks[f"command_{name}"], late + 1, 0.0) for name in ("speed", "steering")]
+        self.commands = np.stack(parts, axis=-1)  # (C, 2) m/s and rad
         self._grid = np.arange(time[0], time[0] + seconds, GRID)
         self.series = [
             self._kept(tracks["wheel_time"], tracks["wheel"].real),
@@ -87,16 +88,19 @@ class Response:
 
     def rows(self, x: Array, dead: Array) -> Array:
         """Return what the model exceeds the measurements by (P, R), for constants (P, K) and dead bands (P,), m/s."""
-        grid = self._grid
+        grid, c = self._grid, dict(zip(NAMES, x.T, strict=True))
         edges = np.empty((len(x), len(grid) + len(self._when)))
         wanted = np.empty((len(x), edges.shape[1] - 1, 2))
-        for p, (latency, *gains, offset, _, _, _, _, most, _, _, _, _) in enumerate(x):
+        gains, most = np.stack([c["speed_gain"], c["steering_gain"]], axis=-1), c["max_steering"]
+        for p, latency in enumerate(c["latency"]):
             begin = self._when + latency  # steps of the command are edges, so that none is within a step of the model
             edges[p] = np.sort(np.concatenate([grid, begin.clip(grid[0], grid[-1])]))
             row = np.searchsorted(begin, 0.5 * (edges[p, 1:] + edges[p, :-1]), side="right")
-            v, angle = (np.concatenate([[[0.0, 0.0]], self.told]) * gains)[row].T
-            wanted[p] = np.stack([np.where(np.abs(v) < dead[p], 0.0, v), (angle + offset).clip(-most, most)], axis=-1)
-        lags = np.ascontiguousarray(x[:, [9, 10, 5, 4, 6, 7]])
+            v, angle = (np.concatenate([[[0.0, 0.0]], self.commands]) * gains[p])[row].T
+            angle = (angle + c["steering_offset"][p]).clip(-most[p], most[p])
+            wanted[p] = np.stack([np.where(np.abs(v) < dead[p], 0.0, v), angle], axis=-1)
+        first = [c[name] for name in ("speed_time_constant", "steering_time_constant", "max_acceleration")]
+        lags = np.stack([*first, c["deceleration"], c["max_steering_rate"], c["max_speed"]], axis=-1)
         reached = wp.zeros(wanted.shape, dtype=wp.float64, device="cpu")
         steps = np.diff(edges, axis=-1)
         arrays: list[Any] = [wp.array(part, dtype=wp.float64, device="cpu") for part in (wanted, lags, steps)]
@@ -104,8 +108,8 @@ class Response:
         inputs = [*arrays[:2], start, arrays[2], reached]
         launch(kernel(follow_commands, "float64"), dim=len(x), inputs=inputs, device="cpu")
         (wheel, gyro, truth), found = self.series, []
-        for (v, angle), (*_, bias, scale), at, step in zip(
-            reached.numpy().transpose(0, 2, 1), x, edges[:, 1:], steps, strict=True
+        for (v, angle), bias, scale, at, step in zip(
+            reached.numpy().transpose(0, 2, 1), c["gyro_bias"], c["wheel_scale"], edges[:, 1:], steps, strict=True
         ):
             turn = np.interp(gyro[0], at, v * np.tan(angle) / self._wheelbase) + bias
             way = np.cumsum(0.5 * (v + np.append(start, v[:-1])) * step)
@@ -123,7 +127,7 @@ class Response:
         return np.concatenate(found)
 
     def limits(self) -> Array:
-        """Return the largest deceleration, acceleration, steering rate, speed and steering that were reached."""
+        """Return (5,) the largest deceleration, acceleration, steering rate, speed and steering reached, SI units."""
         (time, _), (late, _), _ = self.series
         grid = np.arange(max(time[0], late[0]), min(time[-1], late[-1]), INTERVAL / 4)
         ways = (np.interp(grid, t, cumulative_trapezoid(value, t, initial=0.0)) for t, value in self.series[:2])
@@ -215,7 +219,7 @@ def _fitted(response: Response, given: Array, x: Array, dead: float, passes: int
 
 def _dead_band(response: Response, x: Array, w: Array) -> tuple[float, tuple[float, float]]:
     """Return the dead band of the least cost and its bounds, m/s."""
-    steps = np.unique(np.append(0.0, np.abs(x[1] * response.told[:, 0]).round(6)))
+    steps = np.unique(np.append(0.0, np.abs(x[NAMES.index("speed_gain")] * response.commands[:, 0]).round(6)))
     low, high = 0, len(steps) - 1
     while True:
         picked = np.unique(np.linspace(low, high, TRIED).astype(int))

@@ -176,7 +176,7 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     """Inflate the covariance where member n's new report shows a reset; return whether to replace the old report.
 
     A reset shows as a covariance that has grown much, or as a jump of the position after a long silence. A jump alone
-    inflates nothing: the new position may be the wrong one, and bearings will tell.
+    inflates nothing: the new position may be the wrong one; later bearings are tested against it.
     """
     report = memory.member[world, i, n].report
     P = mat66d(report.P)
