@@ -125,9 +125,9 @@ def _markers(message: Any, _settings: VisionSettings, _lens: Lens) -> list[Tag]:
     return found
 
 
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 FINDERS: dict[str, Find] = {
-    "sensor_msgs/msg/Image": _frame,
-    "sensor_msgs/msg/CompressedImage": _frame,
+    **dict.fromkeys(IMAGES, _frame),
     "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
     "vision_msgs/msg/Detection2DArray": _boxes,
     "aruco_msgs/msg/MarkerArray": _markers,

@@ -3,23 +3,26 @@
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from contextlib import suppress
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.assembler import BROADCAST
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import NS, TopicRow, regularity
 from coopenv.cars.bags.topic_map import READ
 from coopenv.cars.profile import VELOCITY, Role
-from coopenv.cars.readings import POSES, READERS
+from coopenv.cars.readings import POSES, READERS, Calibration, read
+from coopenv.cars.vision import IMAGES
 
 CAPTURE = re.compile(r"qualisys|mocap|vicon|optitrack|vrpn|truth|ground", re.IGNORECASE)
 """In names of topics of motion capture."""
 COMMANDED = re.compile(r"cmd|command|setpoint|target", re.IGNORECASE)
 """In names of topics that hold commands, whose types are those of measured twists."""
-BROADCAST = (Role.ESTIMATE, Role.POINT)
+ANY_CAMERA = Calibration((100_000, 100_000), (1e5, 1e5), (5e4, 5e4), (0.0,) * 5)
+"""That has seen whatever was detected."""
 DRIFTING = 1e-5  # s per s from which a clock's drift is mentioned
 
 
@@ -54,12 +57,13 @@ def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
     """Return a map of bags with such topics, as TOML text. Raises CoopenvError: no topic has detections of a camera."""
     cars = cars_of(rows)
     used = {name for topics in cars.values() for name in topics.values()}
-    markers = ", ".join(f"{number} ({count} times)" for number, count in sorted(_markers(files, used).items()))
+    markers = ", ".join(f"{number} ({count} frames)" for number, count in sorted(_markers(files, used).items()))
+    none = "images ([vision]: their tags)" if any(r.type in IMAGES and r.topic in used for r in rows) else "no marker"
     lines = [
         "# Proposed by names and types of topics: check every line.",
         'environment = "my_environment.toml" # landmarks, camera, noise: a name (coopenv list), or a file beside this',
         'names = "none"',
-        f"# The camera has seen {markers or 'no marker'}.",
+        f"# The camera has seen {markers or none}.",
         "markers = {} # numbers by name of the landmark: { SL1 = 1 }",
     ]
     for car, topics in cars.items():
@@ -115,16 +119,12 @@ def role_of(row: TopicRow) -> Role | None:
 
 
 def _markers(files: Sequence[BagFile], used: set[str]) -> Counter[int]:
-    """Return how often each number of a marker was seen on the topics that are used."""
+    """Return in how many frames each marker was detected on the topics that are used. Images are not searched."""
     found: Counter[int] = Counter()
     for file in files:
-        cameras = {n for n in used & file.topics.keys() if file.topics[n] in READERS[Role.DETECTIONS]}
-        cameras = cameras or {n for n in used & file.topics.keys() if file.topics[n] in READERS[Role.BEARINGS]}
-        for _, _, decode in file.messages(cameras):
-            try:
-                message = decode()
-            except CoopenvError:
-                continue
-            seen: Any = getattr(message, "objects", None) or getattr(message, "bearing", ())
-            found.update(int(getattr(entry, "signature", getattr(entry, "id", -1))) for entry in seen)
+        for role in (Role.DETECTIONS, Role.BEARINGS):
+            kinds = READERS[role].keys() - IMAGES
+            for _, _, decode in file.messages([name for name in used if file.topics.get(name) in kinds]):
+                with suppress(CoopenvError):
+                    found.update(getattr(read(role, decode(), ANY_CAMERA), "markers", ()))
     return found

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.cars.bags import Bag
+from coopenv.cars.bags.doctor import examined, proposed
+from coopenv.cars.bags.files import BagFile
 from coopenv.cars.readings import Calibration, rays
 from coopenv.cars.vision import Lens, VisionSettings, find_tags, gray_of
 from coopenv.estimation.lens import distort, undistort
@@ -99,6 +101,8 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
     text = bags.MAP.replace("agent = 8\n", 'agent = 8\n[cars.topics]\ndetections = "/camera/image_raw"\n')
     (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
     bag = Bag([bags.write(tmp_path / "mcap", given, "mcap")], tmp_path / "topics.toml")
+    with BagFile(tmp_path / "mcap") as file:
+        assert "has seen images" in proposed([file], examined([file])[0])
     recording = record(bag)
     assert recording.visible[:, 0, :4].any(axis=0).all()
     result = run("riccati", recording)

@@ -1,0 +1,81 @@
+"""Messages of other detectors and of rectified or rolling-shutter cameras, beside OpenCV-free pinhole geometry."""
+
+from types import SimpleNamespace as Fields
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import Calibration, calibration_of, read
+from coopenv.cars.vision import VisionSettings
+
+CAMERA = Calibration((640, 480), (450.0, 455.0), (322.0, 236.0), (0.0,) * 5)
+PIXELS = {7: (100.0, 50.0), 3: (500.5, 400.0)}
+RAYS = {n: np.array([(u - 322.0) / 450.0, (v - 236.0) / 455.0, 1.0]) for n, (u, v) in PIXELS.items()}
+
+
+def xyz(x: float, y: float, z: float = 0.0) -> Fields:
+    return Fields(x=x, y=y, z=z)
+
+
+def apriltags() -> Fields:
+    square = [xyz(-9.0, -9.0), xyz(9.0, -9.0), xyz(9.0, 9.0), xyz(-9.0, 9.0)]
+    return Fields(detections=[Fields(id=n, centre=xyz(u, v), corners=square) for n, (u, v) in PIXELS.items()])
+
+
+def boxes(nested: bool) -> Fields:
+    """Return a Detection2DArray: of ROS 2 with a nested hypothesis and centre, of ROS 1 without."""
+    found = []
+    for n, (u, v) in PIXELS.items():
+        guesses: list[Any] = [Fields(class_id="12", id=12, score=0.2), Fields(class_id=str(n), id=n, score=0.9)]
+        if nested:
+            guesses = [Fields(hypothesis=guess) for guess in guesses]
+        center = Fields(position=xyz(u, v)) if nested else xyz(u, v)
+        found.append(Fields(results=guesses, bbox=Fields(center=center, size_x=20.0, size_y=20.0)))
+    named = Fields(results=[Fields(class_id="chair", id="chair", score=1.0)], bbox=found[0].bbox)
+    return Fields(detections=[*found, named, Fields(results=[], bbox=found[0].bbox)])
+
+
+def markers(field: str) -> Fields:
+    poses = {n: Fields(pose=Fields(position=xyz(*(2.0 * ray)))) for n, ray in RAYS.items()}
+    entries = [Fields(id=n, pose=pose) for n, pose in poses.items()]
+    return Fields(**{field: [Fields(marker=entry) for entry in entries] if field == "arucos" else entries})
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("apriltag_msgs/msg/AprilTagDetectionArray", apriltags()),
+        ("vision_msgs/msg/Detection2DArray", boxes(nested=True)),
+        ("vision_msgs/msg/Detection2DArray", boxes(nested=False)),
+        ("aruco_msgs/msg/MarkerArray", markers("markers")),
+        ("svea_msgs/msg/ArucoArray", markers("arucos")),
+    ],
+    ids=["apriltag", "vision, ROS 2", "vision, ROS 1", "aruco", "authors"],
+)
+def test_every_detector_gives_the_rays_of_its_pixels(kind: str, message: Fields) -> None:
+    message.__dict__["__msgtype__"] = kind
+    found: Any = read(Role.DETECTIONS, message, CAMERA)
+    assert found.markers == (3, 7)
+    for marker, ray in zip(found.markers, found.bearings, strict=True):
+        np.testing.assert_allclose(ray, RAYS[marker] / np.linalg.norm(RAYS[marker]), atol=1e-12)
+
+
+def test_a_stamp_is_moved_to_the_exposure_of_the_rows_of_the_tags() -> None:
+    vision = VisionSettings(exposure=0.01, row_time=2e-5)
+    assert vision.late([100.0, 300.0], 480) == 5_000_000 + 4_000_000
+    assert vision.late([], 480) == 5_000_000 + 4_800_000
+
+
+def test_rectified_frames_have_the_projection_of_camera_info() -> None:
+    info = Fields(
+        width=640,
+        height=480,
+        distortion_model="plumb_bob",
+        k=np.array([450.0, 0, 322, 0, 455, 236, 0, 0, 1]),
+        d=np.array([-0.3, 0.1, 0, 0, 0]),
+        p=np.array([400.0, 0, 310, 0, 0, 410, 230, 0, 0, 0, 1, 0]),
+    )
+    assert calibration_of(info) == Calibration((640, 480), (450.0, 455.0), (322.0, 236.0), (-0.3, 0.1, 0.0, 0.0, 0.0))
+    assert calibration_of(info, rectified=True) == Calibration((640, 480), (400.0, 410.0), (310.0, 230.0), (0.0,) * 5)
