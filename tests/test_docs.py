@@ -220,31 +220,6 @@ def test_the_settings_of_training(tmp_path: Path) -> None:
 
 
 @pytest.mark.train
-def test_the_page_on_trainers_drives_with_the_result_of_the_one_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With weights that have learnt nothing, which the page's program takes for those of `examples/train_ppo.py`."""
-    torch = pytest.importorskip("torch", reason="needs the extra train")
-    from safetensors.torch import save_file
-
-    monkeypatch.setattr(sys, "path", [*sys.path, str(ROOT / "examples")])
-    from train_ppo import Policy
-
-    torch.manual_seed(0)
-    size = observation_layout(load_scenario("urban_crossing")).size
-    (tmp_path / "out" / "ppo").mkdir(parents=True)
-    save_file(
-        Policy(size, 2, hidden=64, initial_std=0.5).state_dict(), tmp_path / "out" / "ppo" / "weights.safetensors"
-    )
-    monkeypatch.chdir(tmp_path)
-    (block,) = (block for block in python_blocks(DOCS / "trainers.md") if "train_ppo" in block)
-    program: dict[str, Any] = {}
-    exec(compile(block, "trainers.md", "exec"), program)
-    ends = capsys.readouterr().out.splitlines()
-    assert sorted(line.partition(":")[0] for line in ends) == sorted(program["env"].possible_agents)
-
-
-@pytest.mark.train
 @pytest.mark.slow
 def test_the_page_trains_with_stable_baselines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -266,7 +241,6 @@ def test_the_page_trains_with_stable_baselines(
 @pytest.mark.parametrize(
     ("package", "word"),
     [
-        pytest.param("ray", "CooperativeMultiAgentEnv", marks=pytest.mark.rllib),
         pytest.param("ray", "CooperativeRows", marks=pytest.mark.rllib),
         pytest.param("torchrl", "PettingZooWrapper", marks=pytest.mark.torchrl),
         pytest.param("torchrl", "batched_env", marks=pytest.mark.torchrl),

@@ -66,7 +66,7 @@ def test_every_field_of_what_the_api_shows_is_described() -> None:
     classes = [part for part in found if part.is_class]
     classes += [part for module in found if module.is_module for part in module.classes.values() if not part.is_alias]
     records = [part for part in classes if "dataclass" in part.labels or part.name in ("Backend", "JointObserver")]
-    assert {"Tick", "Gains", "Sensed", "Command", "Run", "Field", "Difference", "Agent", "Backend"} <= {
+    assert {"Tick", "Gains", "Sensed", "Command", "Run", "Field", "Difference", "Backend"} <= {
         part.name for part in records
     }
     assert not [
