@@ -60,7 +60,7 @@ class RecordedGeometry:
     t: Annotated[np.ndarray, "f K"]  # s
     position: Annotated[np.ndarray, "f K N 3"]  # m, map frame
     target_position: Annotated[np.ndarray, "f K T 3"]  # m, truth
-    visible: Annotated[np.ndarray, "b K N T"]
+    visible: Annotated[np.ndarray, "b K N T"]  # measured in this frame
     vehicles: Annotated[np.ndarray, "U N"]  # names
 
 
@@ -74,13 +74,13 @@ class Trajectory(RecordedGeometry):
     `covariance` is the observer's P over (2 lambda, p), p being the position in the body frame.
     """
 
-    rotation: Annotated[np.ndarray, "f K N 3 3"]
+    rotation: Annotated[np.ndarray, "f K N 3 3"]  # true, body to map
     position_estimate: Annotated[np.ndarray, "f K N 3"]  # m
-    rotation_estimate: Annotated[np.ndarray, "f K N 3 3"]
+    rotation_estimate: Annotated[np.ndarray, "f K N 3 3"]  # body to map
     position_error: Annotated[np.ndarray, "f K N"]  # m
     orientation_error: Annotated[np.ndarray, "f K N"]  # deg, geodesic
     covariance: Annotated[np.ndarray, "f K N 6 6"]  # rad^2, rad m, m^2
-    nees: Annotated[np.ndarray, "f K N"]
+    nees: Annotated[np.ndarray, "f K N"]  # e^T P^-1 e
     protection_level: Annotated[np.ndarray, "f? K N 2"]  # m, rad; infinite: unknown, or none is stated
     velocity: Annotated[np.ndarray, "f K N 3"]  # m/s, truth
     angular_velocity: Annotated[np.ndarray, "f K N 3"]  # rad/s, truth

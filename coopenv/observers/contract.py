@@ -126,7 +126,7 @@ class Setup:
 class ObserverInit:
     """The setups of all observers, and the properties of the radio."""
 
-    setups: tuple[Setup, ...]
+    setups: tuple[Setup, ...]  # one per vehicle
     order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
     dt: float  # s
     period: int  # ticks between messages
