@@ -19,7 +19,7 @@ from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
-from coopenv.observers import Recording
+from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
@@ -218,3 +218,9 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "MRCLAM_Dataset6" / "Robot5_Measurement.dat").write_text("")
     assert main(["record", "mrclam_6", *data, "--force", "--out", str(path)]) == 0
     assert capsys.readouterr().err == "warning: mrclam_6: no detections of robot 5\n"
+
+
+def test_a_log_of_version_0_2_still_replays() -> None:
+    """`overtaking`, seed 3, 1 s, written by version 0.2; the final errors, m, are those that it computed itself."""
+    found = run("riccati", read_recording(Path(__file__).parent / "data" / "overtaking_0.2.mcap"))
+    assert_allclose(found.position_error[-1], [0.11374381960407857, 0.035937081495087564], rtol=1e-6)
