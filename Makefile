@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs notebooks lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs notebooks names lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -92,8 +92,11 @@ docs: $(VENV)/.docs ## build the documentation site, out/site/index.html; links 
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The site: out/site/index.html"
 
-notebooks: $(VENV)/.docs ## write the tutorials as notebooks to out/notebooks
-	@$(BIN)/python -m sitegen.notebooks out/notebooks
+notebooks: $(VENV)/.docs ## write the tutorials as notebooks to examples/notebooks
+	@$(BIN)/python -m sitegen.notebooks
+
+names: $(VENV)/.dev ## write the public names with their signatures to tests/public_names.txt
+	@$(BIN)/python -m sitegen.public_names
 
 test-browser: $(VENV)/.docs $(VENV)/.view ## the tests that open pages in headless Chromium (installs Debian's chromium, as root)
 	@command -v chromium > /dev/null || $(APT) chromium fonts-dejavu-core

@@ -1,7 +1,6 @@
-"""Tutorials as notebooks, from the same Markdown: `python -m sitegen.notebooks out/notebooks` (`make notebooks`)."""
+"""Tutorials as notebooks, from the same Markdown: `python -m sitegen.notebooks` (`make notebooks`)."""
 
 import re
-import sys
 from pathlib import Path, PurePosixPath
 
 import jupytext
@@ -10,6 +9,14 @@ import nbformat
 from sitegen.mirror import ROOT, outside_of_fences
 
 TUTORIALS = "docs/tutorials"
+FOLDER = ROOT / "examples" / "notebooks"
+INSTALL = """```python
+import importlib.util
+
+if importlib.util.find_spec("coopenv") is None:  # on a machine such as Colab's; a path of a wheel can replace the name
+    %pip install --quiet "coopenv{extras}"
+```"""
+EXTRA = re.compile(r"pip install '\.\[([\w,]+)\]'")
 FENCE = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:)[^)]+\)")
 PICTURE = re.compile(r"^!\[([^\]]*)\]\([^)]+\).*$")
@@ -29,6 +36,7 @@ def notebook(markdown: str) -> str:
     """Return the notebook of a tutorial: its programs and commands are cells, files that it shows are written.
 
     Outputs that the page shows are left out, as the notebook makes its own, and so are links, which lead elsewhere.
+    The first cell installs coopenv where it is missing, with the extras that the page names.
     """
 
     def cell(match: re.Match[str]) -> str:
@@ -39,7 +47,11 @@ def notebook(markdown: str) -> str:
             return f"```python\n%%bash\n{code}```"
         return "" if language == "text" else match[0]
 
-    text = outside_of_fences(FENCE.sub(cell, markdown), lambda line: PICTURE.sub(r"*\1*", LINK.sub(r"\1", line)))
+    extras = ",".join(dict.fromkeys(EXTRA.findall(markdown)))
+    install = INSTALL.format(extras=f"[{extras}]" if extras else "")
+    title, _, rest = FENCE.sub(cell, markdown).partition("\n")
+    page = f"{title}\n\n{install}\n{rest}"
+    text = outside_of_fences(page, lambda line: PICTURE.sub(r"*\1*", LINK.sub(r"\1", line)))
     made = jupytext.reads(text, fmt="md")
     made.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     for number, part in enumerate(made.cells):
@@ -47,7 +59,7 @@ def notebook(markdown: str) -> str:
     return str(nbformat.writes(made)) + "\n"
 
 
-def write(folder: Path) -> list[Path]:
+def write(folder: Path = FOLDER) -> list[Path]:
     """Write the notebooks of all tutorials and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -59,4 +71,4 @@ def write(folder: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    print(*write(Path(sys.argv[1] if len(sys.argv) > 1 else "out/notebooks")), sep="\n")
+    print(*write(), sep="\n")

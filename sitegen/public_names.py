@@ -1,4 +1,4 @@
-"""The public names with their signatures: `python -m sitegen.public_names` (`make names`) writes `tests/public_names.txt`.
+"""Public names with signatures: `python -m sitegen.public_names` (`make names`) writes `tests/public_names.txt`.
 
 Public are the names of the package, those that the pages of the Python API show, the commands with their options, and
 the ids of the environments. The keys of scenarios are those of `docs/scenario.schema.json`.
@@ -25,7 +25,7 @@ def _public(item: Any) -> list[Any]:
     return sorted(members, key=lambda member: str(member.name))
 
 
-def _described(name: str, item: Any) -> Iterator[str]:
+def described(name: str, item: Any) -> Iterator[str]:
     """Yield a line for a name, and those of the members of a class or module."""
     if item.is_function:
         yield item.signature(name=name)
@@ -35,9 +35,10 @@ def _described(name: str, item: Any) -> Iterator[str]:
         if item.is_class:
             bases = ", ".join(str(base) for base in item.bases)
             start = item.members.get("__init__")
-            yield f"class {name}({bases})" if start is None else start.signature(name=f"class {name}")
+            made = start and start.signature(name=f"class {name}", return_type=False)
+            yield made or f"class {name}({bases})"
         for member in _public(item):
-            yield from _described(f"{name}.{member.name}", member)
+            yield from described(f"{name}.{member.name}", member)
 
 
 def _python() -> Iterator[str]:
@@ -45,12 +46,16 @@ def _python() -> Iterator[str]:
     loader = griffe.GriffeLoader(search_paths=[str(ROOT)])
     package = loader.load("coopenv")
     loader.resolve_aliases()
-    for name in package.exports or ():
-        item = package.members.get(str(name))
-        yield from () if item is None else _described(f"coopenv.{name}", item.final_target if item.is_alias else item)
+    short = {}
+    for name in sorted(map(str, package.exports or ())):
+        if name in package.members:
+            item = package.members[name]
+            short[item.canonical_path] = name
+            yield from described(f"coopenv.{name}", item.final_target if item.is_alias else item)
     for page in sorted(PAGES.glob("*.md")):
-        for path in re.findall(r"^::: coopenv\.(\S+)", page.read_text(encoding="utf-8"), re.MULTILINE):
-            yield from _described(f"coopenv.{path}", package[path])
+        for path in re.findall(r"^::: (coopenv\.\S+)", page.read_text(encoding="utf-8"), re.MULTILINE):
+            if path not in short:
+                yield from described(path, package[path.removeprefix("coopenv.")])
 
 
 def _commands(name: str, command: Any) -> Iterator[str]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.helpers import bags
 from tests.helpers.sessions import ROOT
 
 pytest.importorskip("jupytext", reason="needs the extra 'docs'")
@@ -33,19 +33,24 @@ def test_a_page_becomes_cells() -> None:
         "```text\n1\n```\n\n```\nshown\n```\n"
     )
     text = notebooks.notebook(page)
-    assert cells(text) == ["%%writefile mine.py\nx = 1", "%%bash\nls", "print(1)"]
+    install, *others = cells(text)
+    assert others == ["%%writefile mine.py\nx = 1", "%%bash\nls", "print(1)"]
+    assert '%pip install --quiet "coopenv"' in install
+    assert '"coopenv[log,view]"' in cells(notebooks.notebook("# A\n\nIt needs `pip install '.[log,view]'`.\n"))[0]
     prose = "".join(cell.source for cell in nbformat.reads(text, as_version=4).cells if cell.cell_type == "markdown")
     assert "See there and [out](https://mcap.dev)" in prose and "*A car*" in prose and "shown" in prose
     assert json.loads(text)["metadata"]["kernelspec"]["name"] == "python3"
     assert text == notebooks.notebook(page)
 
 
-def test_every_tutorial_becomes_one(tmp_path: Path) -> None:
+def test_every_tutorial_becomes_one_without_outputs_as_in_the_clone(tmp_path: Path) -> None:
     written = notebooks.write(tmp_path)
     assert sorted(path.stem for path in written) == sorted(NAMES)
     for path in written:
-        nbformat.validate(nbformat.read(path, as_version=4))
-        assert len(cells(path.read_text(encoding="utf-8"))) >= 3
+        text = path.read_text(encoding="utf-8")
+        nbformat.validate(nbformat.reads(text, as_version=4))
+        assert len(cells(text)) >= 3 and not any(cell.get("outputs") for cell in json.loads(text)["cells"])
+        assert text == (notebooks.FOLDER / path.name).read_text(encoding="utf-8"), "run `make notebooks`"
 
 
 @pytest.mark.slow
@@ -56,8 +61,8 @@ def test_notebooks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     if name in NEEDS:
         module, extra = NEEDS[name]
         pytest.importorskip(module, reason=f"needs the extra {extra!r}")
-    if name == "logs":  # the reader's bag
-        bags.write(tmp_path / "drive", bags.messages(bags.drive()), "ros1")
+    if name == "logs":  # the sample of a clone
+        shutil.copytree(ROOT / "examples" / "bags", tmp_path / "examples" / "bags")
     tool = tmp_path / "bin" / "coopenv"
     tool.parent.mkdir()
     tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")
