@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs notebooks names lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -91,6 +91,10 @@ $(VENV)/.docs: $(VENV)/.dev
 docs: $(VENV)/.docs ## build the documentation site, out/site/index.html; links are checked
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "The site: out/site/index.html"
+
+site-version: $(VENV)/.docs ## put the site of VERSION (such as 0.9) beside those of earlier versions, on the local branch gh-pages
+	@SITE_VERSIONS=mike NO_MKDOCS_2_WARNING=1 $(BIN)/mike deploy --update-aliases --alias-type redirect $(VERSION) latest
+	@$(BIN)/mike set-default latest
 
 notebooks: $(VENV)/.docs ## write the tutorials as notebooks to examples/notebooks
 	@$(BIN)/python -m sitegen.notebooks

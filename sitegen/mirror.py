@@ -18,6 +18,7 @@ PAGES = {
     "docs": "index.md",
     "examples": "files/examples.md",
     "examples/fleet": "files/examples.md",
+    "examples/notebooks": "tutorials/index.md",
 }
 """Pages of files (and folders) that do not stand under files/."""
 
