@@ -44,7 +44,7 @@ def described(name: str, item: Any) -> Iterator[str]:
 def _python() -> Iterator[str]:
     """Yield the names of the package and of the pages of its API."""
     loader = griffe.GriffeLoader(search_paths=[str(ROOT)])
-    package = loader.load("coopenv")
+    package: Any = loader.load("coopenv")
     loader.resolve_aliases()
     short = {}
     for name in sorted(map(str, package.exports or ())):
