@@ -189,3 +189,22 @@ def test_installed_wheel_makes_environments(wheel: Path, tmp_path: Path) -> None
     assert printed[:-1] == sorted(path.stem for path in (ROOT / "envs").glob("*.toml"))
     assert printed[-1] == "5"
     assert "busy_intersection" in run(tmp_path / "venv" / "bin" / "coopenv", "list", cwd=tmp_path)
+    asked = "from coopenv.base.installation import install_command; print(install_command('log'))"
+    assert run(python, "-c", asked, cwd=tmp_path).strip() == "pip install 'coopenv[log]'"
+    assert run(sys.executable, "-c", asked, cwd=ROOT).strip() == "pip install '.[log]'"
+
+
+@pytest.mark.packaging
+def test_the_wheel_has_a_description_that_an_index_shows(wheel: Path) -> None:
+    run(sys.executable, "-m", "twine", "check", "--strict", wheel, cwd=ROOT)
+
+
+def test_tools_of_a_release_are_those_of_the_tests_and_have_hashes() -> None:
+    pinned = dict(re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE))
+    tools = (ROOT / ".ci" / "release.txt").read_text(encoding="utf-8").replace("\\\n", "").splitlines()
+    rows = [row.split() for row in tools if row and not row.startswith("#")]
+    assert {name.partition("==")[0] for name, *_ in rows} >= {"build", "hatchling", "uv"}
+    for tool, *hashes in rows:
+        name, _, version = tool.partition("==")
+        assert pinned.get(name.replace("-", "_"), pinned.get(name, version)) == version, name
+        assert hashes and all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", text) for text in hashes), name

@@ -24,6 +24,7 @@ from coopenv.api.arguments import (
 from coopenv.api.engine import Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, world_keys
+from coopenv.base.installation import install_command
 from coopenv.scenario import Scenario
 
 ArrayKind = Literal["numpy", "torch"]
@@ -95,7 +96,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """What arrays are: fresh host arrays, or tensors on the device that share memory with the engine."""
         check_one_of("unknown arrays", self.arrays, ("numpy", "torch"))
         if self.arrays == "torch" and find_spec("torch") is None:
-            raise CoopenvError("arrays='torch' needs torch: pip install '.[train]'")
+            raise CoopenvError(f"arrays='torch' needs torch: {install_command('train')}")
         self._tensors: dict[str, Any] = {}
         self._stream: Any = None
 

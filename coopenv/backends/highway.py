@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.backends.simulated import CosimulatedWorld, Poses, Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
@@ -75,7 +75,7 @@ OWNED = {
 }
 """Keys of highway-env's configuration that follow from other parts of a scenario, named here."""
 
-NO_ENVIRONMENT = "backend 'highway' needs highway-env, which is not installed: pip install '.[highway]'"
+NO_ENVIRONMENT = f"backend 'highway' needs highway-env, which is not installed: {install_command('highway')}"
 
 
 def make_environment(scenario: Scenario) -> Any:

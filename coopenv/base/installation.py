@@ -38,6 +38,12 @@ def data_directory(kind: str) -> Path:
     return shipped if shipped.is_dir() else package.parent / kind
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra: from the folder of a clone, or else by the package's name."""
+    package = Path(__file__).resolve().parents[1]
+    return f"pip install '{'coopenv' if (package / 'data').is_dir() else '.'}[{extra}]'"
+
+
 @cache
 def message_types(release: str) -> Any:
     """Return the store of message types of a release of ROS, such as ROS2_JAZZY, with those of `coopenv/messages`.

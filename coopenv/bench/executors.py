@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import ONE_THREAD, available_cores, environment, needing
+from coopenv.base.installation import ONE_THREAD, available_cores, environment, install_command, needing
 from coopenv.base.interrupts import end_with_parent, held
 
 T = TypeVar("T")
@@ -118,7 +118,7 @@ class Ray:
             CoopenvError: Ray is not installed, or the cluster does not answer in time.
         """
         os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is one line, printed here
-        with needing("--engine ray needs Ray: pip install '.[ray]'"):
+        with needing(f"--engine ray needs Ray: {install_command('ray')}"):
             import ray
         if ray.is_initialized():
             return ray

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import message_types, needing
+from coopenv.base.installation import install_command, message_types, needing
 from coopenv.cars.profile import SVEA, CarProfile
 
 TICK = "coopenv_msgs/msg/Tick"
@@ -34,7 +34,7 @@ def ros1() -> Any:
 
 
 def _store(name: str) -> Any:
-    with needing("messages of cars need an extra: pip install '.[svea]'"):
+    with needing(f"messages of cars need an extra: {install_command('svea')}"):
         return message_types(name)
 
 

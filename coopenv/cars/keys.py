@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.files import replace_text, writing
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -210,7 +210,7 @@ def check_known(verifier: Verifier, identity: str, path: str | Path) -> None:
 
 def library() -> Any:
     """Return the library's module of Ed25519. Raises CoopenvError: the extra is not installed."""
-    with needing("signatures need an extra: pip install '.[svea]'"):
+    with needing(f"signatures need an extra: {install_command('svea')}"):
         from cryptography.hazmat.primitives.asymmetric import ed25519
     return ed25519
 

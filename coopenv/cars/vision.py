@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 from scipy.ndimage import map_coordinates
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.base.sections import Section
 from coopenv.estimation.poses import Array
 
@@ -141,7 +141,7 @@ FINDERS: dict[str, Find] = {
 def opencv() -> Any:
     """Return OpenCV, one thread of it. Raises CoopenvError: the extra is not installed."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))  # before a file fills the memory
-    with needing("tags in images need an extra: pip install '.[vision]'"):
+    with needing(f"tags in images need an extra: {install_command('vision')}"):
         import cv2
     cv2.setNumThreads(1)
     return cv2

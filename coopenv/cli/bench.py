@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import install_command
 from coopenv.cli import options
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ def bench_learning(
     """Train agents by environment, arm and seed, and write their cards; goes on where it was interrupted."""
     from coopenv.base.installation import available_cores, needing
 
-    with needing("coopenv bench learning needs the extra train: pip install '.[train]'"):
+    with needing(f"coopenv bench learning needs the extra train: {install_command('train')}"):
         from coopenv.bench import learning
 
     whole, log = learning.read_study(study), options.console(stderr=True)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.cli import options
 
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
@@ -101,7 +101,7 @@ def train(given: TrainOptions) -> None:
 
     from coopenv.runs.console import Progress
 
-    needs = "torch, stable-baselines3, tensorboard and tomlkit: pip install '.[train]'"
+    needs = f"torch, stable-baselines3, tensorboard and tomlkit: {install_command('train')}"
     with needing(f"coopenv train needs {needs}"):
         from coopenv.training.command import Reports
         from coopenv.training.command import train as perform

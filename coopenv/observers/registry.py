@@ -18,7 +18,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError, error_text, shown, suggest
-from coopenv.base.installation import absolute_reference, is_reference, load_reference
+from coopenv.base.installation import absolute_reference, install_command, is_reference, load_reference
 
 if TYPE_CHECKING:
     from coopenv.observers.contract import Factory
@@ -203,7 +203,7 @@ def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
     if name in ZOO:
         module = ZOO[name].needs
-        return f"needs {module}: pip install '.[bench]'" if module and find_spec(module) is None else ""
+        return f"needs {module}: {install_command('bench')}" if module and find_spec(module) is None else ""
     if name not in _registered:
         try:
             find(name)

@@ -14,6 +14,7 @@ from coopenv.backends.base import Repeating
 from coopenv.base.errors import CoopenvError, DataError, listed
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text
+from coopenv.base.installation import install_command
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.registry import states_covariance
@@ -95,7 +96,7 @@ def execute(
                 fps = scenario.rates.camera / frame_stride(scenario)
                 write_film(scene, paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
-                log.print("video: written as GIF; for MP4: pip install '.[video]'", soft_wrap=True)
+                log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
     return {**metrics, "files": [out / path.name for path in paths]}
 
 

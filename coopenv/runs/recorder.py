@@ -20,7 +20,7 @@ from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
-from coopenv.base.installation import environment, environment_id, needing, version
+from coopenv.base.installation import environment, environment_id, install_command, needing, version
 from coopenv.estimation.observability import Trajectory
 from coopenv.estimation.poses import quaternion_wxyz
 from coopenv.evaluation.episodes import Views, driven_vehicles, play
@@ -208,7 +208,7 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
         CoopenvError: Minari is not installed, or the identity is not one.
         OutputError: the dataset is there.
     """
-    with needing("a dataset needs Minari: pip install '.[minari]'"):
+    with needing(f"a dataset needs Minari: {install_command('minari')}"):
         import h5py  # noqa: F401 (Minari imports it late)
         from minari.dataset.minari_dataset import parse_dataset_id
     try:

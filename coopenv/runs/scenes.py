@@ -21,7 +21,7 @@ from coopenv.backends.mcap import write_recording
 from coopenv.backends.sources import SourceKind, kind_of, open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_file, writing
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
@@ -197,7 +197,9 @@ def pages_can_be_written(path: Path, log: Console) -> bool:
     """Return whether the extra `view` is installed; where it is not, a line says so."""
     there = find_spec("viser") is not None
     if not there:
-        log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
+        log.print(
+            f"note: no {path.name}: pages in the browser need an extra: {install_command('view')}", soft_wrap=True
+        )
     return there
 
 
@@ -219,7 +221,7 @@ def check_film(path: Path) -> None:
     if path.suffix not in SUFFIXES:
         raise OutputError(f"{path}: unknown format of a film; known: {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise CoopenvError(f"{path}: MP4 needs an extra: pip install '.[video]'; GIF and WebP do not")
+        raise CoopenvError(f"{path}: MP4 needs an extra: {install_command('video')}; GIF and WebP do not")
 
 
 def video_path(folder: Path) -> Path:

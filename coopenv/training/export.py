@@ -15,7 +15,7 @@ from torch import nn
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.base.files import writing
-from coopenv.base.installation import needing, version, versions
+from coopenv.base.installation import install_command, needing, version, versions
 from coopenv.evaluation import Result
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import ENTRY, layout_hash, layout_tables
@@ -164,7 +164,7 @@ def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:
 
 def check_onnx() -> None:
     """Find out before any work whether ONNX models can be written. Raises CoopenvError: the package is missing."""
-    with needing("--onnx needs the package onnx: pip install '.[onnx]'"):
+    with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 
 

@@ -7,13 +7,14 @@ from typing import Any
 
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import NUMBERS, PlainInfos
+from coopenv.base.installation import install_command
 
 try:
     from benchmarl.environments.pettingzoo.common import PettingZooClass
     from torchrl.envs import EnvBase
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.benchmarl needs BenchMARL: pip install '.[benchmarl]'") from error
+    raise ImportError(f"coopenv.api.trainers.benchmarl needs BenchMARL: {install_command('benchmarl')}") from error
 
 
 class CooperativeTask(PettingZooClass):

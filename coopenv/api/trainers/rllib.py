@@ -10,11 +10,12 @@ from coopenv.api.make import make_rows, parallel_env
 from coopenv.api.parallel_env import PlainInfos
 from coopenv.api.vector_env import TrueEnds
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import install_command
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.rllib needs RLlib: pip install '.[rllib]'") from error
+    raise ImportError(f"coopenv.api.trainers.rllib needs RLlib: {install_command('rllib')}") from error
 
 
 class CooperativeMultiAgentEnv(MultiAgentEnv):

@@ -14,6 +14,7 @@ from coopenv.api.make import make_vec
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv, RecordVehicleEpisodes
 from coopenv.base.errors import CoopenvError, checked_seed
+from coopenv.base.installation import install_command
 from coopenv.estimation.outcomes import Outcome
 
 try:
@@ -23,7 +24,7 @@ try:
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.sb3 needs stable-baselines3: pip install '.[train]'") from error
+    raise ImportError(f"coopenv.api.trainers.sb3 needs stable-baselines3: {install_command('train')}") from error
 
 AT_THE_END = ("position_error", "orientation_error", "nees", "log_determinant", "gramian_min_eigenvalue", "time")
 """Fields of the batch's infos that a row's info holds when its episode ends."""

@@ -8,11 +8,12 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from coopenv.api.make import make_vec
 from coopenv.api.vector_env import CooperativeVectorEnv, TrueEnds
+from coopenv.base.installation import install_command
 
 try:
     from torchrl.envs import GymWrapper
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.torchrl needs TorchRL: pip install '.[torchrl]'") from error
+    raise ImportError(f"coopenv.api.trainers.torchrl needs TorchRL: {install_command('torchrl')}") from error
 
 
 class WholeWorlds(VectorWrapper):

@@ -20,7 +20,7 @@ from pydantic import Field, create_model
 
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.format import jsonable
-from coopenv.base.installation import message_types, needing, version
+from coopenv.base.installation import install_command, message_types, needing, version
 from coopenv.base.sections import Section, validated
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
@@ -71,7 +71,7 @@ def exact_topics(pan: bool) -> dict[str, str]:
 @cache
 def codec() -> Any:
     """Return the store of message types, with ours in it. Raises CoopenvError: the extra is not installed."""
-    with needing("MCAP files need an extra: pip install '.[log]'"):
+    with needing(f"MCAP files need an extra: {install_command('log')}"):
         import mcap  # noqa: F401
 
         return message_types("ROS2_JAZZY")

@@ -20,7 +20,7 @@ from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.mcap.format import CUT_OFF, RosLog, codec, metadata_names, reading
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
-from coopenv.base.installation import version
+from coopenv.base.installation import install_command, version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
@@ -56,7 +56,7 @@ class DriveRecorder:
             CoopenvError: the extra is not installed.
         """
         if find_spec("mcap") is None:
-            raise CoopenvError("recording cars needs an extra: pip install '.[svea]'")
+            raise CoopenvError(f"recording cars needs an extra: {install_command('svea')}")
         if path.suffix != ".mcap":
             raise OutputError(f"{path}: the name must end in .mcap")
         if path.exists():

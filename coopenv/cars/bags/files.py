@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from coopenv.backends.mcap.format import REPAIR
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, error_text
+from coopenv.base.installation import install_command
 from coopenv.cars import codec
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ class BagFile:
 def check_extra() -> None:
     """Make sure that bags can be read. Raises CoopenvError: the extra is not installed."""
     if find_spec("rosbags") is None:
-        raise CoopenvError("ROS bags need an extra: pip install '.[log]'")
+        raise CoopenvError(f"ROS bags need an extra: {install_command('log')}")
 
 
 _allowance: ContextVar["Allowance | None"] = ContextVar("_allowance", default=None)

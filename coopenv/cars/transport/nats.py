@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
 
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.cars.transport.base import (
     Arrival,
     Callback,
@@ -201,7 +201,7 @@ def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: 
         LinkError: no broker answers.
     """
     addresses = [address_of(endpoint) for endpoint in connect]
-    with needing("NATS needs an extra: pip install '.[nats]'"):
+    with needing(f"NATS needs an extra: {install_command('nats')}"):
         import nats
 
     last: list[Exception] = []

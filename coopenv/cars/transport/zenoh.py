@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.cars.deployment import Deployment, DeploymentError
 from coopenv.cars.transport.base import (
     SECURE,
@@ -82,7 +82,7 @@ class Zenoh:
 
 def library() -> Any:
     """Return the library. Raises CoopenvError: the extra is not installed."""
-    with needing("Zenoh needs an extra: pip install '.[svea]'"):
+    with needing(f"Zenoh needs an extra: {install_command('svea')}"):
         import zenoh
     return zenoh
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.viz.style import vehicle_colour
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def check_installed() -> None:
     Raises:
         CoopenvError: it is not.
     """
-    with needing("scenes for Foxglove need an extra: pip install '.[log]', or --no-scene"):
+    with needing(f"scenes for Foxglove need an extra: {install_command('log')}, or --no-scene"):
         import foxglove.messages  # noqa: F401
 
 

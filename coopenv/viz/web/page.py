@@ -19,7 +19,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
 from coopenv.viz.web.ground import Look
@@ -37,7 +37,7 @@ def viser_module() -> Any:
     Raises:
         CoopenvError: it is not installed.
     """
-    with needing("pictures in the browser need an extra: pip install '.[view]'"):
+    with needing(f"pictures in the browser need an extra: {install_command('view')}"):
         import viser
     import rich
 
