@@ -200,7 +200,8 @@ def test_the_wheel_has_a_description_that_an_index_shows(wheel: Path) -> None:
 
 
 def test_tools_of_a_release_are_those_of_the_tests_and_have_hashes() -> None:
-    pinned = dict(re.findall(r"^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE))
+    constraints = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    pinned = dict(re.findall(r"^([\w.-]+)==(\S+)", constraints, re.MULTILINE))
     tools = (ROOT / ".ci" / "release.txt").read_text(encoding="utf-8").replace("\\\n", "").splitlines()
     rows = [row.split() for row in tools if row and not row.startswith("#")]
     assert {name.partition("==")[0] for name, *_ in rows} >= {"build", "hatchling", "uv"}
