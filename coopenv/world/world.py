@@ -13,11 +13,12 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.launch import Launcher, PerWorld, default_threads
+from coopenv.world.launch import Launcher, PerLane, PerWorld, threads_and_lanes
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
     ANYTHING,
+    SCRATCH,
     allocate,
     allocate_state,
     checked_state,
@@ -27,8 +28,19 @@ from coopenv.world.state import (
     state_fields,
     state_sizes,
     state_struct,
+    with_own_scratch,
 )
-from coopenv.world.step import Kernels, fused_kernels, host_kernels, observer_kernels, source_kernels
+from coopenv.world.step import (
+    ARRANGE,
+    LOOK,
+    MOVE,
+    SENSE,
+    Kernels,
+    fused_kernels,
+    host_kernels,
+    observer_kernels,
+    source_kernels,
+)
 
 BY_AGENT = {
     "bearing": 0.0,
@@ -86,29 +98,31 @@ class World:
             raise CoopenvError("topology.most_nearby: only where vehicles are simulated; leave it out")
         self.precision = precision(dtype)
         self.device = check_device(device)
-        self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
-        if self.device != "cpu":
-            self.threads = 1
         self.model = self._build_model()
+        N = self.model.vehicles
+        shares, lanes = threads_and_lanes(worlds, N, self.device, threads)
+        self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
-        needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, sizes)
+        needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, {**sizes, SCRATCH: lanes})
         check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         self.state.parameter_set.fill_(NOT_SET)
         self.state.difficulty.fill_(self.scenario.difficulty.number)
-        N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
         anew = np.concatenate([covariance, np.broadcast_to(UNKNOWN, (N, 6, 6))])
         self.model.start.covariance = wp.array(anew, dtype=mat66d, device=self.device)
-        self.memory = allocate(self.observer.memory, sizes, self.device)
+        self.memory = allocate(self.observer.memory, sizes, self.device, "" if lanes == N else SCRATCH)
         """What the embedded observer remembers besides the state."""
+        others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
+        self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
+        self._levels = wp.zeros((worlds, N), dtype=wp.int32, device=self.device)
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
-        self.launch = Launcher(worlds, self.device, dtype, self.threads)
+        self.launch = Launcher(worlds, self.device, dtype, shares, lanes)
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -191,16 +205,35 @@ class World:
             revive = observer_kernels(self.observer, self.precision)["revive"]
             self._run(("revive", ticks), revive, memory, hold, ticks)
         sensing = self._world_kernels
-        if "advance" in sensing:
+        if self.launch.lanes > 1:
+            self.decide()
+            for _ in range(ticks):
+                self.sense()
+                self._follow()
+                self.finish()
+        elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
             world = [self.model, PerWorld(self.state)]
             decide = sensing["decide"], [*world, PerWorld(self.actions), hold]
-            sense = sensing["sense"], [*world, self._record, hold]
-            follow = observer_kernels(self.observer, self.precision)["follow"], [*world, memory, hold]
-            self.launch.decision(("advance", ticks), ticks, decide, sense, follow)
+            sense = sensing["sense"], [*world, self._record, hold, SENSE]
+            follow = observer_kernels(self.observer, self.precision)["follow"]
+            self.launch.decision(
+                ("advance", ticks), ticks, decide, sense, (follow, [*world, memory, hold, PerWorld(self._levels), 0])
+            )
         self.check_room()
+
+    def _follow(self) -> None:
+        """Let all vehicles receive, estimate and send, in lanes."""
+        hold, levels, last = PerWorld(self.mask), PerWorld(self._levels), 0
+        if self.model.radio.delay == 0:
+            self._run("levels", host_kernels(self.precision)["find_levels"], hold, levels)
+            last = int(self._levels.numpy().max())
+        follow = observer_kernels(self.observer, self.precision)["follow"]
+        for level in range(last + 1):
+            arguments = [self.model, PerWorld(self.state), self._memories, hold, levels, level]
+            self.launch.by_lane(("follow", level), follow, arguments)
 
     def check_room(self) -> None:
         """Make sure that a vehicle keeps all that is in range; on a GPU, that counts the others in `crowded`, no check.
@@ -234,7 +267,14 @@ class World:
 
     def sense(self) -> None:
         """Move the truth to the next tick and measure it."""
-        self._run("sense", source_kernels(self.source, self.precision)["sense"], self._record, PerWorld(self.mask))
+        sense = source_kernels(self.source, self.precision)["sense"]
+        world = [self.model, PerWorld(self.state), self._record, PerWorld(self.mask)]
+        if self.launch.lanes == 1:
+            self.launch.by_lane("sense", sense, [*world, SENSE])
+            return
+        self.launch.by_lane("move", sense, [*world, MOVE])
+        self.launch("arrange", sense, [*world, ARRANGE, 0, 1], (1,))
+        self.launch.by_lane("look", sense, [*world, LOOK])
 
     def receive(self, vehicle: int) -> None:
         """Let a vehicle receive what arrives at this tick."""
