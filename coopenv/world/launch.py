@@ -261,6 +261,7 @@ class Launcher:
     def __init__(self, worlds: int, device: str, precision_name: str, threads: int = 1, lanes: int = 1) -> None:
         self._worlds, self._device, self._precision = worlds, device, precision_name
         self.lanes = lanes
+        self._lane_threads = lanes if device == "cpu" else 1
         self._shares = _split(0, worlds, threads)
         self._recorded: dict[Hashable, list[list[Callable[[], Any]]]] = {}
         self._pool: ThreadPoolExecutor | None = None
@@ -274,25 +275,25 @@ class Launcher:
 
     def by_vehicle(self, key: Hashable, function: Function, arguments: list[Any], vehicles: int) -> None:
         """Run a kernel over the grid (worlds, vehicles); its last argument is the number of the first vehicle."""
-        if self.lanes == 1 or self._device != "cpu":
-            self(key, function, [*arguments, 0], (vehicles,))
-            return
         if key not in self._recorded:
             self._recorded[key] = [
-                [self._record(function, [*arguments, first], self._shares[0], (last - first,))]
-                for first, last in _split(0, vehicles, self.lanes)
+                [self._record(function, [*arguments, first], share, (last - first,), lane)]
+                for share in self._shares
+                for lane, (first, last) in enumerate(_split(0, vehicles, self._lane_threads))
             ]
         self._run(self._recorded[key])
 
-    def by_lane(self, key: Hashable, function: Function, arguments: list[Any]) -> None:
-        """Run a kernel over the grid (worlds, lanes); its last arguments are the first lane and how many there are."""
-        if self.lanes == 1 or self._device != "cpu":
-            self(key, function, [*arguments, 0, self.lanes], (self.lanes,))
-            return
+    def by_lane(self, key: Hashable, *calls: Call) -> None:
+        """Run kernels over the grid (worlds, lanes), in each lane one after the other.
+
+        Their last arguments are the first lane and how many there are.
+        """
         if key not in self._recorded:
+            width = self.lanes // self._lane_threads
             self._recorded[key] = [
-                [self._record(function, [*arguments, lane, self.lanes], self._shares[0], (1,), lane)]
-                for lane in range(self.lanes)
+                [self._record(f, [*arguments, lane, self.lanes], share, (width,), lane) for f, arguments in calls]
+                for share in self._shares
+                for lane in range(self._lane_threads)
             ]
         self._run(self._recorded[key])
 
@@ -342,7 +343,7 @@ class Launcher:
     def _workers(self) -> ThreadPoolExecutor:
         """Return this process's threads: those of a parent process do not exist after a fork."""
         if self._pool is None or self._pool_owner != os.getpid():
-            threads = max(len(self._shares), self.lanes)
+            threads = max(len(self._shares), self._lane_threads)
             self._pool, self._pool_owner = ThreadPoolExecutor(threads - 1), os.getpid()
         return self._pool
 

@@ -13,7 +13,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.launch import Launcher, PerLane, PerWorld, threads_and_lanes
+from coopenv.world.launch import Call, Launcher, PerLane, PerWorld, threads_and_lanes
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
@@ -206,34 +206,45 @@ class World:
             self._run(("revive", ticks), revive, memory, hold, ticks)
         sensing = self._world_kernels
         if self.launch.lanes > 1:
-            self.decide()
-            for _ in range(ticks):
-                self.sense()
-                self._follow()
-                self.finish()
+            self._advance_in_lanes(ticks)
         elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
-            world = [self.model, PerWorld(self.state)]
-            decide = sensing["decide"], [*world, PerWorld(self.actions), hold]
-            sense = sensing["sense"], [*world, self._record, hold, SENSE]
-            follow = observer_kernels(self.observer, self.precision)["follow"]
-            self.launch.decision(
-                ("advance", ticks), ticks, decide, sense, (follow, [*world, memory, hold, PerWorld(self._levels), 0])
-            )
+            decide = sensing["decide"], [self.model, PerWorld(self.state), PerWorld(self.actions), hold]
+            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), self._follow())
         self.check_room()
 
-    def _follow(self) -> None:
-        """Let all vehicles receive, estimate and send, in lanes."""
-        hold, levels, last = PerWorld(self.mask), PerWorld(self._levels), 0
-        if self.model.radio.delay == 0:
-            self._run("levels", host_kernels(self.precision)["find_levels"], hold, levels)
-            last = int(self._levels.numpy().max())
-        follow = observer_kernels(self.observer, self.precision)["follow"]
-        for level in range(last + 1):
-            arguments = [self.model, PerWorld(self.state), self._memories, hold, levels, level]
-            self.launch.by_lane(("follow", level), follow, arguments)
+    def _advance_in_lanes(self, ticks: int) -> None:
+        """Run ticks of one decision; vehicles do not wait for each other but for messages of the same tick."""
+        self.decide()
+        for _ in range(ticks):
+            self._move()
+            if self.model.radio.delay > 0:
+                self.launch.by_lane("look and follow", self._sense(LOOK), self._follow())
+            else:
+                self.launch.by_lane("look", self._sense(LOOK))
+                levels = host_kernels(self.precision)["find_levels"]
+                self._run("levels", levels, PerWorld(self.mask), PerWorld(self._levels))
+                for level in range(int(self._levels.numpy().max()) + 1):
+                    self.launch.by_lane(("follow", level), self._follow(level))
+            self.finish()
+
+    def _sense(self, stages: int) -> Call:
+        """Return the launch of stages of a tick before observers."""
+        sense = source_kernels(self.source, self.precision)["sense"]
+        return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
+
+    def _follow(self, level: int = 0) -> Call:
+        """Return the launch of the observers of a level."""
+        follow, worlds = observer_kernels(self.observer, self.precision)["follow"], PerWorld(self.state)
+        return follow, [self.model, worlds, self._memories, PerWorld(self.mask), PerWorld(self._levels), level]
+
+    def _move(self) -> None:
+        """Move the truth to the next tick, in lanes."""
+        self.launch.by_lane("move", self._sense(MOVE))
+        arrange, arguments = self._sense(ARRANGE)
+        self.launch("arrange", arrange, [*arguments, 0, 1], (1,))
 
     def check_room(self) -> None:
         """Make sure that a vehicle keeps all that is in range; on a GPU, that counts the others in `crowded`, no check.
@@ -267,14 +278,11 @@ class World:
 
     def sense(self) -> None:
         """Move the truth to the next tick and measure it."""
-        sense = source_kernels(self.source, self.precision)["sense"]
-        world = [self.model, PerWorld(self.state), self._record, PerWorld(self.mask)]
         if self.launch.lanes == 1:
-            self.launch.by_lane("sense", sense, [*world, SENSE])
-            return
-        self.launch.by_lane("move", sense, [*world, MOVE])
-        self.launch("arrange", sense, [*world, ARRANGE, 0, 1], (1,))
-        self.launch.by_lane("look", sense, [*world, LOOK])
+            self.launch.by_lane("sense", self._sense(SENSE))
+        else:
+            self._move()
+            self.launch.by_lane("look", self._sense(LOOK))
 
     def receive(self, vehicle: int) -> None:
         """Let a vehicle receive what arrives at this tick."""
