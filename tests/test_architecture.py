@@ -86,8 +86,8 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (110, 2),
-    "api": (3920, 19),
-    "backends": (3280, 17),
+    "api": (3960, 19),
+    "backends": (3285, 17),
     "base": (1395, 8),
     "bench": (4665, 18),
     "cars": (10520, 47),
@@ -97,10 +97,10 @@ LINES_AND_FILES = {
     "observers": (11820, 47),
     "policies": (1725, 10),
     "runs": (2875, 11),
-    "scenario": (3165, 12),
+    "scenario": (3175, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (4910, 19),
+    "world": (5125, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

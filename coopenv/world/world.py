@@ -80,8 +80,8 @@ class World:
             worlds: how many.
             dtype: "float32" or "float64".
             device: "cpu", "cuda", "cuda:0", ...
-            threads: shares into which the batch is split on the CPU; None: by its size and the cores. Results do not
-                depend on it.
+            threads: shares into which the batch, or each of its worlds, is split on the CPU; None: by size and cores
+                (`threads_and_lanes`). Results do not depend on it.
             observer: what estimates in the kernels (none by default: the estimates are written from outside).
             start_covariance: (N, 6, 6) of the initial estimates, for the observer; LEFT coordinates, rad and m.
 
