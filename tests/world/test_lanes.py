@@ -29,6 +29,7 @@ def _small_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("variant", STREETS)
 @pytest.mark.parametrize("observer", ["riccati", pytest.param("robust", marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("_small_lanes")
 def test_vehicles_at_once_are_vehicles_in_turn(variant: str, observer: str) -> None:
     description, found = street(60, 96, observer, **STREETS[variant]), []
     for threads in (1, 2, 3):
@@ -55,6 +56,7 @@ def test_few_vehicles_of_two_worlds(name: str) -> None:
     assert_same(*found)
 
 
+@pytest.mark.usefixtures("_small_lanes")
 def test_results_of_a_step() -> None:
     description, found = street(60, 96), []
     for threads in (1, 2):
@@ -73,6 +75,7 @@ def longest_chain(world: World, vehicle: int, tick: int) -> int:
     return max((1 + longest_chain(world, sender, tick) for sender in senders), default=0)
 
 
+@pytest.mark.usefixtures("_small_lanes")
 def test_levels_are_the_longest_chains_of_messages() -> None:
     world = simulate(street(60, 64, v2x={"delay": 0, "range": 12.0}), 1, threads=2)
     reset(world, [0])
@@ -87,11 +90,11 @@ def test_levels_are_the_longest_chains_of_messages() -> None:
     [
         (1, 5, "cpu", 4, (1, 1)),
         (1, 5, "cpu", None, (1, 1)),
-        (1, 63, "cpu", 4, (1, 1)),
+        (1, 127, "cpu", 4, (1, 1)),
         (1, 1024, "cpu", 4, (1, 4)),
         (3, 1024, "cpu", 4, (1, 4)),
         (4, 1024, "cpu", 4, (4, 1)),
-        (1, 96, "cpu", 4, (1, 3)),
+        (1, 192, "cpu", 4, (1, 3)),
         (3, 5, "cpu", 4, (3, 1)),
         (1, 1024, "cuda:0", None, (1, 1024)),
         (65536, 5, "cuda:0", None, (1, 1)),
