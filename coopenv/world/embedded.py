@@ -73,7 +73,8 @@ class Embedded:
 
     Its functions read what a vehicle senses and receives from `state`, write its estimate there (`estimate_rotation`,
     `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`. `model` and
-    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else.
+    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else. A vehicle writes
+    its own rows alone, and reads of another one what has arrived from it: vehicles may run at once.
     """
 
     name: str
@@ -89,7 +90,7 @@ class Embedded:
     at every tick, after `start` as well."""
     memory: Any = Nothing
     """A Warp struct whose arrays are declared with `coopenv.world.state.array`, the axes W (worlds) and N (vehicles)
-    first."""
+    first; or W and L: scratch."""
     sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
     """Lengths of axes by letter, besides those of the state (`coopenv.world.state.state_sizes`)."""
     fit: Callable[[Any], "Embedded"] | None = None
