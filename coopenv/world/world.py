@@ -117,7 +117,7 @@ class World:
         """What the embedded observer remembers besides the state."""
         others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
         self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
-        self._levels = wp.zeros((worlds, N), dtype=wp.int32, device=self.device)
+        self._levels = wp.zeros((worlds, N), dtype=wp.int32, device=self.device)  # see `find_levels`
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
@@ -186,7 +186,7 @@ class World:
     @property
     def _world_kernels(self) -> Kernels:
         """Those of the source with the observer, or without it."""
-        if self.observer.fused and self.source.fused:
+        if self.observer.fused and self.source.fused and self.launch.lanes == 1:
             return fused_kernels(self.source, self.observer, self.precision)
         return source_kernels(self.source, self.precision)
 
