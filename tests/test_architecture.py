@@ -86,21 +86,21 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (110, 2),
-    "api": (3925, 19),
-    "backends": (3280, 17),
+    "api": (3965, 19),
+    "backends": (3285, 17),
     "base": (1400, 8),
     "bench": (4665, 18),
     "cars": (10525, 47),
     "cli": (2300, 8),
     "estimation": (1765, 8),
     "evaluation": (495, 3),
-    "observers": (11820, 47),
+    "observers": (11810, 47),
     "policies": (1725, 10),
     "runs": (2880, 11),
-    "scenario": (3165, 12),
+    "scenario": (3175, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (4910, 19),
+    "world": (5125, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -23,15 +23,13 @@ BATCHES = (1, 32, 1024, 8192)
 QUICK_BATCHES = (1, 32, 1024)
 ROBUST = "robust"
 ROBUST_BATCH = 1024
-LONGEST_BATCH = 1 << 20
-"""Worlds; enough for `default_threads` to return every core that may be used."""
 BATCHES_DRAWN = 8
 """Batches of actions that are drawn beforehand, taken in turn."""
 
 
 def all_threads() -> int:
     """Return the threads that a large batch is split over when nobody says otherwise."""
-    return default_threads(LONGEST_BATCH, "cpu")
+    return default_threads()
 
 
 def own_cases(

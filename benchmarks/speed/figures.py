@@ -83,7 +83,7 @@ def _curves(shown: list[Result]) -> dict[str, tuple[list[Result], str, str, str]
 
 
 def draw_growth(found: list[Growth], path: Path) -> Path:
-    """Draw the time of a step over vehicles, landmarks and worlds, with the fits to the larger half."""
+    """Draw the CPU time of a step over vehicles, landmarks and worlds, with the fits to the larger half."""
     quantities = list(dict.fromkeys(g.sweep.quantity for g in found))
     figure = style.new_figure(3.0 * len(quantities) + 0.4, 3.2)
     axes = np.atleast_1d(figure.subplots(1, len(quantities)))
@@ -95,7 +95,7 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
         ax.set_ylim(low, high * (high / low) ** 0.2)  # room for the legend
         ax.legend(fontsize=style.SMALL, frameon=False, loc="upper left")
         held = "" if quantity == "worlds" else f" ({WORLDS} worlds)"
-        style.tidy(ax, x_label=quantity, y_label=f"time of one step{held} [ms]")
+        style.tidy(ax, x_label=quantity, y_label=f"CPU time of one step{held} [ms]")
     figure.tight_layout()
     return style.save(figure, path)
 

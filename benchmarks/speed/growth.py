@@ -138,7 +138,7 @@ class PowerLaw:
 
 @dataclass(frozen=True)
 class Growth:
-    """The cost of a step of all worlds (s) over the sizes that were measured."""
+    """The CPU time of a step of all worlds (s) over the sizes that were measured."""
 
     sweep: Sweep
     sizes: list[int]
@@ -149,7 +149,7 @@ class Growth:
 
     def row(self) -> dict[str, object]:
         """Return the figures as plain data."""
-        return {"label": self.sweep.label, "unit": "s per step of all worlds", **asdict(self)}
+        return {"label": self.sweep.label, "unit": "s of CPU time per step of all worlds", **asdict(self)}
 
 
 def fit_power_law(sizes: list[int], costs: list[float]) -> PowerLaw:
@@ -161,7 +161,9 @@ def fit_power_law(sizes: list[int], costs: list[float]) -> PowerLaw:
 def summarise(sweep: Sweep, results: list[Result]) -> Growth | None:
     """Return a sweep's costs and fits; None when fewer than two sizes could be measured."""
     pairs = [
-        (size, result.seconds_per_step) for size, result in zip(sweep.sizes, results, strict=True) if not result.problem
+        (size, result.cpu_seconds_per_step)
+        for size, result in zip(sweep.sizes, results, strict=True)
+        if not result.problem
     ]
     if len(pairs) < 2:
         return None

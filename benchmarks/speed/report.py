@@ -87,7 +87,7 @@ def show(report: Report, out: Console) -> None:
     if not report.startup.compiling:
         out.print("Compiling is not measured by --quick.")
     if report.growth:
-        _section(out, "Growth: time of one step of all worlds, one thread, f32; cost ~ size ^ exponent")
+        _section(out, "Growth: CPU time of one step of all worlds, one thread, f32; cost ~ size ^ exponent")
         out.print(growth_table(report.growth))
 
 

@@ -159,7 +159,7 @@ def startup_table(startup: Startup) -> Table:
 
 
 def growth_table(found: list[Growth]) -> Table:
-    """Return how the time of a step of all worlds grows: cost ~ size ^ exponent."""
+    """Return how the CPU time of a step of all worlds grows: cost ~ size ^ exponent."""
     table = number_table(
         ["what grows"],
         ["from", "to", "step at\nfirst [ms]", "step at\nlast [ms]", "exponent\n(all)", "exponent\n(large)"],

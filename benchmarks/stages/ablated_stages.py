@@ -14,10 +14,8 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.kernels import DEAD_RECKONING
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
-from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import move, referee
-from coopenv.world.embedded import HOST, SIMULATED, Embedded, sense_simulation
-from coopenv.world.odometry import measure_odometry
+from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_nothing
 from coopenv.world.v2x import transmit
 from coopenv.world.world import World
 
@@ -26,37 +24,28 @@ NEVER = 1 << 30
 
 
 @wp.func
-def without_camera(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
-    """Move, measure odometry and look for contact."""
-    move(model, state, world, tick)
-    for vehicle in range(model.vehicles):
-        measure_odometry(model, state, world, vehicle, tick)
-    sort_into_cells(model, state, world)
-    for vehicle in range(model.vehicles):
-        referee(model, state, world, vehicle)
-    transmit(model, state, world, tick)
+def without_camera(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int) -> None:
+    """Look for contact, and receive."""
+    referee(model, state, world, vehicle)
+    transmit(model, state, world, vehicle, tick)
 
 
 @wp.func
-def without_contact(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
+def contact(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int) -> None:
+    """Look for contact."""
+    referee(model, state, world, vehicle)
+
+
+@wp.func
+def without_odometry(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int) -> None:
     """Move, and count the odometry samples by which a driven vehicle moves."""
-    move(model, state, world, tick)
+    move(model, state, world, vehicle, tick)
     time = wp.float64(tick) * model.camera_period + wp.float64(1.0e-9)
-    for vehicle in range(model.vehicles):
-        state.odometry_samples[world, vehicle] = int(time / model.odometry_period) + 1
+    state.odometry_samples[world, vehicle] = int(time / model.odometry_period) + 1
 
 
 @wp.func
-def without_odometry(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
-    """Move and look for contact."""
-    without_contact(model, state, record, world, tick)
-    sort_into_cells(model, state, world)
-    for vehicle in range(model.vehicles):
-        referee(model, state, world, vehicle)
-
-
-@wp.func
-def without_motion(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
+def no_arrangement(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Do nothing."""
 
 
@@ -66,7 +55,7 @@ class Setting:
 
     observer: Embedded | None = None
     """What estimates; None: the scenario's observer."""
-    sense: Any = sense_simulation
+    source: Source = SIMULATED
     overrides: Mapping[str, Any] | None = None
     """Changes of the scenario."""
     visibility: bool = True
@@ -78,8 +67,7 @@ class Setting:
         scenario = load_scenario(environment, {**overrides, **(self.overrides or {})})
         observer = self.observer or find_embedded(scenario.observer.name) or HOST
         world = World(scenario, worlds, dtype, "cpu", 1, observer, start_covariances(scenario))
-        if self.sense is not sense_simulation:
-            world.source = replace(SIMULATED, name=f"simulated_{self.sense.key}", sense=self.sense)
+        world.source = self.source
         if not self.visibility:
             world.model.sensed = 0
         if not self.sending:
@@ -98,17 +86,22 @@ def ablated_settings() -> Iterator[tuple[str, Setting]]:
         yield stage, setting
 
 
+def simulated(**stages: Any) -> Source:
+    """Return the simulation with other stages."""
+    return replace(SIMULATED, name="_".join(["simulated", *(stage.key for stage in stages.values())]), **stages)
+
+
 STAGES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("correction of the estimate", {"observer": DEAD_RECKONING}),
     ("noise and initial errors", {"overrides": {"noise.enabled": False}}),
     ("visibility (view, occlusion)", {"visibility": False}),
-    ("bearings", {"sense": without_camera}),
+    ("bearings", {"source": simulated(look=without_camera)}),
     ("radio", {"sending": False}),
     ("Gramian", {"gramian": False}),
     ("prediction of the estimate", {"observer": HOST}),
-    ("odometry", {"sense": without_odometry}),
-    ("contact and arrival", {"sense": without_contact}),
-    ("motion", {"sense": without_motion}),
+    ("odometry", {"source": simulated(move=without_odometry, look=contact)}),
+    ("contact and arrival", {"source": simulated(move=without_odometry, arrange=no_arrangement, look=sense_nothing)}),
+    ("motion", {"source": simulated(move=sense_nothing, arrange=no_arrangement, look=sense_nothing)}),
 )
 
 

@@ -210,7 +210,7 @@ class Engine:
         world = self.world
         parts = [PerWorld(part) for part in (self._own_terms.records, self.results, fresh, chosen)]
         arguments = [world.model, PerWorld(world.state), self._table, *parts]
-        world.launch(key, step_results, arguments, inner=(world.model.vehicles,))
+        world.launch.by_vehicle(key, step_results, arguments, world.model.vehicles)
         self._own_terms.fill(key, fresh, chosen)
         if self._team != "own":
             least = int(self._team == "min")

@@ -116,7 +116,7 @@ def make_vec(
         autoreset: "next_step", "same_step" or "disabled".
         overrides: dotted scenario keys.
         arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
-        threads: shares of the batch on the CPU; None: by size and cores.
+        threads: shares of the batch, or of large worlds, on the CPU; None: by size and cores.
         render_mode: None or "rgb_array".
         reward: a function of a `coopenv.api.arguments.Step` that returns the rewards (num_worlds, vehicles), on the CPU
             only; None: the weighted sum of the scenario's terms.

@@ -22,7 +22,7 @@ from coopenv.world.camera import (
 )
 from coopenv.world.cells import sort_into_cells
 from coopenv.world.dynamics import depart, referee, touches_anything
-from coopenv.world.embedded import Source
+from coopenv.world.embedded import Source, sense_nothing
 from coopenv.world.model import Precision
 from coopenv.world.nearby import NOT_A_NEIGHBOUR
 from coopenv.world.random import COUNT as PARAMETER_COUNT
@@ -124,7 +124,8 @@ def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
     """Write which messages arrive at a tick, by the source or else by the scenario's radio."""
     row = row_of(record, tick)
     if record.inbox_tick[row, 0, 0] == BY_RADIO:
-        transmit(model, state, world, tick)
+        for receiver in range(model.vehicles):
+            transmit(model, state, world, receiver, tick)
         return
     for receiver in range(model.vehicles):
         for sender in range(model.vehicles):
@@ -136,7 +137,8 @@ def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
 @wp.func
 def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     """Recall a tick and judge contacts and arrivals by its truth, where that is known."""
-    depart(model, state, world)
+    for vehicle in range(model.vehicles):
+        depart(model, state, world, vehicle)
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
@@ -278,5 +280,5 @@ def mean_twists(before: Truth, now: Truth, dt: float) -> tuple[np.ndarray, np.nd
     return linear, angular
 
 
-RECORDED = Source("recorded", rewind, resense, record_struct, knows_truth=False)
+RECORDED = Source("recorded", rewind, sense_nothing, resense, sense_nothing, record_struct, knows_truth=False)
 """Ticks of a recording, or of any other source that is not on the device."""

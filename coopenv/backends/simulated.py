@@ -18,16 +18,13 @@ from coopenv.observers.recording import Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario
-from coopenv.world.camera import observe
-from coopenv.world.cells import sort_into_cells
-from coopenv.world.dynamics import ARRIVED, COLLIDED, UNDER_WAY, depart, prescribe, referee
-from coopenv.world.embedded import HOST, Source
+from coopenv.world.dynamics import ARRIVED, COLLIDED, UNDER_WAY, depart
+from coopenv.world.embedded import HOST, Source, arrange_world, look_around
 from coopenv.world.launch import PerWorld
-from coopenv.world.model import PRESCRIBED, Precision
+from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import begin_sensing, place_everybody
 from coopenv.world.state import allocate, array, fields
-from coopenv.world.v2x import transmit
 
 
 class SimulatedWorld(SensingWorld):
@@ -156,18 +153,21 @@ def cosimulation_struct(p: Precision) -> Any:
 
 
 @wp.func
-def take_poses(model: Any, state: Any, motion: Any, world: int):
-    """Write the true poses and twists, and where the traffic is; a twist holds for all odometry samples of the tick."""
-    for vehicle in range(model.vehicles):
-        agent = model.landmarks + vehicle
-        recall_truth(model, state, motion, world, vehicle, world)
-        state.speed[world, vehicle] = motion.speed[world, vehicle]
-        state.steering[world, vehicle] = motion.steering[world, vehicle]
-        if motion.left[world, vehicle] != 0:
-            state.present[world, agent] = 0
-        for sample in range(model.samples_per_tick):
-            state.sampled_velocity[world, vehicle, sample] = motion.true_velocity[world, vehicle]
-            state.sampled_angular_velocity[world, vehicle, sample] = motion.true_angular_velocity[world, vehicle]
+def take_pose(model: Any, state: Any, motion: Any, world: int, vehicle: int):
+    """Write the true pose and twist of a vehicle; the twist holds for all odometry samples of the tick."""
+    recall_truth(model, state, motion, world, vehicle, world)
+    state.speed[world, vehicle] = motion.speed[world, vehicle]
+    state.steering[world, vehicle] = motion.steering[world, vehicle]
+    if motion.left[world, vehicle] != 0:
+        state.present[world, model.landmarks + vehicle] = 0
+    for sample in range(model.samples_per_tick):
+        state.sampled_velocity[world, vehicle, sample] = motion.true_velocity[world, vehicle]
+        state.sampled_angular_velocity[world, vehicle, sample] = motion.true_angular_velocity[world, vehicle]
+
+
+@wp.func
+def take_traffic(model: Any, state: Any, motion: Any, world: int):
+    """Write where the traffic is."""
     for k in range(model.traffic):
         state.traffic_position[world, k] = motion.traffic_position[world, k]
         state.traffic_rotation[world, k] = motion.traffic_rotation[world, k]
@@ -190,24 +190,12 @@ def renew_sample(model: Any, state: Any, motion: Any, world: int, vehicle: int, 
 
 
 @wp.func
-def judge(model: Any, state: Any, motion: Any, world: int, vehicle: int):
-    """Judge contact and arrival; the moving program may know of past contacts and departures."""
-    if state.ended[world, vehicle] == UNDER_WAY:
-        if motion.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
-            state.ended[world, vehicle] = COLLIDED
-        elif motion.left[world, vehicle] != 0 and model.scene.end_on_arrival == 1:
-            state.ended[world, vehicle] = ARRIVED
-    referee(model, state, world, vehicle)
-    if motion.crashed[world, vehicle] != 0:
-        state.collided[world, vehicle] = 1
-
-
-@wp.func
 def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     place_everybody(model, state, world)
-    take_poses(model, state, motion, world)
+    take_traffic(model, state, motion, world)
     for vehicle in range(model.vehicles):
+        take_pose(model, state, motion, world, vehicle)
         agent = model.landmarks + vehicle
         state.start_rotation[world, agent] = state.rotation[world, agent]
         state.start_position[world, agent] = state.position[world, agent]
@@ -215,26 +203,43 @@ def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
 
 
 @wp.func
-def sense_cosimulation(model: Any, state: Any, motion: Any, world: int, tick: int):
-    """Take the poses of a tick and measure there."""
-    depart(model, state, world)
-    for landmark in range(model.landmarks):
-        if model.motion.kind[landmark] == PRESCRIBED:
-            prescribe(model, state, world, landmark, wp.float64(tick) * model.camera_period)
-    for vehicle in range(model.vehicles):
-        renew_sample(model, state, motion, world, vehicle, tick)
-    take_poses(model, state, motion, world)
-    for vehicle in range(model.vehicles):
-        measure_odometry(model, state, world, vehicle, tick)
-    sort_into_cells(model, state, world)
-    for vehicle in range(model.vehicles):
-        judge(model, state, motion, world, vehicle)
-    for vehicle in range(model.vehicles):
-        observe(model, state, world, vehicle, tick)
-    transmit(model, state, world, tick)
+def move_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: int, tick: int):
+    """Take the pose of a vehicle at a tick and measure its motion."""
+    depart(model, state, world, vehicle)
+    renew_sample(model, state, motion, world, vehicle, tick)
+    take_pose(model, state, motion, world, vehicle)
+    measure_odometry(model, state, world, vehicle, tick)
 
 
-COSIMULATED = Source("cosimulated", begin_cosimulation, sense_cosimulation, cosimulation_struct, keeps_nearby=True)
+@wp.func
+def arrange_cosimulated(model: Any, state: Any, motion: Any, world: int, tick: int):
+    """Take the traffic, and do what a simulation does."""
+    take_traffic(model, state, motion, world)
+    arrange_world(model, state, motion, world, tick)
+
+
+@wp.func
+def look_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: int, tick: int):
+    """Do what a simulation does; the moving program may know of past contacts and departures."""
+    if state.ended[world, vehicle] == UNDER_WAY:
+        if motion.crashed[world, vehicle] != 0 and model.scene.end_on_collision == 1:
+            state.ended[world, vehicle] = COLLIDED
+        elif motion.left[world, vehicle] != 0 and model.scene.end_on_arrival == 1:
+            state.ended[world, vehicle] = ARRIVED
+    look_around(model, state, motion, world, vehicle, tick)
+    if motion.crashed[world, vehicle] != 0:
+        state.collided[world, vehicle] = 1
+
+
+COSIMULATED = Source(
+    "cosimulated",
+    begin_cosimulation,
+    move_cosimulated,
+    arrange_cosimulated,
+    look_cosimulated,
+    cosimulation_struct,
+    keeps_nearby=True,
+)
 """Ticks of vehicles that a program on the host moves."""
 
 

@@ -20,7 +20,7 @@ from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick,
 from coopenv.world.embedded import Embedded, Messages
 from coopenv.world.launch import Launcher
 from coopenv.world.model import Precision, entry_struct, mat66d, model_struct, precision
-from coopenv.world.state import allocate, allocate_state, fields, repeated, state_fields, state_sizes
+from coopenv.world.state import SCRATCH, allocate, allocate_state, fields, repeated, state_fields, state_sizes
 from coopenv.world.step import observer_kernels
 from coopenv.world.warp_internals import struct_of
 
@@ -28,7 +28,7 @@ from coopenv.world.warp_internals import struct_of
 def views_of(record: Any, declared: Mapping[str, Any], vehicle: int = 0) -> SimpleNamespace:
     """Return a vehicle's part of a record's arrays, which it shares; of the first world."""
     arrays = {name: getattr(record, name).numpy() for name in declared}
-    rows = {name: (0, vehicle, ...) if declared[name].axes[1:2] == "N" else (0, ...) for name in arrays}
+    rows = {name: (0, vehicle, ...) if declared[name].axes[1:2] in ("N", SCRATCH) else (0, ...) for name in arrays}
     return SimpleNamespace(**{name: array[rows[name]] for name, array in arrays.items()})
 
 
@@ -95,7 +95,7 @@ class KernelObserver:
         sizes = {**state_sizes(self._model, 1), **self._kernels.sizes}
         self._records = (
             allocate_state(self._model, 1, p, "cpu", shared="N"),
-            allocate(self._kernels.memory, sizes, "cpu", shared="N"),
+            allocate(self._kernels.memory, sizes, "cpu", shared="N" + SCRATCH),
         )
         self.state = views_of(self._records[0], state_fields(p))
         """The vehicle's part of the state by name: arrays without the axes W and N."""

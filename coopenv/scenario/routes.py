@@ -315,14 +315,21 @@ def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
     If `b` is `a` itself, each pair of different boxes counts once, the larger index first.
     """
     radius_a, radius_b = np.linalg.norm(a.half, axis=1), np.linalg.norm(b.half, axis=1)
-    rows = max(1, BLOCK // max(1, len(b.half)))
+    axis = np.ptp(b.center, axis=0).argmax() if len(b.center) else 0  # along it boxes are far apart
+    order = np.argsort(b.center[:, axis])
+    reach = (radius_a + radius_b.max(initial=0.0)) * (1.0 + 1e-9)  # against rounding
+    first, last = (np.searchsorted(b.center[order, axis], a.center[:, axis] + side * reach) for side in (-1.0, 1.0))
+    count = last - first
     found = [np.empty((0, 2), np.int64)]
-    for first in range(0, len(a.half), rows):
-        part = slice(first, first + rows)
-        distance = np.linalg.norm(a.center[part, None] - b.center, axis=-1)
-        near = distance <= radius_a[part, None] + radius_b
-        i, j = np.nonzero(np.tril(near, first - 1) if b is a else near)
-        i += first
+    for rows in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // BLOCK)) + 1):
+        before = np.cumsum(count[rows]) - count[rows]
+        i = np.repeat(rows, count[rows])
+        j = order[np.arange(len(i)) + np.repeat(first[rows] - before, count[rows])]
+        near = np.linalg.norm(a.center[i] - b.center[j], axis=1) <= radius_a[i] + radius_b[j]
+        if b is a:
+            near &= j < i
+        pairs = np.column_stack([i[near], j[near]])
+        i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
         overlap = boxes_overlap(Boxes(*(x[i] for x in a)), Boxes(*(x[j] for x in b)))
         found.append(np.column_stack([i[overlap], j[overlap]]))
     return np.concatenate(found)

@@ -337,9 +337,7 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
     driven = sum(vehicle.motion.kind == "driven" for vehicle in s.vehicles)
     if s.reward.team != "own" and driven < 2:
         yield f"reward.team: '{s.reward.team}' needs at least two driven vehicles, got {driven}"
-    landmarks = len(s.landmarks)
-    receives = any(target >= landmarks for targets in neighbour_sets(s) for target in targets)
-    if s.action.radio and not (receives or (s.v2x.links == "all" and len(s.vehicles) > 1)):
+    if s.action.radio and not _receives(s):
         yield "action.radio: no vehicle receives messages of another one here (v2x.links, vehicles.*.neighbours)"
     if s.reward.own_share and s.reward.team == "own":
         yield "reward.own_share: only with reward.team = 'mean' or 'min'"
@@ -354,6 +352,12 @@ def _problems_of_driving(s: Scenario) -> Iterator[str]:
             yield f"{where}.latency: {limits.latency:g} s is longer than one decision ({decision:g} s)"
         if steering is not None and steering > limits.max_steering:
             yield f"action.steering: {steering:g} rad is above {where}.max_steering ({limits.max_steering:g} rad)"
+
+
+def _receives(s: Scenario) -> bool:
+    """Return whether any vehicle receives messages of another one."""
+    to_all, landmarks = s.v2x.links == "all" and len(s.vehicles) > 1, len(s.landmarks)
+    return to_all or any(target >= landmarks for targets in neighbour_sets(s) for target in targets)
 
 
 def _problems_of_draws(s: Scenario) -> Iterator[str]:

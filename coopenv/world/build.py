@@ -1,7 +1,7 @@
 """Turn a scenario into the arrays and numbers of a `Model` on a device."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -101,7 +101,6 @@ def _groups(scenario: Scenario) -> dict[str, Any]:
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
     """Return the values of the model's `FaultValues`."""
     restart, corruption, lie, wrong, jammer = f.restart, f.corruption, f.lie, f.map_error, f.jammer
-    marks = [mark.name for mark in scenario.landmarks]
     return {
         "clock": f.clock_offset,
         "restart_chance": restart.chance,
@@ -123,7 +122,7 @@ def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
         "lie_turn": lie.turn,
         "lie_consistent": int(lie.kind != "none" and lie.odometry == "consistent"),
         "map_chance": wrong.chance,
-        "map_landmark": -1 if wrong.landmark is None else marks.index(wrong.landmark),
+        "map_landmark": -1 if wrong.landmark is None else scenario.target_names.index(wrong.landmark),
         "map_offset": wrong.offset,
         "map_offset_spread": wrong.offset_spread,
         "map_direction": _unit(wrong.direction),
@@ -212,7 +211,7 @@ NOWHERE = (0.0, 0.0, 0.0)
 def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     """Return the Warp `Model` of a scenario."""
     model = model_struct(p)()
-    cameras, noises, faults = scenario.cameras, scenario.noises, scenario.all_faults
+    limits, cameras, noises, faults = scenario.limits, scenario.cameras, scenario.noises, scenario.all_faults
     _fill(model, device, _world(scenario))
     _fill(model.start, device, _start(scenario))
     _fill(model.motion, device, _motion(scenario))
@@ -223,18 +222,20 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.radio, device, _radio(scenario), scenario.v2x)
     _fill(model.observer, device, _observer(scenario), scenario.observer)
     _fill(model.judgement, device, {}, scenario.reward)
-    of_vehicles: dict[str, list[tuple[Any, dict[str, Any]]]] = {
-        "dynamics": [(d, _dynamics(d, scenario)) for d in scenario.limits],
-        "camera": [(c, camera_entries(c, noise)) for c, noise in zip(cameras, noises, strict=True)],
-        "noise": [(n, noise_entries(n, scenario.rates)) for n in noises],
-        "fault": [(f, fault_entries(f, scenario)) for f in faults],
+    of_vehicles: dict[str, tuple[list[Any], Callable[[int], dict[str, Any]]]] = {
+        "dynamics": (limits, lambda i: _dynamics(limits[i], scenario)),
+        "camera": (cameras, lambda i: camera_entries(cameras[i], noises[i])),
+        "noise": (noises, lambda i: noise_entries(noises[i], scenario.rates)),
+        "fault": (faults, lambda i: fault_entries(faults[i], scenario)),
     }
-    for name, rows in of_vehicles.items():
-        kind = entry_struct(p, name)
-        entries = [kind() for _ in rows]
-        for entry, (section, values) in zip(entries, rows, strict=True):
-            _fill(entry, device, values, section)
-        setattr(model, name, wp.array(entries, dtype=kind, device=device))
+    for name, (sections, values) in of_vehicles.items():
+        kind, made = entry_struct(p, name), {}
+        keys = [(id(section), id(noise)) for section, noise in zip(sections, noises, strict=True)]
+        for i, key in enumerate(keys):  # vehicles share the sections of the scenario
+            if key not in made:
+                made[key] = kind()
+                _fill(made[key], device, values(i), sections[i])
+        setattr(model, name, wp.array([made[key] for key in keys], dtype=kind, device=device))
     return model
 
 

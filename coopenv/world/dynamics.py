@@ -122,12 +122,10 @@ def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
 
 
 @device_function
-def depart(model: Any, state: Any, world: int):
-    """Take the vehicles that have arrived off the scene, where they leave; called at the start of a tick."""
-    if model.drawn.after_arrival == LEAVE:
-        for vehicle in range(model.vehicles):
-            if state.ended[world, vehicle] == ARRIVED:
-                state.present[world, model.landmarks + vehicle] = 0
+def depart(model: Any, state: Any, world: int, vehicle: int):
+    """Take a vehicle that has arrived off the scene, where vehicles leave; called at the start of a tick."""
+    if model.drawn.after_arrival == LEAVE and state.ended[world, vehicle] == ARRIVED:
+        state.present[world, model.landmarks + vehicle] = 0
 
 
 @device_function
@@ -389,14 +387,20 @@ def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
 
 
 @device_function
-def move(model: Any, state: Any, world: int, tick: int):
-    """Carry all truth of one world to the tick's end."""
-    t = wp.float64(tick) * model.camera_period
-    for agent in range(model.agents):
-        if model.motion.kind[agent] == PRESCRIBED:
-            prescribe(model, state, world, agent, t)
-    for vehicle in range(model.vehicles):
-        if model.motion.kind[model.landmarks + vehicle] == DRIVEN:
-            command = command_in_force(model, state, world, vehicle, tick)
-            drive_through(model, state, world, vehicle, command, tick)
-            turn_camera(model, state, world, vehicle, command)
+def move(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Carry the truth of a vehicle to the tick's end."""
+    agent = model.landmarks + vehicle
+    if model.motion.kind[agent] == PRESCRIBED:
+        prescribe(model, state, world, agent, wp.float64(tick) * model.camera_period)
+    elif model.motion.kind[agent] == DRIVEN:
+        command = command_in_force(model, state, world, vehicle, tick)
+        drive_through(model, state, world, vehicle, command, tick)
+        turn_camera(model, state, world, vehicle, command)
+
+
+@device_function
+def move_landmarks(model: Any, state: Any, world: int, tick: int):
+    """Carry the landmarks that move to the tick's end."""
+    for landmark in range(model.landmarks):
+        if model.motion.kind[landmark] == PRESCRIBED:
+            prescribe(model, state, world, landmark, wp.float64(tick) * model.camera_period)

@@ -12,7 +12,7 @@ import warp as wp
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
 from coopenv.world.cells import sort_into_cells
-from coopenv.world.dynamics import depart, move, referee
+from coopenv.world.dynamics import depart, move, move_landmarks, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import begin_sensing, place_everybody
@@ -73,7 +73,8 @@ class Embedded:
 
     Its functions read what a vehicle senses and receives from `state`, write its estimate there (`estimate_rotation`,
     `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`. `model` and
-    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else.
+    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else. A vehicle writes
+    its own rows alone, and reads of another one what has arrived from it: vehicles may run at once.
     """
 
     name: str
@@ -89,7 +90,7 @@ class Embedded:
     at every tick, after `start` as well."""
     memory: Any = Nothing
     """A Warp struct whose arrays are declared with `coopenv.world.state.array`, the axes W (worlds) and N (vehicles)
-    first."""
+    first; or W and L: scratch."""
     sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
     """Lengths of axes by letter, besides those of the state (`coopenv.world.state.state_sizes`)."""
     fit: Callable[[Any], "Embedded"] | None = None
@@ -119,9 +120,15 @@ class Source:
 
     name: str
     begin: Any  # (model, state, record, world): go to the start of an episode
-    sense: Any
-    """(model, state, record, world, tick): write everything that is sensed at a tick, the truth, and which messages
-    arrive at whom (`state.arriving`, see `coopenv.world.v2x`); `begin` does so for the first frame."""
+    move: Any
+    """(model, state, record, world, vehicle, tick): move the truth of a vehicle to a tick and measure its odometry. The
+    three stages write everything that is sensed, the truth, and which messages arrive at whom (`state.arriving`, see
+    `coopenv.world.v2x`); `begin` does so for the first frame. In `move` and `look` a vehicle writes its own rows alone,
+    so that vehicles may come in any order, or at once."""
+    arrange: Any
+    """(model, state, record, world, tick): carry everything else to the tick, after all vehicles have moved."""
+    look: Any
+    """(model, state, record, world, vehicle, tick): judge where a vehicle is, measure, and receive."""
     record: Callable[[Precision], Any]  # returns the Warp struct of the record that both read
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
     keeps_nearby: bool = False  # whether `topology.most_nearby` may limit what a vehicle keeps
@@ -155,19 +162,41 @@ def begin_simulation(model: Any, state: Any, record: Any, world: int):
 
 
 @device_function
-def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Move the truth of one world to a tick and measure it."""
-    depart(model, state, world)
-    move(model, state, world, tick)
-    for vehicle in range(model.vehicles):
-        measure_odometry(model, state, world, vehicle, tick)
+def move_vehicle(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
+    """Move the truth of one vehicle to a tick and measure its motion."""
+    depart(model, state, world, vehicle)
+    move(model, state, world, vehicle, tick)
+    measure_odometry(model, state, world, vehicle, tick)
+
+
+@device_function
+def arrange_world(model: Any, state: Any, record: Any, world: int, tick: int):
+    """Carry the landmarks to a tick, and sort everything into the grid."""
+    move_landmarks(model, state, world, tick)
     sort_into_cells(model, state, world)
-    for vehicle in range(model.vehicles):
-        referee(model, state, world, vehicle)
-    for vehicle in range(model.vehicles):
-        observe(model, state, world, vehicle, tick)
-    transmit(model, state, world, tick)
 
 
-SIMULATED = Source("simulated", begin_simulation, sense_simulation, lambda p: Nothing, keeps_nearby=True, fused=True)
+@device_function
+def look_around(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
+    """Judge where a vehicle is, and take its camera frame and its messages."""
+    referee(model, state, world, vehicle)
+    observe(model, state, world, vehicle, tick)
+    transmit(model, state, world, vehicle, tick)
+
+
+SIMULATED = Source(
+    "simulated",
+    begin_simulation,
+    move_vehicle,
+    arrange_world,
+    look_around,
+    lambda p: Nothing,
+    keeps_nearby=True,
+    fused=True,
+)
 """Ticks that are computed."""
+
+
+@device_function
+def sense_nothing(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
+    """Leave a stage out."""

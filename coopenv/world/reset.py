@@ -291,4 +291,4 @@ def begin_sensing(model: Any, state: Any, world: int):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, 0)
-    transmit(model, state, world, 0)
+        transmit(model, state, world, vehicle, 0)

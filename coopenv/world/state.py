@@ -4,7 +4,7 @@ W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders)
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
 of the traffic, G cells of the grid, I items in it. What is measured and received has
 X entries, one per agent, and Y boxes, one per sender, or as many as are kept (V), see `coopenv.world.nearby`; E agents
-that may be off on maps.
+that may be off on maps. L lanes of scratch: indexed by vehicle, shared by the vehicles that one thread takes in turn.
 
 A field of a record states its axes once, a letter each, and is allocated by them. It states the rule of what a saved
 state may hold there, too; all rules are checked before anything is restored.
@@ -33,6 +33,7 @@ from coopenv.estimation.poses import (
 )
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.world.model import Precision
+from coopenv.world.warp_internals import field_types, struct_of
 
 
 def array(axes: str, dtype: Any, rule: Rule | None = None) -> Any:
@@ -50,6 +51,10 @@ def fields(record: Any) -> dict[str, Any]:
     return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}
 
 
+SCRATCH = "L"
+"""The second axis of scratch."""
+
+
 def size_of(record: Any, sizes: Mapping[str, int]) -> int:
     """Return how many bytes a record's arrays take."""
     arrays = fields(record).values()
@@ -59,17 +64,29 @@ def size_of(record: Any, sizes: Mapping[str, int]) -> int:
 def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "") -> Any:
     """Return a record of zeros of a struct whose fields are declared with `array`; `sizes` are lengths by letter.
 
-    Along the axis `shared`, where it comes second, all indices stand for one and the same row: whoever needs the rows
-    of one vehicle can then index them by the vehicle without memory for the other vehicles.
+    Along the axes in `shared`, where they come second, all indices stand for one and the same row: whoever needs the
+    rows of one vehicle can then index them by the vehicle without memory for the other vehicles.
     """
     result = record()
     for name, field in fields(record).items():
-        shape = [sizes[axis] for axis in field.axes]
-        if shared and field.axes[1:2] == shared:
-            row = wp.zeros([shape[0], 1, *shape[2:]], dtype=field.dtype, device=device)
-            setattr(result, name, repeated(row, 1, shape[1]))
-        else:
-            setattr(result, name, wp.zeros(shape, dtype=field.dtype, device=device))
+        setattr(result, name, _zeros(field, sizes, device, shared))
+    return result
+
+
+def _zeros(field: Any, sizes: Mapping[str, int], device: str, shared: str) -> Any:
+    shape = [sizes[axis] for axis in field.axes]
+    if len(shape) < 2 or field.axes[1] not in shared:
+        return wp.zeros(shape, dtype=field.dtype, device=device)
+    row = wp.zeros([shape[0], 1, *shape[2:]], dtype=field.dtype, device=device)
+    return repeated(row, 1, shape[1])
+
+
+def with_own_scratch(record: Any, sizes: Mapping[str, int]) -> Any:
+    """Return a record on the CPU that shares everything with another one but its scratch, one lane of it."""
+    result = struct_of(record)()
+    for name, field in field_types(record).items():
+        own = getattr(field, "axes", "")[1:2] == SCRATCH
+        setattr(result, name, _zeros(field, sizes, "cpu", SCRATCH) if own else getattr(record, name))
     return result
 
 
@@ -97,8 +114,8 @@ class FieldPart:
 
 
 def parts(record: Any, struct: Any) -> dict[str, Any]:
-    """Return the arrays of a record by name, and of arrays of structs every field by a name with dots."""
-    arrays = {name: getattr(record, name) for name in fields(struct)}
+    """Return the arrays of a record but scratch by name, and of arrays of structs every field by a name with dots."""
+    arrays = {name: getattr(record, name) for name, field in fields(struct).items() if field.axes[1:2] != SCRATCH}
     paths = [(name, path) for name, array in arrays.items() for path in _paths(array.numpy().dtype)]
     return {".".join((name, *path)): FieldPart(arrays[name], path) if path else arrays[name] for name, path in paths}
 
@@ -369,7 +386,7 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     grid = {"G": model.cells.across**2, "I": model.agents + model.traffic}
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
     draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
-    return {"W": worlds, "A": A, "N": N, **draws, **ticks, **grid, **near}
+    return {"W": worlds, "A": A, "N": N, "L": N, **draws, **ticks, **grid, **near}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

@@ -3,6 +3,10 @@
 An episode starts with `begin`. A decision is `decide`, then per tick `sense` (the source) and `follow` (the observer:
 receive, estimate, send). Neither knows the other, so that each is compiled once per precision. For a small observer of
 simulated worlds (`Embedded.fused`) one kernel, `advance`, runs all ticks of a decision without leaving a world.
+
+A thread takes a world with all its vehicles, or every `lanes`-th vehicle of a world. The stages of `sense` are then
+launches of their own, and so is `finish`. `follow` is launched once, as what is received has been sent at earlier
+ticks; or, without a delay of the radio, level by level (`find_levels`).
 """
 
 from functools import cache
@@ -14,6 +18,7 @@ from coopenv.world.dynamics import decide as make_commands
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
 from coopenv.world.launch import module_kernels
 from coopenv.world.model import Precision, model_struct
+from coopenv.world.nearby import sender_of
 from coopenv.world.quality import sample_gramian
 from coopenv.world.state import state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
@@ -39,24 +44,45 @@ def finish_tick(model: Any, state: Any, world: int, tick: int):
     state.tick[world] = tick
 
 
+MOVE, ARRANGE, LOOK = 1, 2, 4
+SENSE = MOVE | ARRANGE | LOOK
+"""Stages of `sense`: those of a source of ticks."""
+
+
+@cache
+def _sense_tick(source: Source) -> Any:
+    """Return the Warp function that moves some of the vehicles to a tick and measures."""
+    move, arrange, look = source.move, source.arrange, source.look
+
+    @device_function
+    def sense_tick(model: Any, state: Any, record: Any, world: int, tick: int, stages: int, lane: int, lanes: int):
+        """Run stages of one world, for every `lanes`-th vehicle from `lane` on."""
+        if stages & MOVE != 0:
+            for vehicle in range(lane, model.vehicles, lanes):
+                move(model, state, record, world, vehicle, tick)
+        if stages & ARRANGE != 0:
+            arrange(model, state, record, world, tick)
+        if stages & LOOK != 0:
+            for vehicle in range(lane, model.vehicles, lanes):
+                look(model, state, record, world, vehicle, tick)
+
+    return sense_tick
+
+
 @cache
 def _follow_tick(observer: Embedded) -> Any:
-    """Return the Warp function of a tick that has been sensed: receive, estimate, send, leaders before followers."""
+    """Return the Warp function of a tick of one vehicle that has been sensed: receive, estimate, send."""
     estimate, send = observer.estimate, observer.send
 
     @device_function
-    def follow_tick(model: Any, state: Any, memory: Any, world: int, tick: int):
-        """Run the observers of one world."""
-        now = regular_tick(model, tick)
-        for place in range(model.vehicles):
-            vehicle = model.order[place]
-            deliver(model, state, world, vehicle, tick)
-            estimate(model, state, memory, world, vehicle, now)
-            sample_gramian(model, state, world, vehicle, tick)
-            broadcast_estimate(model, state, world, vehicle, tick)
-            send(model, state, memory, world, vehicle, tick)
-            count_bytes(model, state, world, vehicle, tick)
-        finish_tick(model, state, world, tick)
+    def follow_tick(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+        """Run the observer of one vehicle; leaders come before their followers."""
+        deliver(model, state, world, vehicle, now.tick)
+        estimate(model, state, memory, world, vehicle, now)
+        sample_gramian(model, state, world, vehicle, now.tick)
+        broadcast_estimate(model, state, world, vehicle, now.tick)
+        send(model, state, memory, world, vehicle, now.tick)
+        count_bytes(model, state, world, vehicle, now.tick)
 
     return follow_tick
 
@@ -86,7 +112,7 @@ def _begin(source: Source, p: Precision) -> Any:
 def source_kernels(source: Source, p: Precision) -> Kernels:
     """Return `begin`, `decide` and `sense`, the stages before observers; worlds marked in `hold` stay as they are."""
     Model, State, Record, Hold = model_struct(p), state_struct(p), source.record(p), wp.array(dtype=wp.int32)
-    sense_tick = source.sense
+    sense_tick = _sense_tick(source)
 
     def decide(model: Model, state: State, actions: wp.array3d(dtype=p.scalar), hold: Hold):
         """Make commands of actions. One thread per world."""
@@ -94,11 +120,11 @@ def source_kernels(source: Source, p: Precision) -> Kernels:
         if is_active(model, state, hold, world):
             make_commands(model, state, actions, world)
 
-    def sense(model: Model, state: State, record: Record, hold: Hold):
-        """Move to the next tick and measure. One thread per world."""
-        world = wp.tid()
+    def sense(model: Model, state: State, record: Record, hold: Hold, stages: int, first: int, lanes: int):
+        """Move to the next tick and measure. One thread per world and lane."""
+        world, lane = wp.tid()
         if is_active(model, state, hold, world):
-            sense_tick(model, state, record, world, state.tick[world] + 1)
+            sense_tick(model, state, record, world, state.tick[world] + 1, stages, first + lane, lanes)
 
     return module_kernels(f"sense_{source.name}", p, _begin(source, p), decide, sense, max_unroll=1)
 
@@ -110,14 +136,26 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
     The latter serve observers that are plug-ins (`coopenv.observers.kernel_observer`).
     """
     Model, State, Memory, Hold = model_struct(p), state_struct(p), observer.memory, wp.array(dtype=wp.int32)
+    Levels = wp.array2d(dtype=wp.int32)
     follow_tick, estimate_pose = _follow_tick(observer), observer.estimate
     start_vehicle, send_message = observer.start, observer.send
 
-    def follow(model: Model, state: State, memory: Memory, hold: Hold):
-        """Let every vehicle receive, estimate and send. One thread per world."""
-        world = wp.tid()
+    def follow(
+        model: Model, state: State, memory: Memory, hold: Hold, levels: Levels, level: int, first: int, lanes: int
+    ):
+        """Let every vehicle of a level receive, estimate and send. One thread per world and lane.
+
+        A single lane also ends the tick.
+        """
+        world, lane = wp.tid()
         if is_active(model, state, hold, world):
-            follow_tick(model, state, memory, world, state.tick[world] + 1)
+            now = regular_tick(model, state.tick[world] + 1)
+            for place in range(first + lane, model.vehicles, lanes):
+                vehicle = model.order[place]
+                if levels[world, vehicle] == level:
+                    follow_tick(model, state, memory, world, vehicle, now)
+            if lanes == 1:
+                finish_tick(model, state, world, now.tick)
 
     def start(model: Model, state: State, memory: Memory, mask: Hold):
         """Start the observers of the worlds whose episode has just begun. One thread per world."""
@@ -175,7 +213,7 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
 def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
     """Return `begin`, and `advance`, which runs whole decisions of a source and an observer."""
     Model, State, Memory, Record = model_struct(p), state_struct(p), observer.memory, source.record(p)
-    sense_tick, follow_tick = source.sense, _follow_tick(observer)
+    sense_tick, follow_tick = _sense_tick(source), _follow_tick(observer)
 
     def advance(
         model: Model,
@@ -193,15 +231,18 @@ def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
             make_commands(model, state, actions, world)
         for _ in range(count):
             tick = state.tick[world] + 1
-            sense_tick(model, state, record, world, tick)
-            follow_tick(model, state, memory, world, tick)
+            now = regular_tick(model, tick)
+            sense_tick(model, state, record, world, tick, SENSE, 0, 1)
+            for place in range(model.vehicles):
+                follow_tick(model, state, memory, world, model.order[place], now)
+            finish_tick(model, state, world, tick)
 
     return module_kernels(f"{source.name}_{observer.name}", p, _begin(source, p), advance, **observer.options)
 
 
 @cache
 def host_kernels(p: Precision) -> Kernels:
-    """Return the stages around observers on the host: `receive`, `broadcast` and `finish`."""
+    """Return the stages around observers on the host: `receive`, `broadcast` and `finish`; and `find_levels`."""
     Model, State, Hold = model_struct(p), state_struct(p), wp.array(dtype=wp.int32)
 
     def receive(model: Model, state: State, hold: Hold, vehicle: int):
@@ -224,4 +265,20 @@ def host_kernels(p: Precision) -> Kernels:
         if is_active(model, state, hold, world):
             finish_tick(model, state, world, state.tick[world] + 1)
 
-    return module_kernels("host", p, receive, broadcast, finish)
+    def find_levels(model: Model, state: State, hold: Hold, levels: wp.array2d(dtype=wp.int32)):
+        """Write the levels of vehicles in the next tick. One thread per world.
+
+        A vehicle is one level above the highest sender whose message of this very tick arrives at it.
+        """
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            tick = state.tick[world] + 1
+            for place in range(model.vehicles):
+                vehicle = model.order[place]
+                level = int(0)
+                for box in range(state.arriving.shape[2]):
+                    if state.arriving[world, vehicle, box] == tick:
+                        level = wp.max(level, levels[world, sender_of(model, state, world, vehicle, box)] + 1)
+                levels[world, vehicle] = level
+
+    return module_kernels("host", p, receive, broadcast, finish, find_levels)

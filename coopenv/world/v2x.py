@@ -344,34 +344,33 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, box: int, 
 
 
 @device_function
-def transmit(model: Any, state: Any, world: int, tick: int):
-    """Decide which messages arrive at a tick, by the scenario's radio: write when they were sent, -1 where none does.
+def transmit(model: Any, state: Any, world: int, receiver: int, tick: int):
+    """Decide which messages arrive at a receiver at a tick, by the scenario's radio: write when they were sent, or -1.
 
     With delay 0 a follower receives its leaders' estimates of this very tick; a sender later in the order than
     its receiver (possible only without the acyclic restriction) is received one tick late.
     """
-    for receiver in range(model.vehicles):
-        here = state.position[world, model.landmarks + receiver]
-        for box in range(state.arriving.shape[2]):
-            state.arriving[world, receiver, box] = -1
-        if is_jammed(model, state, world, here, tick):
-            continue
-        kept = model.kept
-        every = model.radio.to_all == 1 and kept == 0
-        for n in range(wp.where(every, model.vehicles, entry_count(model, state, world, receiver))):
-            entry = model.landmarks + n
-            if not every:
-                entry = entry_at(model, state, kept, world, receiver, n)
-            sender = agent_of(state, kept, world, receiver, entry) - model.landmarks
-            if sender >= 0 and sender != receiver:
-                lag = model.radio.delay
-                if lag == 0 and model.rank[sender] > model.rank[receiver]:
-                    lag = int(1)
-                due = tick - lag
-                there = state.position[world, model.landmarks + sender]
-                if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
-                    if not is_lost(model, state, world, receiver, sender, tick):
-                        state.arriving[world, receiver, box_of_entry(model, entry)] = due
+    here = state.position[world, model.landmarks + receiver]
+    for box in range(state.arriving.shape[2]):
+        state.arriving[world, receiver, box] = -1
+    if is_jammed(model, state, world, here, tick):
+        return
+    kept = model.kept
+    every = model.radio.to_all == 1 and kept == 0
+    for n in range(wp.where(every, model.vehicles, entry_count(model, state, world, receiver))):
+        entry = model.landmarks + n
+        if not every:
+            entry = entry_at(model, state, kept, world, receiver, n)
+        sender = agent_of(state, kept, world, receiver, entry) - model.landmarks
+        if sender >= 0 and sender != receiver:
+            lag = model.radio.delay
+            if lag == 0 and model.rank[sender] > model.rank[receiver]:
+                lag = int(1)
+            due = tick - lag
+            there = state.position[world, model.landmarks + sender]
+            if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
+                if not is_lost(model, state, world, receiver, sender, tick):
+                    state.arriving[world, receiver, box_of_entry(model, entry)] = due
 
 
 @device_function

@@ -13,11 +13,12 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.launch import Launcher, PerWorld, default_threads
+from coopenv.world.launch import Call, Launcher, PerLane, PerWorld, threads_and_lanes
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
     ANYTHING,
+    SCRATCH,
     allocate,
     allocate_state,
     checked_state,
@@ -27,8 +28,19 @@ from coopenv.world.state import (
     state_fields,
     state_sizes,
     state_struct,
+    with_own_scratch,
 )
-from coopenv.world.step import Kernels, fused_kernels, host_kernels, observer_kernels, source_kernels
+from coopenv.world.step import (
+    ARRANGE,
+    LOOK,
+    MOVE,
+    SENSE,
+    Kernels,
+    fused_kernels,
+    host_kernels,
+    observer_kernels,
+    source_kernels,
+)
 
 BY_AGENT = {
     "bearing": 0.0,
@@ -68,8 +80,8 @@ class World:
             worlds: how many.
             dtype: "float32" or "float64".
             device: "cpu", "cuda", "cuda:0", ...
-            threads: shares into which the batch is split on the CPU; None: by its size and the cores. Results do not
-                depend on it.
+            threads: shares into which the batch, or each of its worlds, is split on the CPU; None: by size and cores
+                (`threads_and_lanes`). Results do not depend on it.
             observer: what estimates in the kernels (none by default: the estimates are written from outside).
             start_covariance: (N, 6, 6) of the initial estimates, for the observer; LEFT coordinates, rad and m.
 
@@ -86,29 +98,31 @@ class World:
             raise CoopenvError("topology.most_nearby: only where vehicles are simulated; leave it out")
         self.precision = precision(dtype)
         self.device = check_device(device)
-        self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
-        if self.device != "cpu":
-            self.threads = 1
         self.model = self._build_model()
+        N = self.model.vehicles
+        shares, lanes = threads_and_lanes(worlds, N, self.device, threads)
+        self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
-        needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, sizes)
+        needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, {**sizes, SCRATCH: lanes})
         check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         self.state.parameter_set.fill_(NOT_SET)
         self.state.difficulty.fill_(self.scenario.difficulty.number)
-        N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
         anew = np.concatenate([covariance, np.broadcast_to(UNKNOWN, (N, 6, 6))])
         self.model.start.covariance = wp.array(anew, dtype=mat66d, device=self.device)
-        self.memory = allocate(self.observer.memory, sizes, self.device)
+        self.memory = allocate(self.observer.memory, sizes, self.device, "" if lanes == N else SCRATCH)
         """What the embedded observer remembers besides the state."""
+        others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
+        self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
+        self._levels = wp.zeros((worlds, N), dtype=wp.int32, device=self.device)  # see `find_levels`
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
-        self.launch = Launcher(worlds, self.device, dtype, self.threads)
+        self.launch = Launcher(worlds, self.device, dtype, shares, lanes)
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -172,7 +186,7 @@ class World:
     @property
     def _world_kernels(self) -> Kernels:
         """Those of the source with the observer, or without it."""
-        if self.observer.fused and self.source.fused:
+        if self.observer.fused and self.source.fused and self.launch.lanes == 1:
             return fused_kernels(self.source, self.observer, self.precision)
         return source_kernels(self.source, self.precision)
 
@@ -191,16 +205,46 @@ class World:
             revive = observer_kernels(self.observer, self.precision)["revive"]
             self._run(("revive", ticks), revive, memory, hold, ticks)
         sensing = self._world_kernels
-        if "advance" in sensing:
+        if self.launch.lanes > 1:
+            self._advance_in_lanes(ticks)
+        elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
-            world = [self.model, PerWorld(self.state)]
-            decide = sensing["decide"], [*world, PerWorld(self.actions), hold]
-            sense = sensing["sense"], [*world, self._record, hold]
-            follow = observer_kernels(self.observer, self.precision)["follow"], [*world, memory, hold]
-            self.launch.decision(("advance", ticks), ticks, decide, sense, follow)
+            decide = sensing["decide"], [self.model, PerWorld(self.state), PerWorld(self.actions), hold]
+            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), self._follow())
         self.check_room()
+
+    def _advance_in_lanes(self, ticks: int) -> None:
+        """Run ticks of one decision; vehicles do not wait for each other but for messages of the same tick."""
+        self.decide()
+        for _ in range(ticks):
+            self._move()
+            if self.model.radio.delay > 0:
+                self.launch.by_lane("look and follow", self._sense(LOOK), self._follow())
+            else:
+                self.launch.by_lane("look", self._sense(LOOK))
+                levels = host_kernels(self.precision)["find_levels"]
+                self._run("levels", levels, PerWorld(self.mask), PerWorld(self._levels))
+                for level in range(int(self._levels.numpy().max()) + 1):
+                    self.launch.by_lane(("follow", level), self._follow(level))
+            self.finish()
+
+    def _sense(self, stages: int) -> Call:
+        """Return the launch of stages of a tick before observers."""
+        sense = source_kernels(self.source, self.precision)["sense"]
+        return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
+
+    def _follow(self, level: int = 0) -> Call:
+        """Return the launch of the observers of a level."""
+        follow, worlds = observer_kernels(self.observer, self.precision)["follow"], PerWorld(self.state)
+        return follow, [self.model, worlds, self._memories, PerWorld(self.mask), PerWorld(self._levels), level]
+
+    def _move(self) -> None:
+        """Move the truth to the next tick, in lanes."""
+        self.launch.by_lane("move", self._sense(MOVE))
+        arrange, arguments = self._sense(ARRANGE)
+        self.launch("arrange", arrange, [*arguments, 0, 1], (1,))
 
     def check_room(self) -> None:
         """Make sure that a vehicle keeps all that is in range; on a GPU, that counts the others in `crowded`, no check.
@@ -234,7 +278,11 @@ class World:
 
     def sense(self) -> None:
         """Move the truth to the next tick and measure it."""
-        self._run("sense", source_kernels(self.source, self.precision)["sense"], self._record, PerWorld(self.mask))
+        if self.launch.lanes == 1:
+            self.launch.by_lane("sense", self._sense(SENSE))
+        else:
+            self._move()
+            self.launch.by_lane("look", self._sense(LOOK))
 
     def receive(self, vehicle: int) -> None:
         """Let a vehicle receive what arrives at this tick."""

@@ -152,3 +152,23 @@ def test_observations_have_a_row_for_each_that_is_kept() -> None:
         agents = np.sort(engine.view("kept_agent")[0, i][: count[i]])
         assert_array_equal(seen[i, : count[i]] == 1.0, engine.view("sight")[0, i, agents] == Sight.VISIBLE)
         assert not seen[i, count[i] :].any()
+
+
+def test_the_map_is_found_in_the_grid_as_among_all_landmarks() -> None:
+    sections: dict[str, Any] = {"observation": {"include": ["map"], "map_size": 12, "map_scale": 300.0}}
+    engine = Engine(street(60, 80, **sections), 1, "float64")
+    engine.reset([1])
+    world = engine.world
+    for step in range(3):
+        engine.step()
+        if step == 2:  # one off the map, and one between two landmarks of the same distance
+            world.view("estimate_rotation")[0, :2] = np.eye(3)
+            world.view("estimate_position")[0, 0] = [5000.0, 0.0, 0.0]
+            world.view("estimate_position")[0, 1] = world.view("position")[0, [3, 4]].mean(axis=0)
+            engine.refresh()
+        found = engine.layout["map_position"].values(engine.view("observation").astype(float))[0]
+        R, p = (engine.view(f"estimate_{name}")[0] for name in ("rotation", "position"))
+        for i in range(80):
+            offsets = world.view("position")[0, :80] - R[i] @ p[i]
+            order = np.argsort(np.hypot(*offsets.T[:2]), kind="stable")[:12]
+            assert_allclose(found[i], np.clip(offsets[order] @ R[i], -300.0, 300.0), atol=1e-3)

@@ -15,6 +15,7 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
+from coopenv.world.cells import ROUNDING, WIDER, cell_at, cell_of, first_in, next_in
 from coopenv.world.dynamics import ACCELERATION, ARRIVED, SPEED, STEERING, UNDER_WAY
 from coopenv.world.model import DRIVEN
 from coopenv.world.nearby import (
@@ -319,6 +320,44 @@ def expected_in_view(model: Any, state: Any, world: int, vehicle: int, point: An
 
 
 @device_function
+def follower_of(model: Any, state: Any, world: int, vehicle: int, p: Any, last: Any, best: Any, n: int) -> MapLandmark:
+    """Return `best`, or landmark n if it comes before that one and behind `last`, in the order of `next_landmark`."""
+    offset = mapped_position(model, state, world, vehicle, n) - p
+    distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
+    behind = distance > last.distance or (distance == last.distance and n > last.index)
+    nearer = best.index < 0 or distance < best.distance or (distance == best.distance and n < best.index)
+    if state.present[world, n] != 0 and behind and nearer:  # an absent landmark is on no map
+        best.index = n
+        best.distance = distance
+    return best
+
+
+@device_function
+def nearest_in_grid(model: Any, state: Any, world: int, vehicle: int, p: Any, last: Any, best: Any) -> MapLandmark:
+    """Return what `next_landmark` looks for, from the grid; -1 if its rings of cells about the estimate do not hold it.
+
+    All that is nearer to p than r cells is in the rings up to r, and what is behind `last` not within its distance.
+    """
+    edge = type(p[0])(1.0) / model.cells.per_metre
+    slack = model.marker_reach * type(edge)(WIDER) + type(edge)(ROUNDING)
+    first = int((type(edge)(last.distance) - slack) / (edge * type(edge)(1.5))) - 1
+    most = wp.min(model.cells.across / 2, int(wp.sqrt(float(model.landmarks)) / 2.0))  # not more cells than landmarks
+    for ring in range(wp.max(first, 0), most):
+        for row in range(-ring, ring + 1):
+            for column in range(-ring, ring + 1, wp.where(wp.abs(row) == ring, 1, 2 * ring)):
+                cell = cell_at(model, cell_of(model, p[0]) + column, cell_of(model, p[1]) + row)
+                item = first_in(state, world, cell, -1)
+                while item >= 0:
+                    if item < model.landmarks:
+                        best = follower_of(model, state, world, vehicle, p, last, best, item)
+                    item = next_in(state, world, item, -1)
+        if best.index >= 0 and type(edge)(best.distance) < type(edge)(ring) * edge - slack:
+            return best
+    best.index = -1
+    return best
+
+
+@device_function
 def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLandmark) -> MapLandmark:
     """Return the record that follows `last` in the order of the distance from the estimate, then of the index.
 
@@ -331,14 +370,11 @@ def next_landmark(model: Any, state: Any, world: int, vehicle: int, last: MapLan
         return landmark  # `last` was the end of the map
     R = state.estimate_rotation[world, vehicle]
     p = R * state.estimate_position[world, vehicle]
-    for n in range(model.landmarks):
-        offset = mapped_position(model, state, world, vehicle, n) - p
-        distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
-        behind = distance > last.distance or (distance == last.distance and n > last.index)
-        nearer = landmark.index < 0 or distance < landmark.distance
-        if state.present[world, n] != 0 and behind and nearer:  # an absent landmark is on no map
-            landmark.index = n
-            landmark.distance = distance
+    if model.cells.across > 1 and model.map_errors == 0:
+        landmark = nearest_in_grid(model, state, world, vehicle, p, last, landmark)
+    if landmark.index < 0:
+        for n in range(model.landmarks):
+            landmark = follower_of(model, state, world, vehicle, p, last, landmark, n)
     if landmark.index >= 0:
         point = mapped_position(model, state, world, vehicle, landmark.index)
         landmark.exists = True

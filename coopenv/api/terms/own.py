@@ -89,7 +89,7 @@ class OwnTerms:
         if self._conditions:
             world = self._world
             arguments = [world.model, *map(PerWorld, (world.state, self.records, self._results))]
-            world.launch("records", write_records, arguments, inner=(world.model.vehicles,))
+            world.launch.by_vehicle("records", write_records, arguments, world.model.vehicles)
             self._launch("condition", self._conditions)
 
     def fill(self, key: str, fresh: Any, chosen: Any) -> None:

@@ -244,12 +244,14 @@ def step_results(
     results: Any,
     fresh: wp.array(dtype=wp.int32),
     chosen: wp.array(dtype=wp.int32),
+    first: int,
 ):
-    """Fill the results of every vehicle of the chosen worlds, one thread per (world, vehicle).
+    """Fill the results of every vehicle from `first` on of the chosen worlds, one thread per (world, vehicle).
 
     `fresh` marks worlds that have just been reset: their memory of the last episode is cleared, and the reward is 0.
     """
-    world, vehicle = wp.tid()
+    world, n = wp.tid()
+    vehicle = first + n
     if chosen[world] == 0:
         return
     remaining = remaining_way(model, state, world, vehicle)
@@ -336,9 +338,10 @@ def team_results(
             results.truncated[world, vehicle] = at_end(model, state, world)
 
 
-def write_records(model: Any, state: Any, records: Records, results: Any):
+def write_records(model: Any, state: Any, records: Records, results: Any, first: int):
     """Write the records `Ego` and `Truth` before the user's conditions are checked, one thread per (world, vehicle)."""
-    world, vehicle = wp.tid()
+    world, n = wp.tid()
+    vehicle = first + n
     assess(model, state, results, world, vehicle)
     remaining = remaining_way(model, state, world, vehicle)
     ego, truth = own_records(model, state, results, world, vehicle, remaining, True)

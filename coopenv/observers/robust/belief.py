@@ -100,7 +100,7 @@ def is_estimated(memory: Any, world: int, i: int, k: int) -> bool:
 @device_function
 def correct_member(memory: Any, world: int, i: int, k: int):
     """Apply an estimated member's correction, and set `recentring`, of errors about its new pose by those before."""
-    correction = memory.scratch[world, k].correction
+    correction = memory.scratch[world, i, k].correction
     G = wp.identity(6, wp.float64)
     if k == ERRORS and memory.belief[world, i].first_sender > ERRORS:
         memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
@@ -108,7 +108,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
     else:
         apply_error(memory, world, i, k, correction)
         G = recentring(correction)
-    memory.scratch[world, k].recentring = G
+    memory.scratch[world, i, k].recentring = G
 
 
 @device_function
@@ -121,13 +121,13 @@ def apply_corrections(memory: Any, world: int, i: int):
         for j in range(k + 1):
             block = memory.P[world, i, k, j]
             if estimated and is_estimated(memory, world, i, j):
-                block = recentred(memory.scratch[world, k].recentring, block, memory.scratch[world, j].recentring)
+                block = recentred(memory.scratch[world, i, k].recentring, block, memory.scratch[world, i, j].recentring)
                 if k == j:
                     block = symmetric_part(block)
             elif estimated:
-                block = diagonal_by_rows(memory.scratch[world, k].recentring, block)
+                block = diagonal_by_rows(memory.scratch[world, i, k].recentring, block)
             elif is_estimated(memory, world, i, j):
-                block = wp.transpose(diagonal_by_rows(memory.scratch[world, j].recentring, wp.transpose(block)))
+                block = wp.transpose(diagonal_by_rows(memory.scratch[world, i, j].recentring, wp.transpose(block)))
             else:
                 continue
             set_block(memory, world, i, k, j, block)

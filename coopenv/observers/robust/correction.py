@@ -16,8 +16,8 @@ from coopenv.world.warp_internals import device_function
 def store_poses(memory: Any, world: int, i: int):
     """Store poses as they are before a correction."""
     for k in range(memory.belief[world, i].members):
-        memory.scratch[world, k].last_correction = vec6d()
-        memory.scratch[world, k].pose = memory.member[world, i, k].pose
+        memory.scratch[world, i, k].last_correction = vec6d()
+        memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
 
 
 @device_function
@@ -28,18 +28,20 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
     """
     for k in range(memory.belief[world, i].members):
         if is_estimated(memory, world, i, k):
-            correction = share * memory.scratch[world, k].correction
-            memory.scratch[world, k].last_correction = correction
-            memory.scratch[world, k].recentring = recentring(correction)
-            memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
+            correction = share * memory.scratch[world, i, k].correction
+            memory.scratch[world, i, k].last_correction = correction
+            memory.scratch[world, i, k].recentring = recentring(correction)
+            memory.member[world, i, k].pose = displaced(memory.scratch[world, i, k].pose, correction)
     for n in range(frame.bearings):
-        if memory.measurement[world, n].fits != 0:
+        if memory.measurement[world, i, n].fits != 0:
             linearise(frame, memory, world, i, n)
             for part in range(DERIVATIVES):
-                member = memory.derivative[world, n, part].member
+                member = memory.derivative[world, i, n, part].member
                 if member >= 0 and is_estimated(memory, world, i, wp.max(member, 0)):
-                    H = by_rows(memory.derivative[world, n, part].jacobian, memory.scratch[world, member].recentring)
-                    memory.derivative[world, n, part].jacobian = H
+                    H = by_rows(
+                        memory.derivative[world, i, n, part].jacobian, memory.scratch[world, i, member].recentring
+                    )
+                    memory.derivative[world, i, n, part].jacobian = H
 
 
 @device_function
@@ -47,11 +49,15 @@ def set_projection(memory: Any, world: int, i: int, n: int):
     """Set a bearing's `projection` H P, with P after the earlier bearings, and its `weight` S^-1."""
     members = memory.belief[world, i].members
     for m in range(n):
-        if memory.measurement[world, m].fits == 1:
-            share = innovation_cross_covariance(memory, world, n, m) * memory.measurement[world, m].weight
+        if memory.measurement[world, i, m].fits == 1:
+            share = innovation_cross_covariance(memory, world, i, n, m) * memory.measurement[world, i, m].weight
             for k in range(members):
-                memory.projection[world, n, k] = memory.projection[world, n, k] - share * memory.projection[world, m, k]
-    memory.measurement[world, n].weight = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
+                memory.projection[world, i, n, k] = (
+                    memory.projection[world, i, n, k] - share * memory.projection[world, i, m, k]
+                )
+    memory.measurement[world, i, n].weight = innovation_weight(
+        memory, world, i, n, memory.measurement[world, i, n].noise
+    )
 
 
 @device_function
@@ -65,33 +71,33 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
     """
     members = memory.belief[world, i].members
     for k in range(members):
-        memory.scratch[world, k].correction = vec6d()
+        memory.scratch[world, i, k].correction = vec6d()
     for n in range(bearings):
-        if memory.measurement[world, n].fits != 0:
+        if memory.measurement[world, i, n].fits != 0:
             if projecting:
                 project(memory, world, i, n)
             set_projection(memory, world, i, n)
-            member = memory.measurement[world, n].member
-            residual = memory.measurement[world, n].residual
+            member = memory.measurement[world, i, n].member
+            residual = memory.measurement[world, i, n].residual
             for part in range(DERIVATIVES):
-                k = memory.derivative[world, n, part].member
+                k = memory.derivative[world, i, n, part].member
                 if k >= 0:
-                    left = memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
-                    residual = residual + memory.derivative[world, n, part].jacobian * left
-            weighted = memory.measurement[world, n].weight * residual
+                    left = memory.scratch[world, i, k].last_correction - memory.scratch[world, i, k].correction
+                    residual = residual + memory.derivative[world, i, n, part].jacobian * left
+            weighted = memory.measurement[world, i, n].weight * residual
             nis = wp.dot(weighted, residual)
             if gating and member > 0 and nis > wp.float64(constants.BEARING_GATE):
-                memory.measurement[world, n].fits = -1
-            if memory.measurement[world, n].fits == -1:
+                memory.measurement[world, i, n].fits = -1
+            if memory.measurement[world, i, n].fits == -1:
                 residual = residual * wp.sqrt(wp.min(wp.float64(constants.BEARING_GATE) / nis, wp.float64(1.0)))
-            memory.measurement[world, n].innovation = residual
-            if memory.measurement[world, n].fits == 1:
+            memory.measurement[world, i, n].innovation = residual
+            if memory.measurement[world, i, n].fits == 1:
                 for k in range(members):
-                    correction = memory.scratch[world, k].correction + weighted * memory.projection[world, n, k]
-                    memory.scratch[world, k].correction = correction
+                    correction = memory.scratch[world, i, k].correction + weighted * memory.projection[world, i, n, k]
+                    memory.scratch[world, i, k].correction = correction
     for k in range(members):
         if not is_estimated(memory, world, i, k):
-            memory.scratch[world, k].correction = vec6d()
+            memory.scratch[world, i, k].correction = vec6d()
 
 
 @device_function
@@ -102,9 +108,9 @@ def update_covariance(memory: Any, world: int, i: int, bearings: int):
             if is_estimated(memory, world, i, k) or is_estimated(memory, world, i, j):
                 block = mat66d()
                 for n in range(bearings):
-                    if memory.measurement[world, n].fits == 1:
-                        K = memory.measurement[world, n].weight * memory.projection[world, n, k]
-                        block = block + transposed_by_rows(K, memory.projection[world, n, j])
+                    if memory.measurement[world, i, n].fits == 1:
+                        K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
+                        block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
                 subtract_block(memory, world, i, k, j, block)
 
 
@@ -113,12 +119,14 @@ def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, la
     """Return the largest turn (rad) of a line of sight by a share of the correction less one of the last correction."""
     distance = wp.float64(wp.inf)  # of the nearest target
     for n in range(bearings):
-        if memory.measurement[world, n].fits == 1:
-            distance = wp.min(distance, memory.measurement[world, n].distance)
+        if memory.measurement[world, i, n].fits == 1:
+            distance = wp.min(distance, memory.measurement[world, i, n].distance)
     turn = wp.float64(0.0)
     for k in range(memory.belief[world, i].members):
         if is_estimated(memory, world, i, k):
-            further = share * memory.scratch[world, k].correction - last * memory.scratch[world, k].last_correction
+            further = (
+                share * memory.scratch[world, i, k].correction - last * memory.scratch[world, i, k].last_correction
+            )
             size = wp.abs(further)
             turn = wp.max(turn, wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance))
     return turn
@@ -161,6 +169,6 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
         share = next_share(memory, world, i, bearings, False)
         step += 1
     for k in range(memory.belief[world, i].members):
-        memory.member[world, i, k].pose = memory.scratch[world, k].pose
+        memory.member[world, i, k].pose = memory.scratch[world, i, k].pose
     update_covariance(memory, world, i, bearings)
     apply_corrections(memory, world, i)

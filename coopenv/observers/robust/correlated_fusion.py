@@ -62,7 +62,7 @@ def update_clock_velocity(model: Any, memory: Any, world: int, i: int, n: int) -
 def set_row(memory: Any, world: int, i: int, n: int):
     """Write `scratch.row` to row and column n of the covariance."""
     for k in range(memory.belief[world, i].members):
-        set_block(memory, world, i, n, k, memory.scratch[world, k].row)
+        set_block(memory, world, i, n, k, memory.scratch[world, i, k].row)
 
 
 @device_function
@@ -104,16 +104,16 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: A
     first_sender = memory.belief[world, i].first_sender
     inverse = algebra.inverse6(N)
     for k in range(first_sender):
-        gain = wp.transpose(memory.scratch[world, k].column) * inverse
-        memory.scratch[world, k].correction = gain * d
+        gain = wp.transpose(memory.scratch[world, i, k].column) * inverse
+        memory.scratch[world, i, k].correction = gain * d
         for j in range(k, members):
-            set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, j].column)
+            set_block(memory, world, i, k, j, memory.P[world, i, k, j] - gain * memory.scratch[world, i, j].column)
     q = memory.member[world, i, n].source
     for k in range(first_sender):
-        e = memory.drift_effect[world, i, q - 1, k] - memory.scratch[world, k].correction
+        e = memory.drift_effect[world, i, q - 1, k] - memory.scratch[world, i, k].correction
         memory.drift_effect[world, i, q - 1, k] = e
     for k in range(first_sender, members):
-        memory.scratch[world, k].correction = vec6d()
+        memory.scratch[world, i, k].correction = vec6d()
     apply_corrections(memory, world, i)
 
 
@@ -142,8 +142,8 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.member[world, i, n].pose = report.pose
     more = regress(model, memory, world, i, n, after, True)
     for k in range(members):
-        memory.scratch[world, k].column = memory.P[world, i, n, k] - memory.scratch[world, k].row
-    memory.scratch[world, n].column = -more
+        memory.scratch[world, i, k].column = memory.P[world, i, n, k] - memory.scratch[world, i, k].row
+    memory.scratch[world, i, n].column = -more
     set_row(memory, world, i, n)
     N = before - after + more
     unknown = unknown + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
@@ -162,11 +162,11 @@ def inflate_dependents(memory: Any, world: int, i: int, n: int, variance: Any):
     members = memory.belief[world, i].members
     inverse = algebra.inverse6(memory.P[world, i, n, n])
     for k in range(members):
-        memory.scratch[world, k].column = memory.P[world, i, k, n] * inverse
+        memory.scratch[world, i, k].column = memory.P[world, i, k, n] * inverse
     for k in range(members):
-        A = memory.scratch[world, k].column
+        A = memory.scratch[world, i, k].column
         for j in range(k + 1):
-            B = memory.scratch[world, j].column
+            B = memory.scratch[world, i, j].column
             block = memory.P[world, i, k, j] + variance * (A[:, 3:] * wp.transpose(B[:, 3:]))
             set_block(memory, world, i, k, j, block)
 

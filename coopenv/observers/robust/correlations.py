@@ -144,11 +144,9 @@ def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick
 
 @device_function
 def clear_broadcasts(memory: Any, world: int, i: int):
-    """Clear all sent and received correlations and scratch arrays."""
+    """Clear all sent and received correlations."""
     fill_rows(memory.outbox_correlation[world, i], no_correlation())
     fill_rows(memory.correlation[world, i], no_correlation())
-    fill(memory.known[world], Regressor())
-    fill_rows(memory.factor[world], mat66d())
 
 
 @device_function
@@ -271,7 +269,7 @@ def note_correlations(
             known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
             if known and is_broadcast == broadcast:
                 covariance = A * X * wp.transpose(factor(memory.P[world, i, k, k]))
-                memory.known[world, count] = Regressor(k, covariance, mat66d())
+                memory.known[world, i, count] = Regressor(k, covariance, mat66d())
                 count += 1
     return count
 
@@ -281,7 +279,7 @@ def regressed(memory: Any, world: int, i: int, count: int, k: int):
     """Return the covariance L cov(x, y) with the error y of member k."""
     block = mat66d()
     for a in range(count):
-        block = block + memory.known[world, a].coefficient * memory.P[world, i, memory.known[world, a].member, k]
+        block = block + memory.known[world, i, a].coefficient * memory.P[world, i, memory.known[world, i, a].member, k]
     return block
 
 
@@ -334,29 +332,29 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
     The block Cholesky factor of the regressors' covariance has its inverse on the diagonal.
     """
     for a in range(count):
-        Y = mat66d(memory.known[world, a].covariance)
+        Y = mat66d(memory.known[world, i, a].covariance)
         for b in range(a + 1):
-            X = mat66d(memory.P[world, i, memory.known[world, a].member, memory.known[world, b].member])
+            X = mat66d(memory.P[world, i, memory.known[world, i, a].member, memory.known[world, i, b].member])
             if a == b:
                 X = algebra.inflated(X, wp.float64(constants.SINGLE))
             for c in range(b):
-                X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
+                X = X - memory.factor[world, i, a, c] * wp.transpose(memory.factor[world, i, b, c])
             if a == b:
-                memory.factor[world, a, a] = algebra.inverse_factor(X)
+                memory.factor[world, i, a, a] = algebra.inverse_factor(X)
             else:
-                memory.factor[world, a, b] = X * wp.transpose(memory.factor[world, b, b])
-                Y = Y - memory.known[world, b].coefficient * wp.transpose(memory.factor[world, a, b])
-        memory.known[world, a].coefficient = Y * wp.transpose(memory.factor[world, a, a])
+                memory.factor[world, i, a, b] = X * wp.transpose(memory.factor[world, i, b, b])
+                Y = Y - memory.known[world, i, b].coefficient * wp.transpose(memory.factor[world, i, a, b])
+        memory.known[world, i, a].coefficient = Y * wp.transpose(memory.factor[world, i, a, a])
     for back in range(count):
         a = count - 1 - back
-        Y = mat66d(memory.known[world, a].coefficient)
+        Y = mat66d(memory.known[world, i, a].coefficient)
         for c in range(a + 1, count):
-            Y = Y - memory.known[world, c].coefficient * memory.factor[world, c, a]
-        memory.known[world, a].coefficient = Y * memory.factor[world, a, a]
+            Y = Y - memory.known[world, i, c].coefficient * memory.factor[world, i, c, a]
+        memory.known[world, i, a].coefficient = Y * memory.factor[world, i, a, a]
     left = mat66d(after)
     for a in range(count):
-        block = regressed(memory, world, i, count, memory.known[world, a].member)
-        left = left - block * wp.transpose(memory.known[world, a].coefficient)
+        block = regressed(memory, world, i, count, memory.known[world, i, a].member)
+        left = left - block * wp.transpose(memory.known[world, i, a].coefficient)
     return left
 
 
@@ -369,7 +367,7 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, rec
     others are not used.
     """
     count = wp.where(received, 1, 0)
-    memory.known[world, 0] = Regressor(n, after, mat66d())
+    memory.known[world, i, 0] = Regressor(n, after, mat66d())
     sure = note_correlations(model, memory, world, i, n, after, received, count, True)
     count = note_correlations(model, memory, world, i, n, after, received, sure, False)
     left = solve_for(memory, world, i, after, count)
@@ -382,6 +380,6 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, rec
     if count > wp.where(received, 1, 0):
         memory.member[world, i, n].correlation_unknown = 0
     for k in range(memory.belief[world, i].members):
-        memory.scratch[world, k].row = growth * regressed(memory, world, i, count, k)
-    memory.scratch[world, n].row = after + more
+        memory.scratch[world, i, k].row = growth * regressed(memory, world, i, count, k)
+    memory.scratch[world, i, n].row = after + more
     return more

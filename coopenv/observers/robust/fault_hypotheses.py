@@ -233,13 +233,13 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
 
     Errors of the own pose are the same in many frames, so that all frames together count as one.
     """
-    H = -(memory.derivative[world, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
-    W = innovation_weight(memory, world, n, memory.measurement[world, n].noise)
+    H = -(memory.derivative[world, i, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
+    W = innovation_weight(memory, world, i, n, memory.measurement[world, i, n].noise)
     share = wp.min(frame.period / wp.float64(constants.LONG_TIME), wp.float64(1.0))
     HW = share * (wp.transpose(H) * W)
     kept = wp.float64(1.0) - share
     A = kept * memory.source[world, i, q].information + HW * H
-    a = kept * memory.source[world, i, q].sum + HW * memory.measurement[world, n].residual
+    a = kept * memory.source[world, i, q].sum + HW * memory.measurement[world, i, n].residual
     memory.source[world, i, q].information = A
     memory.source[world, i, q].sum = a
     memory.source[world, i, q].time += frame.period

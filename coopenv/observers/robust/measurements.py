@@ -56,16 +56,16 @@ def tangent_basis(b: Any):
 
 
 @device_function
-def set_bearing_measurement(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
+def set_bearing_measurement(memory: Any, world: int, i: int, n: int, member: int, b: Any, point: Any, variance: Any):
     """Set the n-th bearing b, to a point in the body frame of a member, or (member 0) in the map.
 
     `variance` is that of the point per axis, m^2, without the member's own.
     """
-    memory.measurement[world, n].member = member
-    memory.measurement[world, n].bearing = b
-    memory.measurement[world, n].point = point
-    memory.measurement[world, n].variance = variance
-    memory.measurement[world, n].source = -1
+    memory.measurement[world, i, n].member = member
+    memory.measurement[world, i, n].bearing = b
+    memory.measurement[world, i, n].point = point
+    memory.measurement[world, i, n].variance = variance
+    memory.measurement[world, i, n].source = -1
 
 
 @device_function
@@ -144,7 +144,7 @@ def set_measurement_of_member(
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
             averaged = frames_in(averaging_time(model, i), frame.period)
             variance += memory.member[world, i, member].velocity_variance * age * age * averaged
-    set_bearing_measurement(memory, world, frame.bearings, member, b, gone, variance)
+    set_bearing_measurement(memory, world, i, frame.bearings, member, b, gone, variance)
     return True
 
 
@@ -160,10 +160,10 @@ def set_measurement_of_target(
         return False
     if sender < 0:
         point = vec3d(mapped_position(model, state, world, i, target))
-        set_bearing_measurement(memory, world, frame.bearings, 0, b, point, wp.float64(0.0))
+        set_bearing_measurement(memory, world, i, frame.bearings, 0, b, point, wp.float64(0.0))
         if frame.purpose == TRACKING:
             q = take_slot(memory, world, i, target, frame.tick, True, model.camera_period)
-            memory.measurement[world, frame.bearings].source = q
+            memory.measurement[world, i, frame.bearings].source = q
         return True
     box = box_of_entry(model, entry)
     received = is_received(model, state, memory, world, i, box, frame.tick)
@@ -171,7 +171,7 @@ def set_measurement_of_target(
         if received:
             variance = received_variance(model, memory, world, i, box, frame)
             point = memory.inbox[world, i, box].pose.p
-            set_bearing_measurement(memory, world, frame.bearings, 0, b, point, variance)
+            set_bearing_measurement(memory, world, i, frame.bearings, 0, b, point, variance)
         return received
     member = index_of(memory, world, i, sender)
     if member == 0:
@@ -181,7 +181,7 @@ def set_measurement_of_target(
         return False
     usable = set_measurement_of_member(model, memory, world, i, frame, member, received, b)
     if frame.purpose == TRACKING:
-        memory.measurement[world, frame.bearings].source = q
+        memory.measurement[world, i, frame.bearings].source = q
         memory.source[world, i, q].seen_tick = frame.tick
     return usable
 
@@ -243,9 +243,9 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
 @device_function
 def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
-    member = memory.measurement[world, n].member
-    point = memory.measurement[world, n].point
-    bearing = memory.measurement[world, n].bearing
+    member = memory.measurement[world, i, n].member
+    point = memory.measurement[world, i, n].point
+    bearing = memory.measurement[world, i, n].bearing
     own = memory.member[world, i, 0].pose
     z = point
     turn = wp.identity(3, wp.float64)
@@ -267,24 +267,24 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     H = mat26d()
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
-    memory.derivative[world, n, 0] = Derivative(0, H)
-    memory.derivative[world, n, 1].member = wp.where(member > 0, member, -1)
+    memory.derivative[world, i, n, 0] = Derivative(0, H)
+    memory.derivative[world, i, n, 1].member = wp.where(member > 0, member, -1)
     if member > 0:
         G = B * turn
         H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
-        memory.derivative[world, n, 1].jacobian = H
-    memory.derivative[world, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
+        memory.derivative[world, i, n, 1].jacobian = H
+    memory.derivative[world, i, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
     if frame.mounting > 0:
         turned = memory.member[world, i, frame.mounting].pose.R
-        H[:, :3] = T * turned * skew(memory.measurement[world, n].bearing)
+        H[:, :3] = T * turned * skew(memory.measurement[world, i, n].bearing)
         H[:, 3:] = -(B * turned)
-        memory.derivative[world, n, 2].jacobian = H
-    memory.measurement[world, n].residual = T * bearing
-    memory.measurement[world, n].distance = distance
+        memory.derivative[world, i, n, 2].jacobian = H
+    memory.measurement[world, i, n].residual = T * bearing
+    memory.measurement[world, i, n].distance = distance
     remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
-    memory.measurement[world, n].noise = (
-        frame.variance + memory.measurement[world, n].variance * inverse * inverse + remainder
+    memory.measurement[world, i, n].noise = (
+        frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
     )
     return wp.dot(u, bearing) > wp.float64(0.0)
 
@@ -292,42 +292,42 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 @device_function
 def project(memory: Any, world: int, i: int, n: int):
     """Set a measurement's `projection` to H P; a loop over the derivatives would be slower."""
-    H = memory.derivative[world, n, 0].jacobian
-    member = memory.derivative[world, n, 1].member
-    mounting = memory.derivative[world, n, 2].member
+    H = memory.derivative[world, i, n, 0].jacobian
+    member = memory.derivative[world, i, n, 1].member
+    mounting = memory.derivative[world, i, n, 2].member
     for k in range(memory.belief[world, i].members):
         rows = by_rows(H, memory.P[world, i, 0, k])
         if member > 0:
-            rows = rows + by_rows(memory.derivative[world, n, 1].jacobian, memory.P[world, i, member, k])
+            rows = rows + by_rows(memory.derivative[world, i, n, 1].jacobian, memory.P[world, i, member, k])
         if mounting > 0:
-            rows = rows + by_rows(memory.derivative[world, n, 2].jacobian, memory.P[world, i, mounting, k])
-        memory.projection[world, n, k] = rows
+            rows = rows + by_rows(memory.derivative[world, i, n, 2].jacobian, memory.P[world, i, mounting, k])
+        memory.projection[world, i, n, k] = rows
 
 
 @device_function
-def innovation_cross_covariance(memory: Any, world: int, n: int, m: int):
+def innovation_cross_covariance(memory: Any, world: int, i: int, n: int, m: int):
     """Return the covariance, 2x2, of the n-th predicted bearing with the m-th innovation, given the earlier ones."""
-    S = memory.derivative[world, n, 0].jacobian * wp.transpose(memory.projection[world, m, 0])
-    member = memory.derivative[world, n, 1].member
+    S = memory.derivative[world, i, n, 0].jacobian * wp.transpose(memory.projection[world, i, m, 0])
+    member = memory.derivative[world, i, n, 1].member
     if member > 0:
-        S = S + memory.derivative[world, n, 1].jacobian * wp.transpose(memory.projection[world, m, member])
-    mounting = memory.derivative[world, n, 2].member
+        S = S + memory.derivative[world, i, n, 1].jacobian * wp.transpose(memory.projection[world, i, m, member])
+    mounting = memory.derivative[world, i, n, 2].member
     if mounting > 0:
-        S = S + memory.derivative[world, n, 2].jacobian * wp.transpose(memory.projection[world, m, mounting])
+        S = S + memory.derivative[world, i, n, 2].jacobian * wp.transpose(memory.projection[world, i, m, mounting])
     return S
 
 
 @device_function
-def innovation_weight(memory: Any, world: int, n: int, noise: Any):
+def innovation_weight(memory: Any, world: int, i: int, n: int, noise: Any):
     """Return the inverse of the innovation's covariance of a projected bearing with a noise per axis, rad^2."""
-    return wp.inverse(noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, n, n))
+    return wp.inverse(noise * wp.identity(2, wp.float64) + innovation_cross_covariance(memory, world, i, n, n))
 
 
 @device_function
-def innovation_with(memory: Any, world: int, n: int, noise: Any):
+def innovation_with(memory: Any, world: int, i: int, n: int, noise: Any):
     """Return the normalised innovation squared of a projected bearing with a noise per axis, rad^2."""
-    residual = memory.measurement[world, n].residual
-    return wp.dot(residual, innovation_weight(memory, world, n, noise) * residual)
+    residual = memory.measurement[world, i, n].residual
+    return wp.dot(residual, innovation_weight(memory, world, i, n, noise) * residual)
 
 
 @device_function
@@ -339,4 +339,4 @@ def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: 
     if not linearise(frame, memory, world, i, n):
         return wp.float64(wp.inf)
     project(memory, world, i, n)
-    return innovation_with(memory, world, n, memory.measurement[world, n].noise)
+    return innovation_with(memory, world, i, n, memory.measurement[world, i, n].noise)

@@ -234,7 +234,7 @@ class RobustMemory:
     """The memory of a world's observers.
 
     K members of a belief (the vehicle itself first), H hypotheses, J errors that a bearing depends on, C correlations
-    of a message, Q sources; other axes as in `coopenv.world.state`.
+    of a message, Q sources; other axes as in `coopenv.world.state`. What has lanes (L) is scratch.
     """
 
     belief: array("WN", JointBelief)
@@ -247,21 +247,21 @@ class RobustMemory:
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
     fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
-    effect: array("WAQ", mat23d)  # scratch: of an innovation by the fault of a source
-    block_scratch: array("WKK", mat33d)  # scratch: blocks of the covariance of senders' errors or faults
-    block_member: array("WK", wp.int32)  # scratch: the members to which they belong
+    effect: array("WLXQ", mat23d)  # of an innovation by the fault of a source
+    block_scratch: array("WLKK", mat33d)  # blocks of the covariance of senders' errors or faults
+    block_member: array("WLK", wp.int32)  # the members to which they belong
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", SenderReport)
     inbox: array("WNY", SenderReport)  # per receiver and box
     inbox_sender: array("WNY", wp.int32)  # whose report that is, where not all are kept; -1: none
-    measurement: array("WA", BearingMeasurement)
-    derivative: array("WAJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
-    scratch: array("WK", Scratch)
-    projection: array("WAK", mat26d)  # scratch: H P, of a bearing and a member, see correction.py
+    measurement: array("WLX", BearingMeasurement)
+    derivative: array("WLXJ", Derivative)  # of a bearing, by the own error, that of its target, that of the mounting
+    scratch: array("WLK", Scratch)
+    projection: array("WLXK", mat26d)  # H P, of a bearing and a member, see correction.py
     outbox_correlation: array("WNSC", Correlation)
     correlation: array("WNYC", Correlation)  # per receiver and box
-    known: array("WK", Regressor)  # scratch
-    factor: array("WKK", mat66d)  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
+    known: array("WLK", Regressor)
+    factor: array("WLKK", mat66d)  # blocks of a Cholesky factor, on its diagonal their inverses
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
@@ -297,7 +297,7 @@ def fill_rows(rows: Any, value: Any):
 
 @device_function
 def clear(memory: Any, world: int, i: int):
-    """Clear an earlier episode, messages and scratch included: equal states are equal in every bit."""
+    """Clear an earlier episode, messages included: equal states are equal in every bit."""
     memory.belief[world, i] = JointBelief()
     memory.search[world, i] = Search()
     fill(memory.member[world, i], Member())
@@ -308,13 +308,6 @@ def clear(memory: Any, world: int, i: int):
     never.tick = -1
     fill(memory.inbox[world, i], never)
     fill(memory.inbox_sender[world, i], -1)
-    fill(memory.scratch[world], Scratch())
-    fill(memory.measurement[world], BearingMeasurement())
-    fill_rows(memory.derivative[world], Derivative())
-    fill_rows(memory.projection[world], mat26d())
-    fill_rows(memory.effect[world], mat23d())
-    fill_rows(memory.block_scratch[world], mat33d())
-    fill(memory.block_member[world], 0)
 
 
 LARGE = numbers(LARGEST**3)
@@ -360,10 +353,9 @@ def robust_rules() -> dict[str, Rule]:
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
     large = (
-        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance measurement.variance measurement.noise "
-        "measurement.common_noise measurement.weight scratch.column projection fault_mixture effect sensitivity "
-        "information drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio "
-        "source.vector source.ratio source.sum source.information source.covariance source.offset"
+        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
+        "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.vector "
+        "source.ratio source.sum source.information source.covariance source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
@@ -374,17 +366,11 @@ def robust_rules() -> dict[str, Rule]:
         "source.target": whole(-1, "agents"),
         "source.exclusions": whole(0, 10**9),
         "inbox_sender": VEHICLE,
-        "block_member": whole(0, members - 1),
         "belief.members": whole(1, members),
         "belief.first_sender": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        "measurement.member": whole(0, members - 1),
-        "measurement.fits": whole(-1, 1),
-        "measurement.source": whole(-1, SOURCES - 1),
-        "derivative.member": whole(-1, members - 1),
-        "known.member": whole(0, members - 1),
         **where(
             "belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles"), "member.box": BOX}
         ),

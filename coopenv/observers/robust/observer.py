@@ -104,20 +104,20 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         nis = innovation_squared(frame, memory, world, i, n)
         ahead = nis >= wp.float64(0.0) and nis < wp.float64(wp.inf)
         fits = ahead and nis < wp.float64(constants.BEARING_GATE)
-        q = memory.measurement[world, n].source
+        q = memory.measurement[world, i, n].source
         used = not is_excluded(memory, world, i, q)
         if used:
             counted += 1
             missed += wp.where(fits, 0, 1)
         elif ahead:
             test_excluded(frame, memory, world, i, n, q)
-        memory.measurement[world, n].fits = 0
+        memory.measurement[world, i, n].fits = 0
         if used and (fits or (all_count and ahead)):
-            memory.measurement[world, n].fits = 1
+            memory.measurement[world, i, n].fits = 1
             fitting += 1
             total += nis
         elif used and ahead and frame.purpose == TRACKING:  # for the monitors
-            memory.measurement[world, n].fits = -1
+            memory.measurement[world, i, n].fits = -1
     share = wp.float64(-1.0)
     if counted > 0:
         share = wp.float64(missed) / wp.float64(counted)
@@ -197,19 +197,19 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
     members = memory.belief[world, i].members
     own = mat66d()
     for k in range(members):
-        memory.scratch[world, k].column = mat66d()
+        memory.scratch[world, i, k].column = mat66d()
     for n in range(bearings):
-        if memory.measurement[world, n].fits == 1:
-            HtW = wp.transpose(memory.derivative[world, n, 0].jacobian) * memory.measurement[world, n].weight
-            own += (HtW * wp.transpose(HtW)) * memory.measurement[world, n].noise
-            member = memory.measurement[world, n].member
+        if memory.measurement[world, i, n].fits == 1:
+            HtW = wp.transpose(memory.derivative[world, i, n, 0].jacobian) * memory.measurement[world, i, n].weight
+            own += (HtW * wp.transpose(HtW)) * memory.measurement[world, i, n].noise
+            member = memory.measurement[world, i, n].member
             if member > 0:
-                memory.scratch[world, member].column += HtW * memory.derivative[world, n, 1].jacobian
+                memory.scratch[world, i, member].column += HtW * memory.derivative[world, i, n, 1].jacobian
     for k in range(1, members):
         cross = mat66d()
         for j in range(1, members):
-            cross += memory.scratch[world, j].column * memory.P[world, i, j, k]
-        own += cross * wp.transpose(memory.scratch[world, k].column)
+            cross += memory.scratch[world, i, j].column * memory.P[world, i, j, k]
+        own += cross * wp.transpose(memory.scratch[world, i, k].column)
         set_block(memory, world, i, 0, k, -(inverse * cross))
     memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
 
@@ -224,17 +224,17 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
         M = mat66d()
         b = vec6d()
         for n in range(bearings):
-            if memory.measurement[world, n].fits == 1:
-                N = memory.measurement[world, n].noise * wp.identity(2, wp.float64)
-                member = memory.measurement[world, n].member
+            if memory.measurement[world, i, n].fits == 1:
+                N = memory.measurement[world, i, n].noise * wp.identity(2, wp.float64)
+                member = memory.measurement[world, i, n].member
                 if member > 0:  # the variance includes the error of the target
-                    G = memory.derivative[world, n, 1].jacobian
+                    G = memory.derivative[world, i, n, 1].jacobian
                     N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
-                memory.measurement[world, n].weight = wp.inverse(N)
-                H = memory.derivative[world, n, 0].jacobian
-                HtW = wp.transpose(H) * memory.measurement[world, n].weight
+                memory.measurement[world, i, n].weight = wp.inverse(N)
+                H = memory.derivative[world, i, n, 0].jacobian
+                HtW = wp.transpose(H) * memory.measurement[world, i, n].weight
                 M += HtW * H
-                b += HtW * memory.measurement[world, n].residual
+                b += HtW * memory.measurement[world, i, n].residual
         if fitting < 3:
             return False
         inverse = inverse6(M)

@@ -36,7 +36,7 @@ three."""
 
 
 @device_function
-def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
+def next_triple(memory: Any, world: int, i: int, count: int, size: Any, number: int):
     """Return (bearings, size, number) of the triple that spans most after the one of this size and number.
 
     The size is twice the area that three bearings span; a good triple looks in three very different directions.
@@ -48,9 +48,9 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
     for n0 in range(count):
         for n1 in range(n0 + 1, count):
             for n2 in range(n1 + 1, count):
-                a = memory.measurement[world, n0].bearing
+                a = memory.measurement[world, i, n0].bearing
                 area = wp.length(
-                    wp.cross(memory.measurement[world, n1].bearing - a, memory.measurement[world, n2].bearing - a)
+                    wp.cross(memory.measurement[world, i, n1].bearing - a, memory.measurement[world, i, n2].bearing - a)
                 )
                 later = area < size or (area == size and here > number)
                 if later and area > best_size:
@@ -67,8 +67,8 @@ def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: 
     M = mat66d()
     for n in range(3):
         linearise(frame, memory, world, i, triple[n])
-        H = memory.derivative[world, triple[n], 0].jacobian
-        M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, triple[n]].noise)) * H
+        H = memory.derivative[world, i, triple[n], 0].jacobian
+        M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, i, triple[n]].noise)) * H
     P = symmetric_part(inverse6(M))
     if require_determined:
         return is_known(P), P
@@ -98,7 +98,7 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
 
 
 @device_function
-def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: int):
+def problem(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, number: int):
     """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
     The first is as measured. In the others a bearing is perturbed along an axis across it, or its point if that is not
@@ -107,8 +107,8 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
     b = mat33d()
     z = mat33d()
     for n in range(3):
-        b[n] = memory.measurement[world, triple[n]].bearing
-        z[n] = memory.measurement[world, triple[n]].point
+        b[n] = memory.measurement[world, i, triple[n]].bearing
+        z[n] = memory.measurement[world, i, triple[n]].point
     exists = bool(True)
     if number > 0:
         n = (number - 1) // 10
@@ -118,7 +118,7 @@ def problem(frame: BearingFrame, memory: Any, world: int, triple: Any, number: i
             across = side * wp.float64(constants.MARGIN) * wp.sqrt(frame.variance)
             b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
         else:
-            variance = memory.measurement[world, triple[n]].variance  # `received_variance` has the squared margin
+            variance = memory.measurement[world, i, triple[n]].variance  # `received_variance` has the squared margin
             z[n, axis - 2] = z[n, axis - 2] + side * wp.sqrt(variance)
             exists = variance > wp.float64(0.0)
     return exists, b, z
@@ -134,7 +134,7 @@ def solve_triple(
     """
     memory.search[world, i].hypotheses = 0
     for number in range(PROBLEMS):
-        exists, b, z = problem(frame, memory, world, triple, number)
+        exists, b, z = problem(frame, memory, world, i, triple, number)
         if not exists:
             continue
         count, distances = solve_triangle(b, z)
@@ -211,25 +211,25 @@ def prune(memory: Any, world: int, i: int):
 def set_common_noise(frame: BearingFrame, memory: Any, world: int, i: int):
     """Set the noise of every bearing for comparisons: the largest for any hypothesis."""
     for n in range(frame.bearings):
-        memory.measurement[world, n].common_noise = wp.float64(0.0)
+        memory.measurement[world, i, n].common_noise = wp.float64(0.0)
     for h in range(memory.search[world, i].hypotheses):
         begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
         for n in range(frame.bearings):
             linearise(frame, memory, world, i, n)
-            noise = memory.measurement[world, n].noise
-            memory.measurement[world, n].common_noise = wp.max(memory.measurement[world, n].common_noise, noise)
+            noise = memory.measurement[world, i, n].noise
+            memory.measurement[world, i, n].common_noise = wp.max(memory.measurement[world, i, n].common_noise, noise)
 
 
 @device_function
-def expected_of(frame: BearingFrame, memory: Any, world: int, n: int):
+def expected_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Return the expected normalised innovation squared of a bearing for the true hypothesis.
 
     Noise beyond the camera's stands for a correlated error, multiplied by the number of frames in its correlation time.
     """
     time = wp.float64(constants.LINEARISATION_TIME)
-    if memory.measurement[world, n].variance > wp.float64(0.0):
+    if memory.measurement[world, i, n].variance > wp.float64(0.0):
         time = wp.float64(constants.MEAN_TIME)
-    noise = memory.measurement[world, n].noise
+    noise = memory.measurement[world, i, n].noise
     persistent = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
     return wp.float64(2.0) * (frame.variance + persistent) / noise
 
@@ -247,11 +247,11 @@ def track_hypothesis(frame: BearingFrame, memory: Any, world: int, i: int, h: in
                 fits = 1
             cost = nis
             if wp.isfinite(nis):
-                cost = innovation_with(memory, world, n, memory.measurement[world, n].common_noise)
+                cost = innovation_with(memory, world, i, n, memory.measurement[world, i, n].common_noise)
             memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.BEARING_GATE))
             memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.BEARING_GATE))
-            memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
-        memory.measurement[world, n].fits = fits
+            memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, i, n)
+        memory.measurement[world, i, n].fits = fits
         fitting += fits
     if fitting > 0:
         iterated_update(frame, memory, world, i)
@@ -277,7 +277,7 @@ def chosen_triple(frame: BearingFrame, memory: Any, world: int, i: int):
     size = wp.float64(wp.inf)
     number = int(-1)
     for _ in range(memory.search[world, i].attempts % triples + 1):
-        triple, size, number = next_triple(memory, world, frame.bearings, size, number)
+        triple, size, number = next_triple(memory, world, i, frame.bearings, size, number)
     return triple
 
 

@@ -57,9 +57,9 @@ def by_blocks(G: Any, M: Any):
 
 
 @device_function
-def share_of(frame: BearingFrame, memory: Any, world: int, n: int):
+def share_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Return the share of a bearing's information that counts: errors of messages are the same for `NEWS_TIME`."""
-    if memory.measurement[world, n].member == 0:
+    if memory.measurement[world, i, n].member == 0:
         return wp.float64(1.0)
     return wp.min(frame.period / wp.float64(constants.NEWS_TIME), wp.float64(1.0))
 
@@ -68,35 +68,35 @@ def share_of(frame: BearingFrame, memory: Any, world: int, n: int):
 def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
     """Add the innovations of a frame to the vector of a source, and correct its sensitivities."""
     first_sender = memory.belief[world, i].first_sender
-    turn = wp.transpose(memory.scratch[world, 0].pose.R)
+    turn = wp.transpose(memory.scratch[world, i, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
     errors = memory.sensitivity[world, i, q, ERRORS]
     mounting = memory.sensitivity[world, i, q, MOUNTING]
     vector = memory.source[world, i, q].vector
     for n in range(frame.bearings):
-        fits = memory.measurement[world, n].fits
+        fits = memory.measurement[world, i, n].fits
         if fits != 0:
-            H = memory.derivative[world, n, 0].jacobian
+            H = memory.derivative[world, i, n, 0].jacobian
             M = H * own
             if frame.mounting > 0:
-                M = M + memory.derivative[world, n, 2].jacobian * mounting
-            if memory.measurement[world, n].source == q:
+                M = M + memory.derivative[world, i, n, 2].jacobian * mounting
+            if memory.measurement[world, i, n].source == q:
                 M = M - H[:, 3:] * turn
-            memory.effect[world, n, q] = M
-            WM = memory.measurement[world, n].weight * M
-            vector = vector + share_of(frame, memory, world, n) * (
-                wp.transpose(WM) * memory.measurement[world, n].innovation
+            memory.effect[world, i, n, q] = M
+            WM = memory.measurement[world, i, n].weight * M
+            vector = vector + share_of(frame, memory, world, i, n) * (
+                wp.transpose(WM) * memory.measurement[world, i, n].innovation
             )
             if fits == 1:
-                own = own - wp.transpose(memory.projection[world, n, 0]) * WM
-                errors = errors - wp.transpose(memory.projection[world, n, ERRORS]) * WM
+                own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
+                errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
                 if first_sender > MOUNTING:
-                    mounting = mounting - wp.transpose(memory.projection[world, n, MOUNTING]) * WM
+                    mounting = mounting - wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
-    memory.sensitivity[world, i, q, 0] = by_blocks(memory.scratch[world, 0].recentring, own)
+    memory.sensitivity[world, i, q, 0] = by_blocks(memory.scratch[world, i, 0].recentring, own)
     memory.sensitivity[world, i, q, ERRORS] = errors
     if first_sender > MOUNTING:
-        memory.sensitivity[world, i, q, MOUNTING] = by_blocks(memory.scratch[world, MOUNTING].recentring, mounting)
+        memory.sensitivity[world, i, q, MOUNTING] = by_blocks(memory.scratch[world, i, MOUNTING].recentring, mounting)
 
 
 @device_function
@@ -105,18 +105,18 @@ def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q
 
     A bearing that fits and would not with the drift shows that the odometry is wrong instead, and counts as without it.
     """
-    f = -(wp.transpose(memory.scratch[world, 0].pose.R) * memory.source[world, i, q].drift)
+    f = -(wp.transpose(memory.scratch[world, i, 0].pose.R) * memory.source[world, i, q].drift)
     for n in range(frame.bearings):
-        if memory.measurement[world, n].fits == 1:
-            r = memory.derivative[world, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
+        if memory.measurement[world, i, n].fits == 1:
+            r = memory.derivative[world, i, n, 0].jacobian * memory.drift_effect[world, i, q - 1, 0]
             if frame.mounting > 0:
-                r = r + memory.derivative[world, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
-            if memory.measurement[world, n].source == q:
-                r = r - memory.derivative[world, n, 0].jacobian[:, 3:] * f
-            weighted = memory.measurement[world, n].weight * r
+                r = r + memory.derivative[world, i, n, 2].jacobian * memory.drift_effect[world, i, q - 1, MOUNTING]
+            if memory.measurement[world, i, n].source == q:
+                r = r - memory.derivative[world, i, n, 0].jacobian[:, 3:] * f
+            weighted = memory.measurement[world, i, n].weight * r
             if wp.dot(r, weighted) < wp.float64(constants.BEARING_GATE):
                 for k in range(memory.belief[world, i].first_sender):
-                    e = wp.transpose(memory.projection[world, n, k]) * weighted
+                    e = wp.transpose(memory.projection[world, i, n, k]) * weighted
                     memory.drift_effect[world, i, q - 1, k] = memory.drift_effect[world, i, q - 1, k] - e
 
 
@@ -158,18 +158,18 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
                 correct_drift_effect(frame, memory, world, i, q)
             memory.source[world, i, q].rejected *= wp.float64(1.0) - weight  # out of view as well
     for n in range(frame.bearings):
-        q = memory.measurement[world, n].source
-        if q >= 0 and memory.measurement[world, n].fits == -1:
+        q = memory.measurement[world, i, n].source
+        if q >= 0 and memory.measurement[world, i, n].fits == -1:
             memory.source[world, i, q].rejected += weight
     for n in range(frame.bearings):
-        if memory.measurement[world, n].fits != 0:
-            W = share_of(frame, memory, world, n) * memory.measurement[world, n].weight
+        if memory.measurement[world, i, n].fits != 0:
+            W = share_of(frame, memory, world, i, n) * memory.measurement[world, i, n].weight
             for q in range(SOURCES):
                 if is_active(memory, world, i, q):
-                    MW = wp.transpose(memory.effect[world, n, q]) * W
+                    MW = wp.transpose(memory.effect[world, i, n, q]) * W
                     for c in range(q + 1):
                         if is_active(memory, world, i, c) and (c == q or is_sender(q) or is_sender(c)):
-                            A = memory.information[world, i, q, c] + MW * memory.effect[world, n, c]
+                            A = memory.information[world, i, q, c] + MW * memory.effect[world, i, n, c]
                             memory.information[world, i, q, c] = A
 
 
@@ -182,22 +182,22 @@ def block_between(blocks: Any, q: int, c: int):
 
 
 @device_function
-def invert_blocks(memory: Any, world: int, n: int):
+def invert_blocks(memory: Any, world: int, i: int, n: int):
     """Invert the symmetric positive definite matrix of n x n blocks in `block_scratch` (Gauss-Jordan)."""
     for p in range(n):
-        D = wp.inverse(memory.block_scratch[world, p, p])
+        D = wp.inverse(memory.block_scratch[world, i, p, p])
         for j in range(n):
             if j != p:
-                memory.block_scratch[world, p, j] = D * memory.block_scratch[world, p, j]
+                memory.block_scratch[world, i, p, j] = D * memory.block_scratch[world, i, p, j]
         for k in range(n):
             if k != p:
-                X = memory.block_scratch[world, k, p]
+                X = memory.block_scratch[world, i, k, p]
                 for j in range(n):
                     if j != p:
-                        left = memory.block_scratch[world, k, j] - X * memory.block_scratch[world, p, j]
-                        memory.block_scratch[world, k, j] = left
-                memory.block_scratch[world, k, p] = -(X * D)
-        memory.block_scratch[world, p, p] = D
+                        left = memory.block_scratch[world, i, k, j] - X * memory.block_scratch[world, i, p, j]
+                        memory.block_scratch[world, i, k, j] = left
+                memory.block_scratch[world, i, k, p] = -(X * D)
+        memory.block_scratch[world, i, p, p] = D
 
 
 @device_function
@@ -210,7 +210,7 @@ def reported_covariance(memory: Any, world: int, i: int, k: int, j: int):
 @device_function
 def source_at(memory: Any, world: int, i: int, a: int) -> int:
     """Return the slot of the a-th sender in `block_scratch`."""
-    return memory.member[world, i, memory.block_member[world, a]].source
+    return memory.member[world, i, memory.block_member[world, i, a]].source
 
 
 @device_function
@@ -219,19 +219,19 @@ def eliminate_senders(memory: Any, world: int, i: int, scale: Any) -> int:
     count = int(0)
     for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if is_active(memory, world, i, memory.member[world, i, k].source):
-            memory.block_member[world, count] = k
+            memory.block_member[world, i, count] = k
             for b in range(count + 1):
-                X = scale * reported_covariance(memory, world, i, k, memory.block_member[world, b])
-                memory.block_scratch[world, count, b] = X
-                memory.block_scratch[world, b, count] = wp.transpose(X)
+                X = scale * reported_covariance(memory, world, i, k, memory.block_member[world, i, b])
+                memory.block_scratch[world, i, count, b] = X
+                memory.block_scratch[world, i, b, count] = wp.transpose(X)
             count += 1
-    invert_blocks(memory, world, count)
+    invert_blocks(memory, world, i, count)
     for a in range(count):
         for b in range(count):
             q = source_at(memory, world, i, a)
             c = source_at(memory, world, i, b)
-            memory.block_scratch[world, a, b] += block_between(memory.information[world, i], q, c)
-    invert_blocks(memory, world, count)
+            memory.block_scratch[world, i, a, b] += block_between(memory.information[world, i], q, c)
+    invert_blocks(memory, world, i, count)
     return count
 
 
@@ -241,7 +241,7 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
     X = mat33d()
     for a in range(count):
         c = source_at(memory, world, i, a)
-        X = X + block_between(memory.information[world, i], q, c) * memory.block_scratch[world, a, b]
+        X = X + block_between(memory.information[world, i], q, c) * memory.block_scratch[world, i, a, b]
     return X
 
 

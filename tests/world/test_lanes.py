@@ -1,0 +1,111 @@
+"""A thread per share of the vehicles of a world: the same bits as one thread that takes all of them in turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.api.engine import Engine
+from coopenv.world import launch
+from coopenv.world.launch import threads_and_lanes
+from coopenv.world.world import World
+from tests.helpers.builders import assert_same, reset, simulate
+from tests.world.test_nearby import street
+from tests.world.test_reproducibility import MADE, played
+
+STREETS: dict[str, dict[str, Any]] = {
+    "messages of earlier ticks": {"v2x": {"delay": 1, "range": 30.0, "loss": 0.3}},
+    "messages of this tick": {"topology": {"acyclic": True}, "v2x": {"delay": 0, "range": 20.0}},
+    "messages of this tick to all": {"v2x": {"delay": 0, "range": 20.0, "links": "all", "period": 2}},
+}
+
+
+@pytest.fixture
+def _small_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "VEHICLES_PER_THREAD", 1)
+
+
+@pytest.mark.parametrize("variant", STREETS)
+@pytest.mark.parametrize("observer", ["riccati", pytest.param("robust", marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("_small_lanes")
+def test_vehicles_at_once_are_vehicles_in_turn(variant: str, observer: str) -> None:
+    description, found = street(60, 96, observer, **STREETS[variant]), []
+    for threads in (1, 2, 3):
+        world = simulate(description, 1, "float32", threads)
+        assert world.launch.lanes == threads
+        reset(world, [4])
+        for _ in range(6):
+            world.advance(6)
+        found.append(world.get_state())
+    assert_same(found[0], found[1])
+    assert_same(found[0], found[2])
+    assert (found[0]["inbox_tick"] > 0).any()
+
+
+@pytest.mark.parametrize("name", MADE)
+@pytest.mark.usefixtures("_small_lanes")
+def test_few_vehicles_of_two_worlds(name: str) -> None:
+    found = []
+    for threads in (1, 3):
+        world = simulate(MADE[name], 2, threads=threads)
+        reset(world, range(2))
+        assert world.launch.lanes == threads
+        found.append(played(world, 60))
+    assert_same(*found)
+
+
+@pytest.mark.usefixtures("_small_lanes")
+def test_results_of_a_step() -> None:
+    description, found = street(60, 96), []
+    for threads in (1, 2):
+        engine = Engine(description, 1, threads=threads)
+        engine.reset([3])
+        for _ in range(3):
+            engine.step(np.full(engine.world.actions.shape, 0.3, np.float32))
+        found.append({name: engine.view(name).copy() for name in ("observation", "reward", "nees", "truncated")})
+        engine.close()
+    assert_same(*found)
+
+
+def longest_chain(world: World, vehicle: int, tick: int) -> int:
+    """Return how many messages of a tick one after the other lead to a vehicle, by recursion."""
+    senders = np.flatnonzero(world.view("arriving")[0, vehicle] == tick).tolist()
+    return max((1 + longest_chain(world, sender, tick) for sender in senders), default=0)
+
+
+@pytest.mark.usefixtures("_small_lanes")
+def test_levels_are_the_longest_chains_of_messages() -> None:
+    world = simulate(street(60, 64, v2x={"delay": 0, "range": 12.0}), 1, threads=2)
+    reset(world, [0])
+    world.advance(5)
+    levels = [longest_chain(world, vehicle, 5) for vehicle in range(64)]
+    assert world._levels.numpy()[0].tolist() == levels
+    assert max(levels) > 1
+
+
+@pytest.mark.parametrize(
+    ("worlds", "vehicles", "device", "threads", "expected"),
+    [
+        (1, 5, "cpu", 4, (1, 1)),
+        (1, 5, "cpu", None, (1, 1)),
+        (1, 127, "cpu", 4, (1, 1)),
+        (1, 1024, "cpu", 4, (1, 4)),
+        (3, 1024, "cpu", 4, (1, 4)),
+        (4, 1024, "cpu", 4, (4, 1)),
+        (1, 192, "cpu", 4, (1, 3)),
+        (3, 5, "cpu", 4, (3, 1)),
+        (1, 1024, "cuda:0", None, (1, 1024)),
+        (65536, 5, "cuda:0", None, (1, 1)),
+    ],
+)
+def test_what_is_split(worlds: int, vehicles: int, device: str, threads: int | None, expected: tuple[int, int]) -> None:
+    assert threads_and_lanes(worlds, vehicles, device, threads) == expected
+
+
+def test_cores_are_used_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COOPENV_THREADS", "4")
+    assert threads_and_lanes(1, 1024, "cpu") == (1, 4)
+    assert threads_and_lanes(64, 5, "cpu") == (2, 1)
+    assert threads_and_lanes(128, 1024, "cpu") == (4, 1)
