@@ -79,6 +79,13 @@ class ObserverOptions:
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local"
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Processor time after which an observer is ended on a record, s (default: 1800)."),
+    ] = None
+    memory: Annotated[
+        float | None, typer.Option(min=1, help="Memory beyond which it is ended, MiB (default: 8192).")
+    ] = None
     data: options.DataFolder = None
     topics: options.TopicMap = None
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
@@ -125,7 +132,7 @@ class ObserverOptions:
         return options.command_text("bench observers", chosen, OF_THE_OUTPUT)
 
 
-OF_THE_OUTPUT = ("jobs", "engine", "address", "out", "figures", "width", "open_report", "as_json")
+OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figures", "width", "open_report", "as_json")
 """Options of `bench observers` that do not change what is measured."""
 
 
@@ -150,7 +157,7 @@ def bench_observers(given: ObserverOptions) -> None:
     perform(
         plan,
         given.command_of(plan),
-        find_executor(given.engine, given.jobs, given.address),
+        find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory),
         printed,
         log,
         basin=given.basin,

@@ -17,7 +17,7 @@ from coopenv.base.files import replace_text
 from coopenv.base.installation import needing
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
-from coopenv.bench.observers.judge import Task, judge
+from coopenv.bench.observers.judge import Task, judge_all
 from coopenv.bench.observers.rows import EDGES, Leaderboard, Row, WindowRow, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
@@ -241,7 +241,7 @@ class Plan:
         sent = [{name: portable(name) for name in group} for group in groups]
         used = self.seeds if self.source.seeded else (0,)
         tasks = [Task(self.source, *made, self.steady_from, self.edges) for made in product(self.variants, used, sent)]
-        judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
+        judged = judge_all(executor, tasks, lambda done: on_progress(done / len(tasks)))
         order = list(product(self.variants, self.observers))
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
         summaries = {variant: self.source.variants[variant] for variant in self.variants}
