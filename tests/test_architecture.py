@@ -89,18 +89,18 @@ LINES_AND_FILES = {
     "api": (3920, 19),
     "backends": (3280, 17),
     "base": (1395, 8),
-    "bench": (4990, 19),
+    "bench": (5300, 20),
     "cars": (10520, 47),
-    "cli": (2305, 8),
+    "cli": (2410, 8),
     "estimation": (1765, 8),
     "evaluation": (495, 3),
     "observers": (11820, 47),
     "policies": (1725, 10),
-    "runs": (2875, 11),
+    "runs": (3120, 12),
     "scenario": (3165, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (4910, 19),
+    "world": (4920, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

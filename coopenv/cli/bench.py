@@ -170,6 +170,53 @@ def bench_observers(given: ObserverOptions) -> None:
         options.show(given.out / REPORT_FILE)
 
 
+@bench.command("v1")
+def bench_v1(
+    observers: Annotated[
+        str,
+        typer.Argument(
+            metavar="OBSERVERS",
+            help="mine.py:Mine, package.module:Mine or names, with commas between.",
+            **options.OBSERVERS,
+        ),
+    ],
+    scenes: Annotated[str | None, typer.Option(help="Some scenes only, with commas between, for a trial.")] = None,
+    out: Annotated[Path, typer.Option(help="Result file.")] = Path("bench_v1.json"),
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Another limit of processor time on a record, s; marks the result.")
+    ] = None,
+    memory: Annotated[float | None, typer.Option(min=1, help="Another limit of memory, MiB; marks the result.")] = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Measure observers in the frozen benchmark, beside the rows of the zoo."""
+    from coopenv.base.files import check_file, replace_text
+    from coopenv.base.format import json_text
+    from coopenv.base.installation import available_cores
+    from coopenv.bench import frozen
+    from coopenv.bench.watched import Limits
+    from coopenv.runs.console import Progress
+
+    check_file(out)
+    benchmark, log = frozen.Frozen("v1"), options.console(stderr=True)
+    usual = benchmark.limits
+    limits = Limits(seconds or usual.seconds, memory or usual.mebibytes)
+    names = options.words(observers) or []
+    command = f"coopenv bench v1 {observers}"
+    with Progress(log, "bench v1", total=1.0) as progress:
+        result = benchmark.run(
+            names, options.words(scenes), jobs or available_cores(), limits, command, progress.update
+        )
+    replace_text(out, json_text(result))
+    if as_json:
+        options.print_json(result)
+        return
+    printed = options.console(least=frozen.WIDTH)
+    for part in frozen.report(benchmark, result):
+        printed.print(part, soft_wrap=isinstance(part, str), markup=False)
+    printed.print(f"{out}: the result file", soft_wrap=True)
+
+
 @bench.command("learning")
 def bench_learning(
     study: Annotated[Path, typer.Argument(help="TOML file of the study, such as agents/study.toml.")],

@@ -78,6 +78,9 @@ class RecordProperties:
     """(S, N) m, joint."""
     paper_noise: bool
     """Whether bearings are noisy on the image plane, and so less than the bound assumes off the optical axis."""
+    figures: tuple[float, ...] = ()
+    """What tells another record: bearings, deliveries, and the root mean squares of bearings along x, of measured
+    velocities, m/s, and of the last true positions, m."""
 
     @property
     def steady_from(self) -> float:
@@ -145,7 +148,17 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    return RecordProperties(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
+    return RecordProperties(
+        names, windows, within, gramians, recording.t[kept], bound, paper_noise, figures_of(recording)
+    )
+
+
+def figures_of(recording: Recording) -> tuple[float, ...]:
+    """Return the figures of a record, see `RecordProperties`."""
+    r = recording
+    squares = r.bearings[r.visible][:, 0], r.velocity, r.truth.position[-1]
+    roots = (float(np.sqrt(np.mean(values**2))) if values.size else 0.0 for values in squares)
+    return float(r.visible.sum()), float((np.diff(r.inbox_tick, axis=0) > 0).sum()), *roots
 
 
 def _geometry(recording: Recording) -> RecordedGeometry:
