@@ -141,7 +141,7 @@ def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed:
 
     names = [setup.name for setup in recording.setups]
     watched = [Watched(robust(setup)) for setup in recording.setups]
-    changed = change_of(case)(recording, np.random.default_rng(seed))
+    changed = change_of(case)(recording, seed)
     result = run(lambda setup: watched[names.index(setup.name)], changed)
     if result.failure:
         raise RuntimeError(result.failure)
@@ -158,24 +158,22 @@ def add_case(found: dict[str, Any], scene: str, case: str, recording: Any, seed:
 
 
 def change_of(case: str) -> Callable[..., Any]:
-    """Return what changes a recording as in a case; its arguments are the recording and a generator."""
-    from benchmarks import evidence
-    from coopenv.bench.observers.faults import variant_of
+    """Return what changes a recording as in a case; its arguments are the recording and a seed."""
+    from benchmarks.evidence import CHANGES, STEP_AT, changed
 
-    if case in LIES:
-        return lambda recording, random: variant_of(LIES[case]).applied(recording, 0)
-    return {
-        "nominal": evidence.unchanged,
-        "landmark": evidence.landmark_moved(3.0),
-        "passing": passing,
-        "bias": evidence.bias_step(np.radians(1.0)),
-        "large bias": evidence.bias_step(np.radians(5.0)),
-        "scale": evidence.scale_drift(0.1),
-        "random": evidence.random_bearings(0.1),
-    }[case]
+    faults = {
+        "nominal": "",
+        "landmark": CHANGES["one landmark of the map off by 3 m"],
+        "bias": f"gyro_step={np.radians(1.0)}@{STEP_AT}",
+        "large bias": f"gyro_step={np.radians(5.0)}@{STEP_AT}",
+        "scale": "scale_drift=0.1",
+        "random": "random_bearings=0.1",
+        **LIES,
+    }
+    return passing if case == "passing" else lambda recording, seed: changed(recording, faults[case], seed)
 
 
-def passing(recording: Any, random: Any) -> Any:
+def passing(recording: Any, seed: int) -> Any:
     """Return a recording in which the second landmark of the maps is 3 m off from `AT` on for 4 s."""
     landmarks = recording.landmarks.copy()
     landmarks[(recording.t >= AT) & (recording.t < AT + 4.0), 1] += (1.8, 2.4, 0.0)

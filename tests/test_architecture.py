@@ -89,18 +89,18 @@ LINES_AND_FILES = {
     "api": (3965, 19),
     "backends": (3285, 17),
     "base": (1400, 8),
-    "bench": (4665, 18),
+    "bench": (5300, 20),
     "cars": (10525, 47),
-    "cli": (2300, 8),
+    "cli": (2405, 8),
     "estimation": (1765, 8),
     "evaluation": (495, 3),
     "observers": (11810, 47),
     "policies": (1725, 10),
-    "runs": (2880, 11),
+    "runs": (3120, 12),
     "scenario": (3175, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (5125, 19),
+    "world": (5135, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

@@ -23,7 +23,7 @@ from coopenv.observers.registry import observer_names
 from coopenv.runs import console
 from coopenv.runs.recorder import record
 
-FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
+FILES = {"metrics.json", "trajectory.npz", "scene.npz", "record.zip"}
 FIGURES = {
     "errors.png",
     "trajectories_2d.png",
@@ -144,7 +144,9 @@ def test_run_as_json_prints_nothing_else(capsys: pytest.CaptureFixture[str], tmp
     captured = capsys.readouterr()
     printed = json.loads(captured.out)
     assert "the policy has no effect" in captured.err
-    assert printed["files"] == [f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz")]
+    assert printed["files"] == [
+        f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz", "record.zip")
+    ]
     folder = tmp_path / "out" / "overtaking"
     assert {path.name for path in folder.iterdir()} == FILES
     assert json.loads((folder / "metrics.json").read_text()) == {k: v for k, v in printed.items() if k != "files"}

@@ -136,7 +136,7 @@ def error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-def listed(names: Sequence[str], most: int = 16) -> str:
+def listed(names: Sequence[str], most: int = 20) -> str:
     """Return names with commas between; of very many the first few and how many there are."""
     few = names if len(names) <= most else [*names[:most], f"... ({len(names)} in all)"]
     return ", ".join(few)

@@ -6,20 +6,18 @@ Processes are of the standard library, not of joblib: they end within two second
 
 import multiprocessing
 import os
-import pickle
-import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import ONE_THREAD, available_cores, environment, install_command, needing
 from coopenv.base.interrupts import end_with_parent, held
+from coopenv.bench.watched import Limits, check_sendable, deaf_children
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -34,6 +32,8 @@ class Local:
     """Processes of this machine, or this very process where one is enough."""
 
     jobs: int
+    limits: Limits | None = None
+    """Of observers, in `coopenv.bench.observers.judge.judge_all`; None: none, and they may run in this process."""
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task."""
@@ -44,14 +44,14 @@ class Local:
                 results[n] = function(task)
                 on_done(n + 1)
         else:
-            _check_sendable(tasks[0])
+            check_sendable(tasks[0])
             others = multiprocessing.active_children()
             with (
                 environment(ONE_THREAD),  # matrices here are small: threads would only get in the way
                 ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), end_with_parent) as pool,
             ):
                 try:
-                    with held(), _deaf_children():
+                    with held(), deaf_children():
                         work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
                     for done in as_completed(work):
                         results[work[done]] = done.result()
@@ -63,30 +63,6 @@ class Local:
                         worker.kill()
                     raise
         return [results[n] for n in range(len(tasks))]
-
-
-@contextmanager
-def _deaf_children() -> Iterator[None]:
-    """Let processes that are started meanwhile not hear Ctrl-C, which a terminal sends to all: the parent decides."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _check_sendable(task: object) -> None:
-    """Refuse what cannot be sent to another process, most likely an observer that is defined within a function."""
-    try:
-        pickle.dumps(task)
-    except Exception as error:
-        raise CoopenvError(
-            f"cannot be sent to another process: {error} (define observers at the top level of a module, or use "
-            "--jobs 1)"
-        ) from None
 
 
 @dataclass(frozen=True)
@@ -148,7 +124,13 @@ class Ray:
 Executor = Local | Ray
 
 
-def find_executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
+def find_executor(
+    name: str,
+    jobs: int | None = None,
+    address: str | None = None,
+    seconds: float | None = None,
+    mebibytes: float | None = None,
+) -> Executor:
     """Return an executor that is ready, by its name and the options of `bench observers`.
 
     Raises:
@@ -159,9 +141,12 @@ def find_executor(name: str, jobs: int | None = None, address: str | None = None
     if name == "local":
         if address is not None:
             raise CoopenvError(f"--address {address}: only --engine ray has an address")
-        return Local(jobs or available_cores())
-    if jobs is not None:
-        raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
+        given = {"seconds": seconds, "mebibytes": mebibytes}
+        limits = Limits(**{key: value for key, value in given.items() if value is not None})
+        return Local(jobs or available_cores(), limits)
+    for option, value in (("--jobs", jobs), ("--seconds", seconds), ("--memory", mebibytes)):
+        if value is not None:
+            raise CoopenvError(f"{option} {value:g}: with --engine ray the cluster decides")
     if address not in (None, AUTO):
         reach(address)
     executor = Ray(address or AUTO)

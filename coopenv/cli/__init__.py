@@ -21,7 +21,7 @@ from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
 from coopenv.cli.bench import bench
 from coopenv.cli.calibrate import calibrate, identify
-from coopenv.cli.run import export, figures, import_, record, run
+from coopenv.cli.run import bundle, export, figures, import_, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch
@@ -120,6 +120,7 @@ for command in (
     run,
     figures,
     export,
+    bundle,
     record,
     import_,
     calibrate,

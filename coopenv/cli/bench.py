@@ -80,6 +80,13 @@ class ObserverOptions:
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local"
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Processor time after which an observer is ended on a record, s (default: 1800)."),
+    ] = None
+    memory: Annotated[
+        float | None, typer.Option(min=1, help="Memory beyond which it is ended, MiB (default: 8192).")
+    ] = None
     data: options.DataFolder = None
     topics: options.TopicMap = None
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0
@@ -126,7 +133,7 @@ class ObserverOptions:
         return options.command_text("bench observers", chosen, OF_THE_OUTPUT)
 
 
-OF_THE_OUTPUT = ("jobs", "engine", "address", "out", "figures", "width", "open_report", "as_json")
+OF_THE_OUTPUT = ("jobs", "engine", "address", "seconds", "memory", "out", "figures", "width", "open_report", "as_json")
 """Options of `bench observers` that do not change what is measured."""
 
 
@@ -151,7 +158,7 @@ def bench_observers(given: ObserverOptions) -> None:
     perform(
         plan,
         given.command_of(plan),
-        find_executor(given.engine, given.jobs, given.address),
+        find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory),
         printed,
         log,
         basin=given.basin,
@@ -162,6 +169,53 @@ def bench_observers(given: ObserverOptions) -> None:
     )
     if given.open_report and given.out is not None:
         options.show(given.out / REPORT_FILE)
+
+
+@bench.command("v1")
+def bench_v1(
+    observers: Annotated[
+        str,
+        typer.Argument(
+            metavar="OBSERVERS",
+            help="mine.py:Mine, package.module:Mine or names, with commas between.",
+            **options.OBSERVERS,
+        ),
+    ],
+    scenes: Annotated[str | None, typer.Option(help="Some scenes only, with commas between, for a trial.")] = None,
+    out: Annotated[Path, typer.Option(help="Result file.")] = Path("bench_v1.json"),
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Another limit of processor time on a record, s; marks the result.")
+    ] = None,
+    memory: Annotated[float | None, typer.Option(min=1, help="Another limit of memory, MiB; marks the result.")] = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """Measure observers in the frozen benchmark, beside the rows of the zoo."""
+    from coopenv.base.files import check_file, replace_text
+    from coopenv.base.format import json_text
+    from coopenv.base.installation import available_cores
+    from coopenv.bench import frozen
+    from coopenv.bench.watched import Limits
+    from coopenv.runs.console import Progress
+
+    check_file(out)
+    benchmark, log = frozen.Frozen("v1"), options.console(stderr=True)
+    usual = benchmark.limits
+    limits = Limits(seconds or usual.seconds, memory or usual.mebibytes)
+    names = options.words(observers) or []
+    command = f"coopenv bench v1 {observers}"
+    with Progress(log, "bench v1", total=1.0) as progress:
+        result = benchmark.run(
+            names, options.words(scenes), jobs or available_cores(), limits, command, progress.update
+        )
+    replace_text(out, json_text(result))
+    if as_json:
+        options.print_json(result)
+        return
+    printed = options.console(least=frozen.WIDTH)
+    for part in frozen.report(benchmark, result):
+        printed.print(part, soft_wrap=isinstance(part, str), markup=False)
+    printed.print(f"{out}: the result file", soft_wrap=True)
 
 
 @bench.command("learning")

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 class RunOptions(options.SourceOptions):
     """Options of `coopenv run`."""
 
+    observer: Annotated[
+        str | None,
+        typer.Option(help="In place of the scenario's own: a name, or mine.py:Mine.", **options.OBSERVERS),
+    ] = None
     seed: options.Seed = 0
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None
@@ -41,10 +45,23 @@ class RunOptions(options.SourceOptions):
     ] = False
     as_json: options.AsJson = False
 
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The overrides of the scenario, its observer included."""
+        from coopenv.observers.registry import named
+
+        return super().changes | ({} if self.observer is None else {"observer.name": named(self.observer)})
+
 
 @options.command
 def run(given: RunOptions) -> None:
-    """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
+    """Run an environment; write metrics, arrays, figures and a page that plays the episode.
+
+    The file of an earlier run, which `coopenv bundle` wrote, runs again and is compared.
+    """
+    if given.environment.endswith(BUNDLE):
+        replay(Path(given.environment))
+        return
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
     backend = given.open()
@@ -73,6 +90,40 @@ def run(given: RunOptions) -> None:
     if given.open_out:
         page = folder / REPLAY_FILE
         options.show_page(page) if page in result["files"] else options.show(folder)
+
+
+BUNDLE = ".zip"
+
+
+def replay(path: Path) -> None:
+    """Run a bundle again. Raises CoopenvError: it is not valid, or something else comes out."""
+    from coopenv.runs.bundle import Bundle
+
+    bundle, printed = Bundle.read(path), options.console()
+    if others := bundle.other_versions():
+        options.console(stderr=True).print(f"note: made with {', '.join(others)}", soft_wrap=True)
+    if differing := bundle.replay():
+        raise CoopenvError(f"{path}: another result than that of the file: {'; '.join(differing)}")
+    printed.print(f"{path}: {bundle.title}", soft_wrap=True)
+    error = bundle.manifest["end"]["error"]
+    printed.print(f"The same error: {error}" if error else "The same figures.", soft_wrap=True)
+
+
+def bundle(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")],
+    out: Annotated[Path | None, typer.Option(help="File to write (default: RUN.zip).")] = None,
+) -> None:
+    """Write a run, or one that failed, to one file, which `coopenv run` replays."""
+    from shutil import copyfile
+
+    from coopenv.base.files import replacing_file
+    from coopenv.runs.bundle import RECORD_FILE, Bundle
+
+    found = Bundle.read(run / RECORD_FILE)
+    file = out or run.with_name(f"{run.name}{BUNDLE}")
+    with replacing_file(file) as new:
+        copyfile(found.path, new)
+    options.console().print(f"{file}: {found.title}. It runs again with: coopenv run {file}", soft_wrap=True)
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -12,12 +13,13 @@ from rich.console import Console
 
 from coopenv.backends.base import Repeating
 from coopenv.base.errors import CoopenvError, DataError, listed
-from coopenv.base.files import replace_text, replacing_folder
+from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.registry import states_covariance
+from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import VIDEO_FILES, Keeper, frame_stride, source_of, video_path, write_film, write_page
@@ -31,7 +33,7 @@ METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
-    return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
+    return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, RECORD_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
 
 
 class NoTruthError(CoopenvError):
@@ -52,7 +54,8 @@ def execute(
 ) -> dict[str, Any]:
     """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
-    A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `width` is a column
+    A run that does not reach its end writes nothing to `out`; that of an error leaves its record in the folder
+    `OUT_failed`, see `coopenv.runs.bundle`. `figures` is their format; None: no figures. `width` is a column
     of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar.
 
     Raises:
@@ -69,8 +72,14 @@ def execute(
         with compile_notice(log):
             run.engine.load()
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
-        with Progress(log, doing, run.ticks_planned, scenario.rates.camera if able.real_time else None) as progress:
+        record = None if able.recorded or able.real_time else RunRecord(run)
+        with (
+            Progress(log, doing, run.ticks_planned, scenario.rates.camera if able.real_time else None) as progress,
+            _kept_if_failed(record, out, name, log),
+        ):
             for tick in run.play():
+                if record is not None:
+                    record.tick(tick)
                 if keeper.tick(tick):
                     progress.update(tick, describe() if describe is not None else None)
         scene = keeper.record()
@@ -85,6 +94,9 @@ def execute(
         replace_text(paths[0], json_text(metrics))
         trajectory.save(paths[1])
         scene.save(paths[2])
+        if record is not None:
+            paths.append(folder / RECORD_FILE)
+            record.save(paths[-1], name)
         if figures is not None:
             with Progress(log, "drawing figures"):
                 paths += Results(metrics, judged).save_figures(folder, figures, width, scenario, observability)
@@ -98,6 +110,20 @@ def execute(
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
     return {**metrics, "files": [out / path.name for path in paths]}
+
+
+@contextmanager
+def _kept_if_failed(record: RunRecord | None, out: Path, name: str, log: Console) -> Iterator[None]:
+    """Write the record of a run that fails to a folder of its own."""
+    try:
+        yield
+    except CoopenvError as error:
+        if record is not None:
+            folder = out.with_name(f"{out.name}_failed")
+            with new_folder(folder):
+                record.save(folder / RECORD_FILE, name, str(error))
+            log.print(f"kept for a report: coopenv bundle {folder}", soft_wrap=True)
+        raise
 
 
 def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:

@@ -6,6 +6,7 @@
 | `device_function` | `Function.__class__`, `get_overload`, `overload.adj` | records by reference, uncopied |
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record by its instance |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
+| `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
 """
 
 import ctypes
@@ -86,3 +87,11 @@ def field_types(record: Any) -> dict[str, Any]:
 def scalar_of(kind: Any) -> Any:
     """Return the scalar type of a vector or matrix type; a scalar type is returned unchanged."""
     return getattr(kind, "_wp_scalar_type_", kind)
+
+
+def kernel_hashes() -> dict[str, str]:
+    """Return the hashes of this package's modules of kernels that are loaded, by name."""
+    empty = wp.get_module("coopenv.empty").get_module_hash()
+    modules = [(name, module) for name, module in context.user_modules.items() if name.startswith("coopenv.")]
+    hashes = {name: module.get_module_hash() for name, module in modules}
+    return {name: digest.hex() for name, digest in sorted(hashes.items()) if digest != empty}

@@ -171,7 +171,7 @@ def seed_of_run(folder: Path) -> int:
     final = [vehicle["final_position_error_m"] for vehicle in metrics["vehicles"]]
     assert np.array_equal(run.position_error[-1], final)
     names = {path.name for path in folder.iterdir()}
-    assert len(names) == 10 and names <= set(result_names())
+    assert len(names) == 11 and names <= set(result_names())
     pictures = {name: folder.joinpath(name).stat().st_mtime_ns for name in names if name.endswith(".png")}
     assert len(pictures) == 6
     for name in pictures:

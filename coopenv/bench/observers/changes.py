@@ -1,6 +1,6 @@
-"""Changes of a recording by faults: losses, delays, wrong identities, hidden landmarks, jammers, wrong maps and lies.
+"""Changes of a recording by faults of the radio, of bearings, of maps, of odometry and of broadcasts.
 
-The truth and the odometry of a recording are never changed. Every random draw is a function of the seed and the fault.
+Observers are not told. The truth is never changed. Every random draw is a function of the seed and the fault.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
@@ -64,6 +65,32 @@ def with_wrong_association(recording: Recording, fault: Fault, seed: int) -> Rec
             pair = [target, others[int(partners[k, i, target] * len(others))]]
             bearings[k, i, pair] = bearings[k, i, pair[::-1]]
     return replace(recording, bearings=bearings)
+
+
+def with_random_bearings(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Replace a share of all bearings by uniform directions."""
+    bearings = recording.bearings.copy()
+    generator = np.random.default_rng(seed)
+    wrong = recording.visible & (generator.random(recording.visible.shape) < fault.value)
+    directions = generator.standard_normal((int(wrong.sum()), 3))
+    bearings[wrong] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return replace(recording, bearings=bearings)
+
+
+def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
+    late = np.arange(recording.ticks) >= _first_tick(recording, fault)
+    bias = fault.value * np.outer(late, _on(recording, fault))[..., None] * (0.0, 0.0, 1.0)
+    turn = Rotation.from_rotvec((bias * recording.dt).reshape(-1, 3)).as_matrix().reshape(recording.rotation.shape)
+    return replace(recording, rotation=recording.rotation @ turn, angular_velocity=recording.angular_velocity + bias)
+
+
+def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Let the scale error of odometries grow linearly from a time on, up to its value at the end."""
+    start, end = fault.start_in(float(recording.t[-1])), float(recording.t[-1])
+    grown = np.maximum(0.0, recording.t - start) / max(end - start, recording.dt)
+    scale = (1.0 + fault.value * np.outer(grown, _on(recording, fault)))[..., None]
+    return replace(recording, translation=recording.translation * scale, velocity=recording.velocity * scale)
 
 
 def without_landmarks(recording: Recording, fault: Fault, seed: int) -> Recording:
@@ -120,6 +147,11 @@ def _indices(recording: Recording, fault: Fault) -> list[int]:
     """Return the vehicles that have a fault; all if none is named."""
     names = [setup.name for setup in recording.setups]
     return [names.index(name) for name in fault.vehicles or names]
+
+
+def _on(recording: Recording, fault: Fault) -> np.ndarray:
+    """Return (N,) which vehicles have a fault."""
+    return np.isin(np.arange(len(recording.setups)), _indices(recording, fault))
 
 
 def _first_tick(recording: Recording, fault: Fault) -> int:

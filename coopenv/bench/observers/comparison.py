@@ -17,7 +17,7 @@ from coopenv.base.files import replace_text
 from coopenv.base.installation import needing
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
-from coopenv.bench.observers.judge import Task, judge
+from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
 from coopenv.bench.observers.rows import EDGES, Leaderboard, Row, WindowRow, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
@@ -235,17 +235,33 @@ class Plan:
         Raises:
             CoopenvError: a record cannot be made, or the steady state would start beyond it.
         """
+        tasks = self.tasks
+        return self.compared(judge_all(executor, tasks, lambda done: on_progress(done / len(tasks))))
+
+    @property
+    def tasks(self) -> list[Task]:
+        """One record and its observers each.
+
+        Raises:
+            CoopenvError: the steady state would start beyond the record.
+        """
         self.source.steady_from(self.steady_from)
         # One record serves all observers. Recorded robots are few and long records: their observers are shared out.
         groups = [self.observers] if self.source.seeded else [(name,) for name in self.observers]
         sent = [{name: portable(name) for name in group} for group in groups]
-        used = self.seeds if self.source.seeded else (0,)
-        tasks = [Task(self.source, *made, self.steady_from, self.edges) for made in product(self.variants, used, sent)]
-        judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
+        made = product(self.variants, self._used, sent)
+        return [Task(self.source, *parts, self.steady_from, self.edges) for parts in made]
+
+    @property
+    def _used(self) -> tuple[int, ...]:
+        return self.seeds if self.source.seeded else (0,)
+
+    def compared(self, judged: Iterable[Iterable[JudgedRun]]) -> Comparison:
+        """Return the comparison from the results of the tasks."""
         order = list(product(self.variants, self.observers))
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
         summaries = {variant: self.source.variants[variant] for variant in self.variants}
-        return Comparison(self.source.name, self.observers, summaries, used, samples)
+        return Comparison(self.source.name, self.observers, summaries, self._used, samples)
 
 
 def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) -> tuple[str, ...]:

@@ -18,10 +18,13 @@ from coopenv.bench.observers.changes import (
     leaders_of,
     usual_sender,
     with_delay,
+    with_gyro_step,
     with_jammer,
     with_lie,
     with_loss,
     with_map_error,
+    with_random_bearings,
+    with_scale_drift,
     with_wrong_association,
     without_landmarks,
 )
@@ -63,6 +66,25 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         0.05,
         high=1.0,
         change=with_wrong_association,
+    ),
+    "random_bearings": RecordFault(
+        "SHARE", "of the bearings that points in a uniform direction", 0.1, high=1.0, change=with_random_bearings
+    ),
+    "gyro_step": RecordFault(
+        "RATE",
+        "by which gyros are biased about the vertical from START on, rad/s; undeclared",
+        0.02,
+        start=True,
+        vehicles=True,
+        change=with_gyro_step,
+    ),
+    "scale_drift": RecordFault(
+        "SHARE",
+        "to which the scale error of odometries grows from START to the end; undeclared",
+        0.1,
+        start=True,
+        vehicles=True,
+        change=with_scale_drift,
     ),
     "landmarks_lost": RecordFault(
         "",

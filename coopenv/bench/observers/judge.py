@@ -1,8 +1,8 @@
 """One record, judged: the errors of every observer against the truth and the bounds."""
 
 import pickle
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import pairwise
 from typing import NamedTuple
@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers.sources import RecordSource
+from coopenv.bench.watched import watched
 from coopenv.estimation.metrics import (
     CONVERGED,
     SETTLED,
@@ -27,7 +29,7 @@ from coopenv.estimation.poses import Array
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
-from coopenv.observers.runner import Run, run
+from coopenv.observers.runner import PLANAR_STATES, Run, run
 
 STEADY = "steady"
 
@@ -76,6 +78,9 @@ class RecordProperties:
     """(S, N) m, joint."""
     paper_noise: bool
     """Whether bearings are noisy on the image plane, and so less than the bound assumes off the optical axis."""
+    figures: tuple[float, ...] = ()
+    """What tells another record: bearings, deliveries, and the root mean squares of bearings along x, of measured
+    velocities, m/s, and of the last true positions, m."""
 
     @property
     def steady_from(self) -> float:
@@ -143,7 +148,17 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    return RecordProperties(names, windows, within, gramians, recording.t[kept], bound, paper_noise)
+    return RecordProperties(
+        names, windows, within, gramians, recording.t[kept], bound, paper_noise, figures_of(recording)
+    )
+
+
+def figures_of(recording: Recording) -> tuple[float, ...]:
+    """Return the figures of a record, see `RecordProperties`."""
+    r = recording
+    squares = r.bearings[r.visible][:, 0], r.velocity, r.truth.position[-1]
+    roots = (float(np.sqrt(np.mean(values**2))) if values.size else 0.0 for values in squares)
+    return float(r.visible.sum()), float((np.diff(r.inbox_tick, axis=0) > 0).sum()), *roots
 
 
 def _geometry(recording: Recording) -> RecordedGeometry:
@@ -182,45 +197,92 @@ RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory
 
 
 @dataclass(frozen=True)
+class Ended:
+    """In place of an observer that was ended and is not started again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
 class Task:
-    """One record and its observers; small, so that it travels to a worker."""
+    """One record and its observers, its parts; small, so that it travels to a worker."""
 
     source: RecordSource
     variant: str
     seed: int
-    observers: Mapping[str, str | Factory]
+    observers: Mapping[str, str | Factory | Ended]
     """By name, as `registry.find` takes them in another process."""
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """s, of the windows that are judged one by one."""
 
+    def parts(self) -> Iterator[JudgedRun | None]:
+        """Make the record, and run every observer on it."""
+        recording = self.source.recording(self.variant, self.seed)
+        scene = scene_of(recording, self.source.steady_from(self.steady_from, recording), self.edges)
+        yield None
+        for name, factory in self.observers.items():
+            if isinstance(factory, Ended):
+                dof = len(PLANAR_STATES) if recording.on_a_plane else 6
+                yield failed_run(self.variant, name, scene, dof, factory.reason, {})
+            else:
+                yield sample_of(self.variant, name, scene, recording, run(factory, recording))
+
+    def rest(self, done: int) -> "Task":
+        """Return the task without its first observers."""
+        return replace(self, observers=dict([*self.observers.items()][done:]))
+
+    def ending(self, other: "Task", part: int, reason: str) -> "Task":
+        """Return the task without the observer that was ended as another's part, if the variant is the same."""
+        name = [*other.observers][part]
+        if name not in self.observers or (self.source, self.variant) != (other.source, other.variant):
+            return self
+        ended = Ended(f"with seed {other.seed}: {reason}")
+        return replace(self, observers={**self.observers, name: ended})
+
 
 def judge(task: Task) -> list[JudgedRun]:
     """Make the record and run every observer of a task on it."""
-    recording = task.source.recording(task.variant, task.seed)
-    steady_from = task.source.steady_from(task.steady_from, recording)
-    scene = scene_of(recording, steady_from, task.edges)
-    return [
-        sample_of(task.variant, name, scene, recording, run(factory, recording))
-        for name, factory in task.observers.items()
-    ]
+    return [run for run in task.parts() if run is not None]
+
+
+def judge_all(executor: Executor, tasks: Sequence[Task], on_done: Callable[[int], None]) -> list[list[JudgedRun]]:
+    """Judge the observers of all tasks; where the executor has limits, those that exceed one fail, the others do not.
+
+    An observer that was ended is not started again in the same variant.
+    """
+    if isinstance(executor, Local) and executor.limits is not None:
+        return watched(tasks, executor.jobs, executor.limits, on_done)
+    return executor.map(judge, tasks, on_done)
+
+
+def failed_run(
+    variant: str,
+    observer: str,
+    scene: RecordProperties,
+    dof: int,
+    reason: str,
+    costs: Mapping[str, Array],
+) -> JudgedRun:
+    """Return a run that failed, of which nothing but its costs is known."""
+    unknown = Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
+    return JudgedRun(variant, observer, scene, costs, dof, reason, unknown, np.zeros((len(LEVEL_BINS) - 1,) * 2))
 
 
 def sample_of(variant: str, observer: str, scene: RecordProperties, recording: Recording, result: Run) -> JudgedRun:
-    """Judge one run. Where it failed, everything but its costs is NaN."""
-    series = Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
-    measures = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
-    stanford = np.zeros((len(LEVEL_BINS) - 1,) * 2)
-    if not result.failure:
-        kept = kept_ticks(recording)
-        std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
-        measures |= _measures(scene, recording, result)
-        series = Series(result.position_error[kept], std, result.nees[kept])
-        error, level = horizontal_error(recording, result), result.protection_level[..., 0]
-        counted = result.judged & np.isfinite(level)
-        error, level = (np.clip(values[counted], LEVEL_BINS[0], LEVEL_BINS[-1]) for values in (error, level))
-        stanford = np.histogram2d(error, level, bins=[LEVEL_BINS, LEVEL_BINS])[0]
-    return JudgedRun(variant, observer, scene, measures, result.nees_dof, result.failure, series, stanford)
+    """Judge one run."""
+    costs = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
+    if result.failure:
+        return failed_run(variant, observer, scene, result.nees_dof, result.failure, costs)
+    kept = kept_ticks(recording)
+    std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
+    measures = costs | _measures(scene, recording, result)
+    series = Series(result.position_error[kept], std, result.nees[kept])
+    error, level = horizontal_error(recording, result), result.protection_level[..., 0]
+    counted = result.judged & np.isfinite(level)
+    error, level = (np.clip(values[counted], LEVEL_BINS[0], LEVEL_BINS[-1]) for values in (error, level))
+    stanford = np.histogram2d(error, level, bins=[LEVEL_BINS, LEVEL_BINS])[0]
+    return JudgedRun(variant, observer, scene, measures, result.nees_dof, "", series, stanford)
 
 
 def horizontal_error(recording: Recording, result: Run) -> Array:

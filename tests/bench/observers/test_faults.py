@@ -280,6 +280,35 @@ def test_bearings_are_swapped_within_their_frame() -> None:
         assert before == now
 
 
+def test_a_gyro_is_biased_from_its_step_on() -> None:
+    """The increments turn by the bias as well."""
+    after = changed_by("vehicle_2:gyro_step=0.3@1")
+    difference = after.angular_velocity - made().angular_velocity
+    late = made().t >= 1.0 - 1e-9
+    assert_allclose(difference[late, 1], np.broadcast_to([0.0, 0.0, 0.3], (late.sum(), 3)), atol=1e-12)
+    assert not difference[~late].any() and not np.delete(difference, 1, axis=1).any()
+    turned = made().rotation[late, 1].swapaxes(-1, -2) @ after.rotation[late, 1]
+    assert_allclose(np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), 0.3 * made().dt, atol=1e-12)
+    assert differing(after, made()) == {"angular_velocity", "rotation"}
+
+
+def test_the_scale_error_grows_to_its_value() -> None:
+    after, end = changed_by("scale_drift=0.1@1"), made().t[-1]
+    for name in ("velocity", "translation"):
+        expected = (
+            getattr(made(), name) * (1.0 + 0.1 * np.clip((made().t - 1.0) / (end - 1.0), 0.0, 1.0))[:, None, None]
+        )
+        assert_allclose(getattr(after, name), expected)
+    assert differing(after, made()) == {"velocity", "translation"}
+
+
+def test_a_share_of_the_bearings_is_random() -> None:
+    after = changed_by("random_bearings=0.1", 1)
+    wrong = (after.bearings != made().bearings).any(axis=-1)[made().visible]
+    assert abs(wrong.mean() - 0.1) < 4 * np.sqrt(0.09 / len(wrong))
+    assert_allclose(np.linalg.norm(after.bearings[made().visible], axis=-1), 1.0)
+
+
 def test_a_single_bearing_keeps_its_identity() -> None:
     alone = np.zeros_like(made().visible)
     alone[:, :, 0] = made().visible[:, :, 0]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.evidence import CHANGES, STEP_AT, bias_step
+from benchmarks.evidence import CHANGES, STEP_AT, changed
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
@@ -191,7 +191,7 @@ def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[flo
 def test_a_step_of_a_gyros_bias_is_located_in_the_gyro() -> None:
     """By 3 deg/s, within 1.5 s and by all vehicles, of which two see no more than two targets; nothing is excluded."""
     bias = np.radians(3.0)
-    found = watch(bias_step(bias)(busy(18.0, 0), np.random.default_rng(0)))
+    found = watch(changed(busy(18.0, 0), f"gyro_step={bias}@{STEP_AT}", 0))
     exclusions = found.source["exclusions"]
     after = np.searchsorted(found.recording.t, STEP_AT + 1.5)
     assert (exclusions[after, :, GYRO] > 0).all()
@@ -244,7 +244,7 @@ def test_a_gyro_s_bias_that_is_not_declared_costs_little() -> None:
     step, ratios = CHANGES["gyro bias steps to 1 deg/s at 12 s"], []
     for seed in range(2):  # as above, so that nothing is estimated twice
         without = usual(busy, 24.0, seed)
-        ratios.append(cost(watch(step(without.recording, np.random.default_rng(seed))), without, STEP_AT))
+        ratios.append(cost(watch(changed(without.recording, step, seed)), without, STEP_AT))
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)
 
 
@@ -262,7 +262,7 @@ def test_random_bearings_cost_little(make: Callable[..., Recording]) -> None:
     ratios = []
     for seed in range(3):
         without = usual(make, 16.0, seed)
-        found = watch(CHANGES["10 % of the bearings random"](without.recording, np.random.default_rng(seed)))
+        found = watch(changed(without.recording, CHANGES["10 % of the bearings random"], seed))
         assert not found.excluded()
         ratios.append(cost(found, without, 5.0))
     assert np.mean(ratios) < 1.5, np.round(ratios, 2)

@@ -1,0 +1,282 @@
+"""Frozen benchmarks, `coopenv bench v1`: scenes, seeds and limits that do not change, and the rows of the zoo.
+
+`v1.toml` says what is measured. `v1.json` is the result file of the zoo, whose hashes and figures of records are those
+that every other result is held against.
+"""
+
+import inspect
+import json
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from itertools import islice
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from rich.table import Table
+
+from coopenv.base.errors import CoopenvError, check_one_of, listed
+from coopenv.base.format import in_parentheses, jsonable, number
+from coopenv.base.installation import data_directory, is_reference, versions
+from coopenv.bench.executors import Local
+from coopenv.bench.observers.comparison import Comparison, Plan
+from coopenv.bench.observers.judge import judge_all
+from coopenv.bench.observers.rows import spread
+from coopenv.bench.observers.sources import SimulatedRecords, find_source
+from coopenv.bench.observers.tables import mean_of, short_name
+from coopenv.bench.watched import Limits
+from coopenv.estimation.metrics import DIVERGED_POSITION
+from coopenv.observers.registry import find, named
+from coopenv.runs.console import number_table
+
+FOLDER = Path(__file__).parent
+TOLERANCE = 1e-3
+"""Relative, of the figures of records: other processors round differently."""
+WIDTH = 100
+SHOWN = ("robust", "split_covariance_intersection")
+"""Observers of the zoo beside the new one in the table of scenes."""
+
+
+@dataclass(frozen=True)
+class FrozenScene:
+    """One scene of a benchmark."""
+
+    name: str
+    source: SimulatedRecords
+    variant: str
+    hash: str
+    """Of its scenario, policy, fault and seeds."""
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any], seeds: range) -> Self:
+        """Return the scene of an entry of the definition."""
+        fault, policy = about.get("fault", ""), about.get("policy")
+        source = find_source(about["environment"], about.get("set"), faults=[fault] * bool(fault), policy=policy)
+        assert isinstance(source, SimulatedRecords)
+        variant = source.added[0] if fault else source.fault("nominal")
+        world = (variant.scenario or source.scenario).model_dump(mode="json")
+        text = json.dumps([world, policy, fault, [*seeds]], sort_keys=True)
+        return cls(about["name"], source, variant.name, sha256(text.encode()).hexdigest())
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """A version of the benchmark."""
+
+    version: str
+
+    @cached_property
+    def _text(self) -> str:
+        return (FOLDER / f"{self.version}.toml").read_text(encoding="utf-8")
+
+    @cached_property
+    def definition(self) -> dict[str, Any]:
+        """What is measured."""
+        return tomllib.loads(self._text)
+
+    @cached_property
+    def zoo(self) -> dict[str, Any]:
+        """The result file that ships with coopenv; without rows before the version is frozen."""
+        path = FOLDER / f"{self.version}.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"rows": [], "scenes": {}}
+
+    @property
+    def seeds(self) -> range:
+        """Of every scene."""
+        first = self.definition["first"]
+        return range(first, first + self.definition["seeds"])
+
+    @property
+    def limits(self) -> Limits:
+        """Of every observer."""
+        return Limits(self.definition["seconds"], self.definition["memory"])
+
+    def scenes(self, names: Sequence[str] | None = None) -> list[FrozenScene]:
+        """Return scenes by name; None: all. Raises CoopenvError: there is none of a name."""
+        known = [about["name"] for about in self.definition["scenes"]]
+        for name in names or ():
+            check_one_of("unknown scene", name, known)
+        return [
+            FrozenScene.of(about, self.seeds)
+            for about in self.definition["scenes"]
+            if about["name"] in (names or known)
+        ]
+
+    def run(
+        self,
+        observers: Sequence[str],
+        names: Sequence[str] | None,
+        jobs: int,
+        limits: Limits,
+        command: str,
+        on_progress: Callable[[float], None],
+    ) -> dict[str, Any]:
+        """Return the content of the result file of observers."""
+        scenes, share = self.scenes(names), self.definition["steady_from"]
+        plans = [
+            Plan.of(observers, s.source, self.seeds, [s.variant], share * s.source.scenario.horizon, ()) for s in scenes
+        ]
+        tasks = [task for plan in plans for task in plan.tasks]
+        judged = iter(judge_all(Local(jobs, limits), tasks, lambda done: on_progress(done / len(tasks))))
+        boards = {
+            scene.name: plan.compared(islice(judged, len(self.seeds)))
+            for scene, plan in zip(scenes, plans, strict=True)
+        }
+        found = {scene.name: {"hash": scene.hash, "records": _figures(boards[scene.name])} for scene in scenes}
+        definition = sha256(self._text.encode()).hexdigest()
+        remarks = self._remarks(definition, found, limits)
+        rows = [row_of(name, board, observer) for name, board in boards.items() for observer in board.observers]
+        code = {name: _code_of(name) for name in observers}
+        return dict(
+            jsonable(
+                {
+                    "benchmark": self.version,
+                    "definition": definition,
+                    "comparable": not remarks,
+                    "remarks": remarks,
+                    "command": command,
+                    "versions": versions("coopenv", "numpy", "scipy", "warp-lang", "numba"),
+                    "code": {"package": package_hash(), **{named(name): h for name, h in code.items() if h}},
+                    "limits": {"seconds": limits.seconds, "memory": limits.mebibytes},
+                    "seeds": [*self.seeds],
+                    "scenes": found,
+                    "rows": rows,
+                    "totals": totals_of(rows),
+                }
+            )
+        )
+
+    def _remarks(self, definition: str, found: Mapping[str, Any], limits: Limits) -> list[str]:
+        """Return why a result is not comparable with that of the zoo; empty where it is."""
+        remarks, frozen = [], self.zoo["scenes"]
+        if definition != self.zoo.get("definition"):
+            remarks.append(f"{self.version}.toml is not that of the shipped rows")
+        if missing := len(self.definition["scenes"]) - len(found):
+            remarks.append(f"{missing} scenes were left out")
+        if limits != self.limits:
+            remarks.append(f"limits {limits.seconds:g} s and {limits.mebibytes:g} MiB")
+        for name, scene in found.items():
+            if scene["hash"] != frozen.get(name, {}).get("hash"):
+                remarks.append(f"scene {name}: its scenario is not the frozen one")
+            elif not np.allclose(scene["records"], frozen[name]["records"], rtol=TOLERANCE):
+                remarks.append(f"scene {name}: its records are not the frozen ones")
+        return remarks
+
+
+def _figures(board: Comparison) -> list[float]:
+    """Return the mean figures of the records of all seeds."""
+    figures = [sample.scene.figures for sample in board.samples if sample.observer == board.observers[0]]
+    return [float(f"{value:.7g}") for value in np.mean(figures, axis=0)]
+
+
+def row_of(scene: str, board: Comparison, observer: str) -> dict[str, Any]:
+    """Return the row of one observer in one scene; null where it failed."""
+    variant = next(iter(board.variants))
+    rows = board.rows_in(variant, observer)
+    rmse, position, anees = board.totals[variant, observer].rmse, spread(rows, "position_rmse_m"), spread(rows, "anees")
+    return {
+        "scene": scene,
+        "observer": observer,
+        "rmse_m": rmse.value,
+        "rmse_se_m": rmse.error,
+        "median_m": position.median,
+        "worst_m": position.worst,
+        "worst_se_m": position.error,
+        "worst_vehicle": position.vehicle,
+        "orientation_deg": mean_of(rows, "orientation_rmse_deg"),
+        "bound_m": mean_of(rows, "bound_ancestors_m"),
+        "anees_median": anees.median,
+        "anees_worst": anees.worst,
+        "bytes_per_s": mean_of(rows, "bytes_per_s"),
+        "us_per_update": mean_of(rows, "us_per_update"),
+        "failure": next((row.failure for row in rows if row.failure), ""),
+    }
+
+
+def totals_of(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of all scenes summed up, one per observer, the most accurate first.
+
+    Positions are geometric means over the scenes, in which an error above 5 m, or a failure, counts as 5 m.
+    """
+    totals = []
+    for observer in dict.fromkeys(row["observer"] for row in rows):
+        own = [row for row in rows if row["observer"] == observer]
+        error = {key: np.array([_limited(row[key]) for row in own]) for key in ("rmse_m", "median_m", "worst_m")}
+        spreads = [row["rmse_se_m"] / e for row, e in zip(own, error["rmse_m"], strict=True) if e < DIVERGED_POSITION]
+        whole = [row for row in own if not row["failure"]]
+        means = {key: math.exp(np.log(values).mean()) for key, values in error.items()}
+        totals.append(
+            {
+                "observer": observer,
+                **means,
+                "rmse_se_m": means["rmse_m"] * float(np.sqrt(np.square(spreads).sum())) / len(own),
+                "limited": int((error["rmse_m"] >= DIVERGED_POSITION).sum()),
+                "failed": len(own) - len(whole),
+                **{key: _median(whole, key) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")},
+            }
+        )
+    return sorted(totals, key=lambda total: total["rmse_m"])
+
+
+def _limited(value: float | None) -> float:
+    return DIVERGED_POSITION if value is None or not value < DIVERGED_POSITION else max(value, 1e-9)
+
+
+def _median(rows: Sequence[Mapping[str, Any]], key: str) -> float:
+    values = [row[key] for row in rows if row[key] is not None and math.isfinite(row[key])]
+    return float(np.median(values)) if values else math.nan
+
+
+def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str]:
+    """Yield the totals and the errors by scene, those of the zoo included, failures, and remarks."""
+    own = {row["observer"] for row in result["rows"]}
+    zoo = [row for row in benchmark.zoo["rows"] if row["scene"] in result["scenes"] and row["observer"] not in own]
+    numbers = ["RMSE\n[m]", "median\nvehicle", "worst\nvehicle", "above\n5 m", "failed", "\nANEES", "worst\nANEES"]
+    totals = number_table([f"bench {benchmark.version}"], [*numbers, "sent\nB/s", "\nus"])
+    for total in totals_of([*result["rows"], *zoo]):
+        figures = [number(total[key], 3) for key in ("median_m", "worst_m")]
+        counts = [str(total[key]) for key in ("limited", "failed")]
+        costs = [number(total[key], 2) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")]
+        mark = "* " if total["observer"] in own else ""
+        error = in_parentheses(total["rmse_m"], total["rmse_se_m"])
+        totals.add_row(mark + total["observer"], error, *figures, *counts, *costs)
+    yield totals
+    yield f"*: this run. Geometric means over {len(result['scenes'])} scenes; a failure or more than 5 m counts as 5 m."
+    yield ""
+    names = [*own, *(name for name in SHOWN if any(row["observer"] == name for row in zoo))]
+    cells = {(row["scene"], row["observer"]): row for row in [*zoo, *result["rows"]]}
+    scenes = number_table(["RMSE [m]"], ["bound", *map(short_name, names)])
+    for scene in result["scenes"]:
+        of = [cells[scene, name] for name in names]
+        errors = ["failed" if row["failure"] else in_parentheses(row["rmse_m"], row["rmse_se_m"]) for row in of]
+        scenes.add_row(scene, "-" if of[0]["bound_m"] is None else number(of[0]["bound_m"], 3), *errors)
+    yield scenes
+    yield from (
+        f"{row['observer']} ({row['scene']}): failed {row['failure']}" for row in result["rows"] if row["failure"]
+    )
+    if result["remarks"]:
+        yield f"Not comparable with the zoo's rows: {listed(result['remarks'], 4)}"
+
+
+def package_hash() -> str:
+    """Return a digest of the code and data of the package that is running."""
+    digest, package = sha256(), Path(__file__).resolve().parents[1]
+    for folder in (package, data_directory("envs"), data_directory("agents")):
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in (".py", ".toml", ".safetensors") and path.is_file():
+                digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _code_of(observer: str) -> str:
+    """Return the digest of the file of a user's observer; empty: it is of the package."""
+    if not is_reference(observer):
+        return ""
+    try:
+        return sha256(Path(inspect.getsourcefile(find(observer)) or "").read_bytes()).hexdigest()
+    except (OSError, TypeError) as error:
+        raise CoopenvError(f"observer '{observer}': its source cannot be read ({error})") from None

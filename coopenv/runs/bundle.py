@@ -1,0 +1,215 @@
+"""A run as one checked file, which `coopenv run` replays: scenario, seed, actions, versions, and a state near its end.
+
+A ZIP archive of `manifest.json`, `scenario.json`, `arrays.npz` and, of an observer in a file, its source to read. The
+manifest holds the digest of every other part. Code in the archive is never executed: a replay needs the observer's file
+in the current folder, and the same.
+"""
+
+import json
+import zipfile
+from collections import deque
+from dataclasses import dataclass
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError, DataError, error_text, listed, shown
+from coopenv.base.files import replacing_file
+from coopenv.base.format import json_text
+from coopenv.base.installation import is_reference, versions
+from coopenv.observers.registry import named, portable
+from coopenv.runs.rollouts import Rollout
+from coopenv.scenario.files import parse_scenario
+from coopenv.world.warp_internals import kernel_hashes
+
+RECORD_FILE = "record.zip"
+FORMAT = "coopenv-run 1"
+PARTS = {"manifest.json": 2**20, "scenario.json": 2**24, "arrays.npz": 2**28, "observer.py": 2**20}
+"""Names of the parts with the most bytes that each may unpack to."""
+FIGURE_TOLERANCE = 1e-6
+"""Relative, of figures that count as the same: other processors round differently."""
+
+
+class RunRecord:
+    """The actions of a run, and its state at the last two full seconds."""
+
+    def __init__(self, run: Rollout) -> None:
+        self.run = run
+        self._actions: list[np.ndarray] = []
+        self._states: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=2)
+        self.last = 0
+
+    def tick(self, tick: int) -> None:
+        """Keep what belongs to a tick that has been simulated."""
+        world = self.run.engine.world
+        self.last = tick
+        if tick % max(1, round(self.run.scenario.rates.camera)) == 0:
+            self._states.append((tick, world.get_state()))
+        if tick > 0:
+            self._keep_actions((tick - 1) // world.model.ticks_per_decision)
+
+    def _keep_actions(self, decision: int) -> None:
+        if decision == len(self._actions):
+            self._actions.append(self.run.engine.view("actions")[0].copy())
+
+    def save(self, path: Path, environment: str, error: str = "") -> None:
+        """Write the file of a run of an environment that has ended, with an error or without.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        run, world, model = self.run, self.run.engine.world, self.run.engine.world.model
+        if error and self._states:  # in the tick after the last
+            self._keep_actions(self.last // model.ticks_per_decision)
+        before, state = self._states[0] if self._states else (0, {})
+        empty = np.zeros((0, model.vehicles, model.action_size))
+        arrays = {"actions": np.array(self._actions or empty), **{f"state.{name}": a for name, a in state.items()}}
+        buffer = BytesIO()
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]
+        scenario = run.scenario.model_dump(mode="json", exclude_unset=True)
+        parts = {"scenario.json": json_text(scenario).encode(), "arrays.npz": buffer.getvalue()}
+        observer, place = run.scenario.observer.name, portable(run.scenario.observer.name)
+        if isinstance(place, str) and (file := Path(place.rpartition(":")[0])).suffix == ".py":
+            observer, parts["observer.py"] = f"{file.name}:{place.rpartition(':')[2]}", file.read_bytes()
+        manifest = {
+            "format": FORMAT,
+            "environment": environment,
+            "seed": run.seed,
+            "policy": run.policy_name,
+            "observer": observer,
+            "dtype": world.precision.name,
+            "device": world.device,
+            "ticks_planned": run.ticks_planned,
+            "versions": versions("coopenv", "numpy", "warp-lang"),
+            "kernels": kernel_hashes(),
+            "state_tick": before,
+            "end": {"tick": self.last, "error": error, "figures": figures_of(run)},
+            "parts": {name: sha256(content).hexdigest() for name, content in parts.items()},
+        }
+        with replacing_file(path) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in {"manifest.json": json_text(manifest).encode(), **parts}.items():
+                archive.writestr(name, content)
+
+
+def figures_of(run: Rollout) -> dict[str, list[float]]:
+    """Return the last errors of the vehicles, m and deg."""
+    view = run.engine.view
+    return {name: view(name)[0].astype(float).tolist() for name in ("position_error", "orientation_error")}
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A file of a run, checked."""
+
+    path: Path
+    manifest: dict[str, Any]
+    scenario: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+    @classmethod
+    def read(cls, path: Path) -> "Bundle":
+        """Read a file. Raises DataError: it is cut off, changed, or not of this format."""
+        try:
+            with zipfile.ZipFile(path) as archive:
+                members = {part.filename: part.file_size for part in archive.infolist()}
+                wrong = [name for name, size in members.items() if size > PARTS.get(name, -1)]
+                missing = [name for name in (*PARTS,)[:3] if name not in members]
+                if wrong or missing or len(members) < len(archive.infolist()):
+                    raise DataError(f"{path}: not a run: parts {listed(missing or wrong or [*members])}")
+                parts = {name: archive.read(name) for name in members}
+            manifest = json.loads(parts.pop("manifest.json"))
+            if manifest.get("format") != FORMAT:
+                raise DataError(f"{path}: format {shown(manifest.get('format'))}, expected '{FORMAT}'")
+            for name, content in parts.items():
+                if manifest["parts"].get(name) != sha256(content).hexdigest():
+                    raise DataError(f"{path}: {name}: not the part that was written, its digest differs")
+            with zipfile.ZipFile(BytesIO(parts["arrays.npz"])) as inner:
+                if any(part.compress_type != zipfile.ZIP_STORED for part in inner.infolist()):
+                    raise DataError(f"{path}: arrays.npz: is packed twice")
+            with np.load(BytesIO(parts["arrays.npz"]), allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            made = cls(path, manifest, json.loads(parts["scenario.json"]), arrays)
+            made._check()
+            return made
+        except CoopenvError:
+            raise
+        except Exception as error:  # any error of zipfile, NumPy and JSON for malformed files
+            raise DataError(
+                f"{path}: not a readable run ({getattr(error, 'strerror', None) or error_text(error)})"
+            ) from None
+
+    def _check(self) -> None:
+        about, end, actions = self.manifest, self.manifest["end"], self.arrays["actions"]
+        whole = (about["seed"], about["ticks_planned"], about["state_tick"], end["tick"])
+        texts = (about["environment"], about["observer"], about["dtype"], about["device"], end["error"])
+        valid = all(type(n) is int and 0 <= n < 2**63 for n in whole) and all(isinstance(t, str) for t in texts)
+        if not valid or about["state_tick"] > end["tick"]:
+            raise DataError(f"{self.path}: manifest.json: a number or text is not what it should be")
+        if actions.ndim != 3 or actions.dtype.kind != "f" or not (np.abs(actions) <= 1.0).all():
+            raise DataError(
+                f"{self.path}: arrays.npz: actions: expected numbers from -1 to 1, decisions x vehicles x parts"
+            )
+
+    @property
+    def title(self) -> str:
+        """What ran."""
+        about = self.manifest
+        return f"{about['environment']}, {about['observer']}, seed {about['seed']}, {about['end']['tick']} ticks"
+
+    def other_versions(self) -> list[str]:
+        """Return what the run was made with and what is different here."""
+        here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest["versions"]
+        return [f"{name} {made.get(name)}, here {number}" for name, number in here.items() if made.get(name) != number]
+
+    def replay(self) -> list[str]:
+        """Run it again and return what has come out otherwise, in words; empty: all is as it was.
+
+        Raises:
+            CoopenvError: the scenario is not valid, or its observer is not there.
+        """
+        about, end = self.manifest, self.manifest["end"]
+        scenario = parse_scenario(self._with_observer(), f"{self.path.name}: scenario.json")
+        rows = iter(self.arrays["actions"])
+        run = Rollout(scenario, about["seed"], None, about["dtype"], about["device"], lambda observations: next(rows))
+        expected = (len(scenario.vehicles), run.engine.world.model.action_size)
+        if self.arrays["actions"].shape[1:] != expected:
+            raise DataError(f"{self.path}: arrays.npz: actions: expected {expected} per decision")
+        run.ticks_planned, error, last, differing = about["ticks_planned"], "", 0, []
+        try:
+            for last in run.play():
+                if last == about["state_tick"]:
+                    differing += self._differing_state(run)
+        except CoopenvError as failure:
+            error = str(failure)
+        if kernels := [n for n, digest in kernel_hashes().items() if about["kernels"].get(n, digest) != digest]:
+            differing.append(f"kernels {listed(kernels)}")
+        if (last, error) != (end["tick"], end["error"]):
+            differing.append(f"after tick {last}: {error or 'no error'}")
+        for name, values in figures_of(run).items():
+            if not np.allclose(values, np.array(end["figures"][name], float), rtol=FIGURE_TOLERANCE, equal_nan=True):
+                differing.append(f"last {name.replace('_', ' ')} {', '.join(f'{value:.4g}' for value in values)}")
+        return differing
+
+    def _with_observer(self) -> dict[str, Any]:
+        """Return the scenario with its observer, which is loaded from its file if it is in one."""
+        reference = self.manifest["observer"]
+        if not is_reference(reference):
+            return self.scenario
+        file, digest = Path(reference.rpartition(":")[0]), self.manifest["parts"].get("observer.py")
+        if len(file.parts) != 1 or not file.is_file() or sha256(file.read_bytes()).hexdigest() != digest:
+            raise DataError(f"{self.path}: needs its observer.py here as {file.name}: unzip, read and rename it")
+        return {**self.scenario, "observer": {**self.scenario.get("observer", {}), "name": named(reference)}}
+
+    def _differing_state(self, run: Rollout) -> list[str]:
+        before = {name.removeprefix("state."): array for name, array in self.arrays.items() if name != "actions"}
+        now = run.engine.world.get_state()
+        # NaN stand for what is not there: bytes are compared
+        same = [
+            n for n in now if n in before and (now[n].dtype, now[n].tobytes()) == (before[n].dtype, before[n].tobytes())
+        ]
+        changed = sorted({*now, *before}.difference(same)) if before else []
+        time = self.manifest["state_tick"] / run.scenario.rates.camera
+        return [f"state at {time:g} s: {listed(changed, 6)}"] if changed else []

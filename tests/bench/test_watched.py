@@ -1,0 +1,122 @@
+"""Observers that loop, wait, allocate, raise or end their process are ended alone; the others' rows stay."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from coopenv.base.errors import CoopenvError
+from coopenv.bench.executors import find_executor
+from coopenv.cli import main
+
+PLUGINS = '''
+import ctypes, os, subprocess, sys, time
+import numpy as np
+from coopenv.observers import Estimate, Message
+
+class Fine:
+    def __init__(self, setup):
+        self.ticks = 0
+    def reset(self, pose, covariance):
+        self.estimate = Estimate(*pose, covariance)
+    def update(self, tick):
+        self.ticks += 1
+        if self.ticks == 5:
+            self.misbehave()
+        return self.estimate
+    def message(self):
+        return Message()
+    def misbehave(self):
+        pass
+
+class Loops(Fine):
+    def misbehave(self):
+        while True:
+            pass
+
+class Waits(Fine):
+    def misbehave(self):
+        time.sleep(1e6)
+
+class Allocates(Fine):
+    def misbehave(self):
+        kept = []
+        while True:
+            kept.append(np.ones(2**20))
+
+class Delegates(Fine):
+    """Allocates in a process of its own."""
+    def misbehave(self):
+        subprocess.run([sys.executable, "-c", "kept = bytearray(2**30)\\nwhile True: pass"])
+
+class Raises(Fine):
+    def misbehave(self):
+        raise ValueError("on purpose")
+
+class Interrupts(Fine):
+    def misbehave(self):
+        raise KeyboardInterrupt
+
+class Ends(Fine):
+    def misbehave(self):
+        os._exit(3)
+
+class Crashes(Fine):
+    def misbehave(self):
+        ctypes.string_at(0)
+'''
+REASONS = {
+    "Fine": "",
+    "Loops": "with seed 0: more than 4 s on one record (--seconds)",
+    "Waits": "with seed 0: more than 4 s on one record (--seconds)",
+    "Allocates": "with seed 0: more than 400 MiB of memory (--memory)",
+    "Delegates": "with seed 0: more than 400 MiB of memory (--memory)",
+    "Raises": "of vehicle_1 at 0.083 s: ValueError: on purpose (mine.py:",
+    "Interrupts": "with seed 0: KeyboardInterrupt",
+    "Ends": "with seed 0: its process ended with status 3",
+    "Crashes": "with seed 0: its process ended with SIGSEGV",
+}
+
+
+def board(folder: Path, monkeypatch: pytest.MonkeyPatch, names: list[str], *more: str) -> dict[str, str]:
+    """Return the failure of each observer, after a comparison with `dead_reckoning`, whose row must be whole."""
+    (folder / "mine.py").write_text(PLUGINS)
+    monkeypatch.chdir(folder)
+    observers = ",".join([*(f"mine.py:{name}" for name in names), "dead_reckoning"])
+    command = [
+        "bench",
+        "observers",
+        "overtaking",
+        "--observers",
+        observers,
+        "--set",
+        "horizon=0.5",
+        "--windows",
+        "none",
+    ]
+    assert main([*command, "--seconds", "4", "--memory", "400", "--out", "board", *more]) == 0
+    rows = json.loads((folder / "board" / "leaderboard.json").read_text())["rows"]
+    whole = [row for row in rows if row["observer"] in ("dead_reckoning", "Fine")]
+    assert len(whole) == 2 * (1 + ("Fine" in names)) and all(row["position_rmse_m"] > 0.0 for row in whole)
+    assert all(row["position_rmse_m"] is None for row in rows if row["failure"])
+    return {name: next(row["failure"] for row in rows if row["observer"] == name) for name in names}
+
+
+def test_what_misbehaves_is_ended_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["Loops", "Allocates", "Raises", "Ends", "Fine"]
+    for name, reason in board(tmp_path, monkeypatch, names, "--seeds", "2", "--jobs", "1").items():
+        assert reason.startswith(REASONS[name]) and bool(reason) == (name != "Fine")
+
+
+@pytest.mark.slow
+def test_what_waits_delegates_or_crashes_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["Waits", "Delegates", "Interrupts", "Crashes"]
+    for name, reason in board(tmp_path, monkeypatch, names, "--seeds", "1").items():
+        assert reason.startswith(REASONS[name])
+
+
+def test_a_cluster_has_limits_of_its_own() -> None:
+    with pytest.raises(CoopenvError, match="--memory 100: with --engine ray the cluster decides"):
+        find_executor("ray", mebibytes=100.0)

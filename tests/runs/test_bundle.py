@@ -1,0 +1,129 @@
+"""A run as one file: it is replayed, what comes out otherwise is named, and what is not such a file is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopenv.cli import main
+from tests.helpers.commands import refused
+
+OBSERVER = """
+from coopenv.observers import Estimate, Message
+
+class Late:
+    def __init__(self, setup):
+        pass
+    def reset(self, pose, covariance):
+        self.pose, self.covariance = pose, covariance
+    def update(self, tick):
+        if tick.time > 2.5:
+            VERDICT
+        return Estimate(*self.pose, self.covariance)
+    def message(self):
+        return Message()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*more: str) -> list[str]:
+    return ["run", "facade", "--no-figures", "--policy", "peek", "--out", "run", *more]
+
+
+def edited(file: Path, change: Callable[[dict[str, bytes]], None], sealed: bool = True) -> str:
+    """Write a file with changed parts, and with their digests if `sealed`; return its name."""
+    with zipfile.ZipFile(file) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    change(parts)
+    if sealed:
+        manifest = json.loads(parts["manifest.json"])
+        manifest["parts"] = {n: sha256(c).hexdigest() for n, c in parts.items() if n != "manifest.json"}
+        parts["manifest.json"] = json.dumps(manifest).encode()
+    with zipfile.ZipFile("edited.zip", "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return "edited.zip"
+
+
+def arrays(parts: dict[str, bytes], pack: Callable[..., None] = np.savez, **changed: np.ndarray) -> None:
+    buffer = io.BytesIO()
+    pack(buffer, **{**np.load(io.BytesIO(parts["arrays.npz"])), **changed})
+    parts["arrays.npz"] = buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("verdict", "reason"),
+    [("raise ValueError('late')", "ValueError: late"), ("self.pose[1][0] = float('nan')", "not a finite array")],
+)
+def test_a_failed_run_is_kept_and_fails_again(
+    folder: Path, capsys: pytest.CaptureFixture[str], verdict: str, reason: str
+) -> None:
+    (folder / "mine.py").write_text(OBSERVER.replace("VERDICT", verdict))
+    assert main(run("--observer", "mine.py:Late")) == 2
+    assert "coopenv bundle run_failed" in capsys.readouterr().err and not (folder / "run").exists()
+    assert main(["bundle", "run_failed", "--out", "report.zip"]) == 0
+    with zipfile.ZipFile("report.zip") as archive:
+        manifest = json.loads(archive.read("manifest.json"))
+        assert archive.read("observer.py") == (folder / "mine.py").read_bytes()
+    assert manifest["state_tick"] == 30 and manifest["end"]["tick"] == 75 and str(folder) not in str(manifest)
+    capsys.readouterr()
+    assert main(["run", "report.zip"]) == 0
+    assert "Late' of vehicle_1" in (printed := capsys.readouterr().out) and reason in printed
+    (folder / "mine.py").write_text(OBSERVER.replace("VERDICT", "pass"))
+    assert "report.zip: needs its observer.py here as mine.py" in refused("run", "report.zip")
+
+
+def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(run("--steps", "30")) == 0 and main(["bundle", "run"]) == 0
+    assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+    with zipfile.ZipFile("run.zip") as archive, np.load(io.BytesIO(archive.read("arrays.npz"))) as kept:
+        actions, position = kept["actions"], kept["state.position"]
+    assert len(actions) == 30 and np.abs(actions).max() > 0.1
+    other = edited(folder / "run.zip", lambda parts: arrays(parts, actions=-actions))
+    assert "another result than that of the file: state at 2 s:" in (line := refused("run", other))
+    assert "last position error" in line
+    other = edited(folder / "run.zip", lambda parts: arrays(parts, **{"state.position": position + 1e-3}))
+    assert refused("run", other).endswith("state at 2 s: position\n")
+
+
+def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
+    assert main(run("--steps", "4")) == 0 and main(["bundle", "run"]) == 0
+    whole = folder / "run.zip"
+
+    def manifest(key: str, value: object) -> Callable[[dict[str, bytes]], None]:
+        def change(parts: dict[str, bytes]) -> None:
+            parts["manifest.json"] = json.dumps({**json.loads(parts["manifest.json"]), key: value}).encode()
+
+        return change
+
+    (folder / "cut.zip").write_bytes(whole.read_bytes()[:2000])
+    assert "cut.zip: not a readable run" in refused("run", "cut.zip")
+    assert "unknown environment 'none.zip'" in refused("run", "none.zip")
+    assert "record.zip: not a readable run" in refused("bundle", ".")
+    cases: list[tuple[Callable[[dict[str, bytes]], None], bool, str]] = [
+        (lambda parts: arrays(parts, actions=np.zeros((4, 1, 2))), False, "arrays.npz: not the part that was written"),
+        (lambda parts: arrays(parts, pack=np.savez_compressed), True, "arrays.npz: is packed twice"),
+        (lambda parts: arrays(parts, actions=np.full((4, 1, 2), 7.0)), True, "actions: expected numbers from -1 to 1"),
+        (lambda parts: arrays(parts, actions=np.zeros((4, 9, 2))), True, "actions: expected (1, 2) per decision"),
+        (lambda parts: parts.update(more=b"x"), True, "not a run: parts more"),
+        (lambda parts: parts.pop("arrays.npz") and None, True, "not a run: parts arrays.npz"),
+        (manifest("format", "coopenv-run 2"), True, "format 'coopenv-run 2', expected 'coopenv-run 1'"),
+        (manifest("seed", -1), True, "manifest.json: a number or text is not what it should be"),
+        (manifest("end", 3), True, "not a readable run"),
+        (lambda parts: parts.update({"scenario.json": b'{"horizon": -1}'}), True, "scenario.json: "),
+        (lambda parts: parts.update({"manifest.json": bytes(2**20 + 1)}), False, "not a run: parts manifest.json"),
+    ]
+    for change, sealed, reason in cases:
+        assert reason in refused("run", edited(whole, change, sealed)), reason
