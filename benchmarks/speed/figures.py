@@ -92,7 +92,7 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
             _growth_curve(ax, g)
         _logarithmic(ax)
         low, high = ax.get_ylim()
-        ax.set_ylim(low, high * (high / low) ** 0.2)  # room for the legend
+        ax.set_ylim(low, high * (high / low) ** 0.35)  # room for the legend
         ax.legend(fontsize=style.SMALL, frameon=False, loc="upper left")
         held = "" if quantity == "worlds" else f" ({WORLDS} worlds)"
         style.tidy(ax, x_label=quantity, y_label=f"CPU time of one step{held} [ms]")
