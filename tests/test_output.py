@@ -158,8 +158,6 @@ def test_a_scenario_goes_where_a_name_goes() -> None:
     assert coopenv.load_scenario(scenario) is scenario
     with pytest.raises(coopenv.CoopenvError, match=r"^overrides \(--set\): noise\.enabeld: unknown key .*did you mean"):
         coopenv.parallel_env(scenario, overrides={"noise.enabeld": False})
-    with pytest.raises(coopenv.CoopenvError, match=r"^environment: expected a name or a path, got a Scenario"):
-        coopenv.compare(["riccati"], scenario, seeds=1)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--help"]])

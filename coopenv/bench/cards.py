@@ -22,7 +22,7 @@ from coopenv.base.installation import version
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, ScenarioLike, scenario_name
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
@@ -83,7 +83,7 @@ class Contest:
     @classmethod
     def of(
         cls,
-        environment: str,
+        environment: ScenarioLike,
         overrides: Mapping[str, Any],
         agents: Sequence[str],
         worlds: int,
@@ -94,7 +94,7 @@ class Contest:
         """Build the drivers.
 
         Args:
-            environment: name or TOML file.
+            environment: as for `load_scenario`.
             overrides: dotted keys of the scenario.
             agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
             worlds: how many.
@@ -105,9 +105,9 @@ class Contest:
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
         """
-        scenario, name = open_simulation(environment, overrides), Path(environment).stem
+        scenario, name = open_simulation(environment, overrides), scenario_name(environment)
         if not scenario.driven:
-            raise CoopenvError(f"{environment}: all motion here is prescribed, there is nothing to drive")
+            raise CoopenvError(f"{name}: all motion here is prescribed, there is nothing to drive")
         found = [find_agent(text) for text in agents or agents_for(name)]
         if not found:
             raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")

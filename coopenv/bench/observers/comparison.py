@@ -23,6 +23,7 @@ from coopenv.bench.observers.sources import ALL, RecordSource, find_source, vari
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
 from coopenv.runs.console import Progress
+from coopenv.scenario import ScenarioLike
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,7 +141,7 @@ def _written(text: str, path: str | Path | None) -> str:
 
 def compare(
     observers: Iterable[str | Factory] | None,
-    environment: str | Path,
+    environment: ScenarioLike,
     seeds: int | Iterable[int] = 5,
     *,
     variants: str | Sequence[str] | None = None,
@@ -159,7 +160,8 @@ def compare(
 
     Args:
         observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
-        environment: name, TOML file, recorded robots (`mrclam_1`, `mrclam_1_space`, ...), MCAP file or ROS bag.
+        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
+            `mrclam_1_space`, ...), MCAP file or ROS bag.
         seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
