@@ -12,9 +12,9 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation
-from coopenv.base.errors import CoopenvError, ScenarioError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import named
+from coopenv.observers.registry import with_observer
 from coopenv.scenario import ScenarioLike, scenario_name
 
 
@@ -160,14 +160,3 @@ def make_rows(
             f"of {name_or_path}"
         )
     return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)
-
-
-def with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory | None) -> dict[str, Any]:
-    """Return dotted keys and the observer's among them.
-
-    Raises:
-        ScenarioError: the overrides are no mapping.
-    """
-    if overrides is not None and not isinstance(overrides, Mapping):
-        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
-    return {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}

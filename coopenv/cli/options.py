@@ -207,6 +207,14 @@ Station = Annotated[
         show_default=False,
     ),
 ]
+ObserverName = Annotated[
+    str | None,
+    typer.Option(
+        help="Observer by name or as mine.py:Mine (default: that of the environment).",
+        show_default=False,
+        **OBSERVERS,
+    ),
+]
 LogObserver = Annotated[
     str | None,
     typer.Option(

@@ -34,6 +34,7 @@ class RunOptions(options.SourceOptions):
     device: Annotated[str, typer.Option(help="Device that computes: cpu, cuda, cuda:0, ...")] = "cpu"
     dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64"
     policy: options.PolicyName = "zero"
+    observer: options.ObserverName = None
     steady_from: options.SteadyFrom = None
     figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
     width: options.FigureWidth = None
@@ -64,7 +65,11 @@ def run(given: RunOptions) -> None:
         return
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
-    backend = given.open()
+    from coopenv.backends.sources import open_backend
+    from coopenv.observers.registry import with_observer
+
+    changes = with_observer(given.changes, given.observer)
+    backend = open_backend(given.environment, None, changes, given.data, given.variant, topics=given.topics)
     from coopenv.runs.command import REPLAY_FILE, execute, report
     from coopenv.runs.console import compile_notice
     from coopenv.runs.rollouts import Rollout
@@ -77,19 +82,19 @@ def run(given: RunOptions) -> None:
         rollout,
         folder,
         log,
-        given.changes,
+        changes,
         given.steady_from,
         None if given.no_figures else given.figures.value,
         given.video,
         width=given.width and given.width.value,
     )
     if given.as_json:
-        options.print_json(result)
+        options.print_json({**result.metrics, "files": result.files})
     else:
         report(rollout, result, folder, options.console())
     if given.open_out:
         page = folder / REPLAY_FILE
-        options.show_page(page) if page in result["files"] else options.show(folder)
+        options.show_page(page) if page in result.files else options.show(folder)
 
 
 BUNDLE = ".zip"
@@ -235,7 +240,7 @@ def check_log(out: Path, observer: str | None, scene: bool) -> None:
 
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
-ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "layout": "foxglove-layout"})
+ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "csv": "csv", "parquet": "parquet", "layout": "foxglove-layout"})
 Exported = Annotated[
     Path, typer.Argument(metavar="RUN|FILE.mcap", help="Folder that `coopenv run` has written, or log of `record`.")
 ]
@@ -256,7 +261,7 @@ def figures(
 
     results, folder = Results.read(run), out or run / "figures"
     with Progress(options.console(stderr=True), "drawing figures"):
-        paths = results.save_figures(folder, file_format.value, width and width.value, results.scenario())
+        paths = results.save_figures(folder, file_format.value, width and width.value)
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 
@@ -266,13 +271,16 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="tum: true and estimated trajectories of a run, which evo reads. foxglove-layout: how Foxglove and "
-            "Lichtblick arrange a log.",
+            help="tum: true and estimated trajectories of a run, which evo reads. csv, parquet: its table, a row per "
+            "tick and vehicle. foxglove-layout: how Foxglove and Lichtblick arrange a log.",
         ),
     ] = ExportFormat.tum,
     out: Annotated[
         Path | None,
-        typer.Option(help=f"Folder of the trajectories (default: RUN/tum), or file (default: {LAYOUT_FILE})."),
+        typer.Option(
+            help="Folder of the trajectories (default: RUN/tum), or file (default: RUN/trajectory.csv or .parquet; "
+            f"{LAYOUT_FILE})."
+        ),
     ] = None,
 ) -> None:
     """Write a run or a log in the formats of other programs."""
@@ -282,8 +290,14 @@ def export(
     from coopenv.runs.command import Results
     from coopenv.runs.recorder import write_tum
 
+    results = Results.read(source)
+    if file_format in (ExportFormat.csv, ExportFormat.parquet):
+        path = out or source / f"trajectory.{file_format.value}"
+        results.to_csv(path) if file_format is ExportFormat.csv else results.to_parquet(path)
+        options.console().print(f"{path}: {len(results.trajectory.t)} ticks", soft_wrap=True)
+        return
     folder = out or source / file_format.value
-    paths = write_tum(Results.read(source).trajectory, folder)
+    paths = write_tum(results.trajectory, folder)
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 

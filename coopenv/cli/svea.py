@@ -402,7 +402,7 @@ def run(given: SveaRunOptions) -> None:
         except NoTruthError:
             raise CoopenvError(truth_report(backend)) from None
     if given.as_json:
-        options.print_json(result)
+        options.print_json({**result.metrics, "files": result.files})
     else:
         report(rollout, result, folder, options.console())
         links_report(backend, options.console())

@@ -215,7 +215,7 @@ def evaluate(given: EvaluateOptions) -> None:
         options.print_json(evaluate.document(result, command))
         return
     printed = options.console(least=evaluate.WIDTH + max(0, max(map(len, result.results)) - SHORT_NAME))
-    evaluate.report(result, printed)
+    printed.print(result)
     if out is not None:
         printed.print(f"Files in {out}:", soft_wrap=True)
         printed.print(f"  {', '.join(sorted(path.name for path in out.iterdir()))}")
