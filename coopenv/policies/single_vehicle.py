@@ -91,7 +91,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         else:
             raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
         restart(self._others, np.ones(len(self.world.scenario.vehicles), dtype=bool))
-        return observations[self.vehicle], infos[self.vehicle]
+        return observations[self.vehicle], dict(infos[self.vehicle])
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive the vehicle for one decision period.
@@ -108,7 +108,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         v = self.vehicle
         if v not in rewards:
             raise CoopenvError(f"step() called although {v} has ended; call reset()")
-        return observations[v], rewards[v], terminated[v], truncated[v], infos[v]
+        return observations[v], rewards[v], terminated[v], truncated[v], dict(infos[v])
 
     def render(self) -> Any:
         """Draw the top view."""
