@@ -25,9 +25,9 @@ def facts_html(title: str, facts: Mapping[str, object]) -> str:
 
 def terminal_html(printable: Any) -> str:
     """Return what rich prints of an object, its alignment kept."""
-    from rich.console import Console
+    from coopenv.base.terminal import Terminal
 
-    console = Console(file=StringIO(), record=True, width=WIDTH, markup=False, highlight=False)
+    console = Terminal(file=StringIO(), record=True, width=WIDTH)
     console.print(printable)
     return console.export_html(inline_styles=True, code_format='<pre style="line-height: 1.2">{code}</pre>')
 

@@ -10,6 +10,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import version, versions
+from coopenv.base.terminal import Terminal
 from coopenv.bench.cards import Contest, Evaluation
 from coopenv.evaluation import METRICS
 from coopenv.runs.command import REPLAY_FILE
@@ -20,8 +21,6 @@ from coopenv.viz import FORMATS
 JSON_FILE = "evaluation.json"
 FIGURES = ("error_along_the_way", "time_against_error", "looking")
 FILMS = ("video.mp4", "video.gif")
-WIDTH = 100
-"""Width of the tables without a terminal, characters."""
 
 
 def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
@@ -124,6 +123,5 @@ def evaluate(
     """
     if isinstance(agents, str):
         raise CoopenvError(f"agents: expected a list such as ['{agents}']")
-    log = Console(stderr=True)
     contest = Contest.of(environment, overrides or {}, [*agents], worlds, seed_block, ideal)
-    return run(contest, "", log)
+    return run(contest, "", Terminal(stderr=True))

@@ -198,7 +198,7 @@ def record(given: RecordOptions) -> None:
 
     if replayed:
         if given.changes:
-            raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
+            raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
         recording = open_recording(environment, given.data, given.variant)
     else:
         for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
@@ -314,10 +314,6 @@ def _export_layout(log: Path, out: Path) -> None:
     options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)
 
 
-WIDTH = 116
-"""Columns of a table that is not for a terminal."""
-
-
 def import_(
     bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
@@ -340,7 +336,9 @@ def import_(
         raise CoopenvError("--propose: writes a map, --map names one; give one of them")
     if topics is None:
         if out is not None or overrides:
-            raise CoopenvError(f"{'--out' if out else '--set'}: needs the map of the bags' topics, --map topics.toml")
+            raise CoopenvError(
+                f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
+            )
         from coopenv.base.files import check_new, replace_text
         from coopenv.cars.bags.doctor import examined, proposed
         from coopenv.cars.bags.files import BagFile
@@ -402,8 +400,6 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
         *(["leads\n[ms]"] if read else []),
     ]
     table = number_table(names, numbers)
-    for column in table.columns[: len(names)]:
-        column.no_wrap, column.overflow = False, "fold"
     for row in rows:
         about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
         offset = None if row.offset is None else 1e3 * row.offset
@@ -412,4 +408,4 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
         shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
         lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
         table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
-    options.console(least=WIDTH).print(table)
+    options.console().print(table)

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from io import StringIO
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.notebook import WIDTH, one_line, picture_html, terminal_html
+from coopenv.base.terminal import Terminal, text_of
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.contract import Factory
@@ -174,7 +174,7 @@ def run(
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
-    changes, log = with_observer(overrides, observer), Console(stderr=True)
+    changes, log = with_observer(overrides, observer), Terminal(stderr=True)
     backend = open_backend(environment, None, changes, data, variant, topics=topics)
     with compile_notice(log):
         made = Rollout(backend.scenario, checked_seed(seed), steps, dtype, device, policy, backend)
@@ -274,9 +274,7 @@ class Results(Tabular):
         return terminal_html(self) + picture_html(self.figure("trajectories_2d"))
 
     def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, markup=False, highlight=False).print(self)
-        return text.getvalue()
+        return text_of(self, WIDTH)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         vehicles, end = self.metrics["vehicles"], float(self.trajectory.t[-1])

@@ -21,7 +21,7 @@ from coopenv.scenario.schema import Scenario
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""
 
-OVERRIDES = "overrides (--set)"
+OVERRIDES = "overrides"
 """Where a field stands that an override has made wrong."""
 
 

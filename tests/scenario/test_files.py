@@ -223,7 +223,7 @@ def test_a_dict_is_what_its_file_is(file: Path) -> None:
     [
         ({}, {}, "^scenario: title: Field required"),
         ({"horizn": 2.0}, {}, r"^scenario: horizn: unknown key \(did you mean 'horizon'"),
-        (tomllib.loads(MINIMAL), {"horizn": 2.0}, r"^overrides \(--set\): horizn: unknown key"),
+        (tomllib.loads(MINIMAL), {"horizn": 2.0}, r"^overrides: horizn: unknown key"),
         (3, {}, "^environment: expected a name, a path, a dict of its keys or a Scenario, got int"),
         (None, {}, "got NoneType"),
     ],
@@ -264,7 +264,7 @@ def test_wrong_overrides(file: Path, key: str, words: str) -> None:
 def test_override_values_are_checked(file: Path) -> None:
     with pytest.raises(
         ScenarioError,
-        match=r"overrides \(--set\): rates.camera: Input should be greater than or equal to 0.001, got -5",
+        match=r"overrides: rates.camera: Input should be greater than or equal to 0.001, got -5",
     ):
         load_scenario(file, {"rates.camera": -5})
     with pytest.raises(ScenarioError, match="whole multiple of the decision rate"):

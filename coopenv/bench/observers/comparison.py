@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from io import StringIO
 from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from rich.table import Table
 from coopenv.base.columns import Columns, Tabular, written
 from coopenv.base.errors import CoopenvError, check_one_of, checked_seed
 from coopenv.base.notebook import one_line, picture_html, terminal_html
+from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
@@ -137,9 +137,7 @@ class Comparison(Leaderboard, Tabular):
         return terminal_html(self) + (picture_html(self.figure()) if drawn else "")
 
     def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=tables.WIDTH, markup=False, highlight=False).print(self)
-        return text.getvalue()
+        return text_of(self, tables.WIDTH)
 
     def _checked(self, variant: str | None) -> str:
         if variant is None:
@@ -191,7 +189,7 @@ def compare(
     source = find_source(environment, overrides, data, topics, faults, policy)
     plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
-    with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
+    with Progress(Terminal(stderr=True), plan.work, total=1.0) as progress:
         return plan.run(Local(jobs), progress.update)
 
 

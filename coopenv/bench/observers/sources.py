@@ -253,7 +253,7 @@ def find_source(
         ),
         f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not robots,
         f"--map {topics}: is for ROS bags, {text} is none": topics and not bag,
-        f"--set {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
+        f"--override {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
             overrides and not bag
         ),
         f"no such log file: {text}": not (bag or robots or path.is_file()),

@@ -102,7 +102,6 @@ def mean_of(rows: Sequence[Row], column: str) -> float:
 
 
 WIDTH = 80
-WIDE = 100  # without a terminal: vehicles have columns of their own
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 
 
