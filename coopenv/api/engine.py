@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import warp as wp
@@ -319,6 +319,7 @@ class Saved:
     engine: Engine
     scenario: Scenario
     metadata: dict[str, Any]
+    close: Any
     _arguments: dict[str, Any]
     """Those that build an equal environment."""
 
@@ -326,6 +327,12 @@ class Saved:
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of the flat observation."""
         return self.engine.layout.copy()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
     def __repr__(self) -> str:
         return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)

@@ -19,7 +19,7 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
-from coopenv.cli.bench import bench
+from coopenv.cli.bench import bench, bench_observers
 from coopenv.cli.calibrate import calibrate, identify
 from coopenv.cli.run import bundle, export, figures, import_, record, run
 from coopenv.cli.svea import svea
@@ -126,6 +126,7 @@ app.command(rich_help_panel=RUN)(export)
 app.command(rich_help_panel=RUN)(figures)
 app.command(rich_help_panel=RUN)(bundle)
 app.add_typer(bench, name="bench", rich_help_panel=COMPARE)
+app.command("compare", hidden=True)(bench_observers)  # its name in Python
 app.command(rich_help_panel=COMPARE)(evaluate)
 app.command(rich_help_panel=TRAIN)(train)
 app.command(rich_help_panel=TRAIN)(dataset)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import typer
 from typer.core import TyperGroup
 
-from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning
+from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning, check_one_of
 from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
@@ -244,12 +244,19 @@ Options = TypeVar("Options")
 class Grouped(TyperGroup):
     """Lists its commands by the group that each names as its `rich_help_panel`, with whole sentences."""
 
+    def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
+        """Return the command that the arguments begin with."""
+        if args[0] not in self.commands:
+            check_one_of("no such command:", args[0], self.commands)
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
         """Write the list."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for name, one in self.commands.items():
             panel = getattr(one, "rich_help_panel", None) or "Commands"
-            groups.setdefault(panel, []).append((name, one.get_short_help_str(formatter.width * 10)))
+            if not one.hidden:
+                groups.setdefault(panel, []).append((name, one.get_short_help_str(formatter.width * 10)))
         for panel, rows in groups.items():
             with formatter.section(panel):
                 formatter.write_dl(rows, col_max=12)

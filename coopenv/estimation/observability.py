@@ -37,7 +37,7 @@ from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 import numpy as np
 
 from coopenv.base.columns import Columns, Tabular
-from coopenv.base.errors import DataError
+from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
 from coopenv.base.notebook import facts_html, one_line
@@ -117,6 +117,12 @@ class Trajectory(RecordedGeometry, Tabular):
         for names, array in parts.items():
             values |= dict(zip(names.split(), array.reshape(len(self.t) * N, -1).T, strict=True))
         return Columns(values, ("t_s", "vehicle"))
+
+    def __getitem__(self, vehicle: str) -> Self:
+        """Return the record of one vehicle. Raises CoopenvError: there is none of that name."""
+        names = self.vehicles.tolist()
+        check_one_of("unknown vehicle", vehicle, names)
+        return self.of_vehicles([names.index(vehicle)])
 
     def __repr__(self) -> str:
         facts = {"ticks": len(self.t), "vehicles": len(self.vehicles), "targets": len(self.targets)}
