@@ -1,4 +1,4 @@
-"""What users of PettingZoo, Gymnasium, pandas and notebooks try without a page: it works, or one line says what does."""
+"""What users of PettingZoo, Gymnasium and notebooks try without a page: it works, or one line says what does."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_wrappers_and_registries() -> None:
     view.reset(seed=2)
     assert view.render().shape[-1] == 3
     assert [view.step(view.action_space.sample())[3] for _ in range(2)] == [False, True]
-    assert "episode" in view.step.__self__.__dict__ or view.return_queue
+    assert len(view.return_queue) == 1
 
 
 def test_infos_have_the_entries_that_their_type_names() -> None:
