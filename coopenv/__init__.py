@@ -30,10 +30,11 @@ if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
     from coopenv.api.vector_env import CooperativeVectorEnv
+    from coopenv.bench.cards import Evaluation
     from coopenv.bench.evaluate import evaluate
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.estimation.poses import position_covariance
-    from coopenv.runs.command import run
+    from coopenv.runs.command import Results, run
     from coopenv.scenario import Scenario, load_scenario
     from coopenv.scenario.own_terms import register_observation, register_reward, register_termination
 
@@ -56,7 +57,9 @@ __all__ = [
     "CooperativeVectorEnv",
     "DataError",
     "DeviceError",
+    "Evaluation",
     "OutputError",
+    "Results",
     "Scenario",
     "ScenarioError",
     "UnknownEnvironmentError",
