@@ -181,7 +181,7 @@ def test_one_observer_of_a_comparison(comparison: coopenv.Comparison) -> None:
     assert "riccati" in str(alone) and "Mine" not in str(alone)
     assert repr(alone).startswith("Comparison('overtaking', observers=('riccati',), variants=('nominal', 'v2x_loss')")
     assert "<pre" in alone._repr_html_() and "data:image/png;base64" in alone._repr_html_()
-    with pytest.raises(CoopenvError, match=r"unknown observer 'ricati' \(did you mean 'riccati'\?\); known: riccati"):
+    with pytest.raises(CoopenvError, match=r"unknown observer 'ricati' \(did you mean 'riccati'\?\); known: Raises"):
         comparison["ricati"]
 
 
