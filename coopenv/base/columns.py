@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopenv.base.files import replace_text, replacing_file
-from coopenv.base.installation import needing
+from coopenv.base.installation import install_command, needing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
     from polars import DataFrame as PolarsFrame
     from xarray import Dataset
 
+INSTALL = install_command("tables")
 UNITS = {
     "gramian_min_eigenvalue": "mixed",
     "bytes_per_s": "byte/s",
@@ -83,7 +84,7 @@ class Tabular(ABC):
 
     def to_pandas(self, **options: Any) -> DataFrame:
         """Return the table for pandas. Raises CoopenvError: it is not installed."""
-        with needing("a table of pandas needs pandas: pip install '.[tables]'"):
+        with needing(f"a table of pandas needs pandas: {INSTALL}"):
             from pandas import DataFrame
         table = self.columns(**options)
         frame = DataFrame(dict(table.values))
@@ -92,13 +93,13 @@ class Tabular(ABC):
 
     def to_polars(self, **options: Any) -> PolarsFrame:
         """Return the table for polars. Raises CoopenvError: it is not installed."""
-        with needing("a table of polars needs polars: pip install '.[tables]'"):
+        with needing(f"a table of polars needs polars: {INSTALL}"):
             import polars
         return polars.DataFrame(dict(self.columns(**options).values))
 
     def to_xarray(self, **options: Any) -> Dataset:
         """Return the table over its keys as axes, for xarray. Raises CoopenvError: it is not installed."""
-        with needing("a dataset of xarray needs xarray and pandas: pip install '.[tables]'"):
+        with needing(f"a dataset of xarray needs xarray and pandas: {INSTALL}"):
             import xarray  # noqa: F401 (pandas imports it late)
         table = self.columns(**options)
         frame = self.to_pandas(**options)
@@ -123,7 +124,7 @@ class Tabular(ABC):
             CoopenvError: pandas or pyarrow is not installed, or the file cannot be written.
         """
         frame = self.to_pandas(**options)
-        with needing("Parquet needs pyarrow: pip install '.[tables]'"), replacing_file(Path(path)) as new:
+        with needing(f"Parquet needs pyarrow: {INSTALL}"), replacing_file(Path(path)) as new:
             frame.to_parquet(new, engine="pyarrow")
 
 

@@ -211,7 +211,7 @@ def bench_v1(
     if as_json:
         options.print_json(result)
         return
-    printed = options.console(least=frozen.WIDTH)
+    printed = options.console()
     for part in frozen.report(benchmark, result):
         printed.print(part, soft_wrap=isinstance(part, str), markup=False)
     printed.print(f"{out}: the result file", soft_wrap=True)

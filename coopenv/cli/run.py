@@ -24,10 +24,6 @@ if TYPE_CHECKING:
 class RunOptions(options.SourceOptions):
     """Options of `coopenv run`."""
 
-    observer: Annotated[
-        str | None,
-        typer.Option(help="In place of the scenario's own: a name, or mine.py:Mine.", **options.OBSERVERS),
-    ] = None
     seed: options.Seed = 0
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None
@@ -49,9 +45,9 @@ class RunOptions(options.SourceOptions):
     @property
     def changes(self) -> dict[str, Any]:
         """The overrides of the scenario, its observer included."""
-        from coopenv.observers.registry import named
+        from coopenv.observers.registry import with_observer
 
-        return super().changes | ({} if self.observer is None else {"observer.name": named(self.observer)})
+        return with_observer(super().changes, self.observer)
 
 
 @options.command
@@ -65,11 +61,7 @@ def run(given: RunOptions) -> None:
         return
     name = Path(given.environment).stem
     refuse_for_recordings(given.environment, seed=given.seed, policy=given.policy)
-    from coopenv.backends.sources import open_backend
-    from coopenv.observers.registry import with_observer
-
-    changes = with_observer(given.changes, given.observer)
-    backend = open_backend(given.environment, None, changes, given.data, given.variant, topics=given.topics)
+    backend = given.open()
     from coopenv.runs.command import REPLAY_FILE, execute, report
     from coopenv.runs.console import compile_notice
     from coopenv.runs.rollouts import Rollout
@@ -82,7 +74,7 @@ def run(given: RunOptions) -> None:
         rollout,
         folder,
         log,
-        changes,
+        given.changes,
         given.steady_from,
         None if given.no_figures else given.figures.value,
         given.video,
