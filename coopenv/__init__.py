@@ -30,7 +30,11 @@ if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
     from coopenv.api.vector_env import CooperativeVectorEnv
+    from coopenv.bench.cards import Evaluation
+    from coopenv.bench.evaluate import evaluate
     from coopenv.bench.observers.comparison import Comparison, compare
+    from coopenv.estimation.poses import position_covariance
+    from coopenv.runs.command import Results, run
     from coopenv.scenario import Scenario, load_scenario
     from coopenv.scenario.own_terms import register_observation, register_reward, register_termination
 
@@ -53,20 +57,25 @@ __all__ = [
     "CooperativeVectorEnv",
     "DataError",
     "DeviceError",
+    "Evaluation",
     "OutputError",
+    "Results",
     "Scenario",
     "ScenarioError",
     "UnknownEnvironmentError",
     "__version__",
     "compare",
+    "evaluate",
     "evaluation_seed",
     "list_envs",
     "load_scenario",
     "make_vec",
     "parallel_env",
+    "position_covariance",
     "register_observation",
     "register_reward",
     "register_termination",
+    "run",
 ]
 
 # The command makes environments itself; until it runs, no signal is caught, so that it is to begin at once.

@@ -63,7 +63,7 @@ def _commands(name: str, command: Any) -> Iterator[str]:
     for part in sorted(getattr(command, "commands", {})):
         yield from _commands(f"{name} {part}", command.commands[part])
     if not hasattr(command, "commands"):
-        words = [max(option.opts, key=len) for option in command.params if option.opts]
+        words = [word for option in command.params for word in option.opts if word.startswith("--") or len(word) > 2]
         yield " ".join([name, *sorted(words)])
 
 

@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
 RUN = {"README.md", "agents.md", "backends.md", "data.md", "draws.md", "highway.md"}
-RUN |= {"replay.md", "terms.md", "trainers.md", "view.md"}
+RUN |= {"outputs.md", "replay.md", "terms.md", "trainers.md", "view.md"}
 """Pages whose programs are run below."""
 
 
@@ -75,6 +75,13 @@ def test_the_page_on_backends(capsys: pytest.CaptureFixture[str]) -> None:
     assert "missing=24" in capsys.readouterr().out
     estimates = [info["estimate"]["position"] for info in program["infos"].values()]
     assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
+
+
+@pytest.mark.slow
+def test_the_page_on_outputs() -> None:
+    (program,) = run(DOCS / "outputs.md")
+    assert len(program["run"].to_pandas()) == program["run"].trajectory.position_error.size
+    assert program["run"].metrics["policy"] == "peek" and list(program["found"]) == ["riccati", "robust"]
 
 
 def test_the_entries_of_a_step_are_listed_in_the_api() -> None:

@@ -36,7 +36,6 @@ def modules_after(statement: str) -> set[str]:
         "import coopenv",
         "import coopenv.base.errors",
         "from coopenv.cli import main; main(['--help'])",
-        "from coopenv.cli import main; main(['run', '--help'])",
         "from coopenv.cli import main; main(['--version'])",
         "from coopenv.cli import main; main(['frobnicate'])",
     ],
@@ -47,6 +46,30 @@ def test_start_loads_no_simulation(statement: str) -> None:
     assert not HEAVY & {name.partition(".")[0] for name in loaded}
     own = {name.removeprefix("coopenv.") for name in loaded if name.startswith("coopenv.")}
     assert own <= LIGHT
+
+
+HELP = """
+sys.orig_argv[1:3] = ['-m', 'coopenv']  # so that nothing is registered with Gymnasium
+import contextlib, io
+from coopenv.cli import app, main
+from typer.main import get_command
+
+def help_of(command, path):
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main([*path, "--help"]) == 0
+    assert "Usage:" in printed.getvalue(), path
+    below = getattr(command, "commands", {})
+    assert not below or "..." not in printed.getvalue().partition("Options:")[2], path  # no sentence is cut
+    return 1 + sum(help_of(one, [*path, name]) for name, one in below.items())
+
+assert help_of(get_command(app), []) > 30
+"""
+
+
+def test_the_help_of_every_command_loads_nothing_heavy_and_is_whole() -> None:
+    loaded = modules_after(HELP)
+    assert not (HEAVY | {"numpy", "rich"}) & {name.partition(".")[0] for name in loaded}
+    assert {name.removeprefix("coopenv.") for name in loaded if name.startswith("coopenv.")} <= LIGHT
 
 
 @pytest.mark.parametrize(

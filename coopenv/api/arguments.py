@@ -1,7 +1,7 @@
 """What users give and read on the host: options of a reset, the results of a step, and a reward in Python."""
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -104,6 +104,54 @@ QUALITIES = (
     "protection_level",
 )
 """Fields of an engine with a number for every vehicle, or two, which infos hold, too."""
+
+
+class EstimateInfo(TypedDict):
+    """The vehicle's estimate of its pose; `coopenv.position_covariance(**estimate)` is its spread in the map frame."""
+
+    position: np.ndarray
+    """(3,) m, map frame."""
+    rotation: np.ndarray
+    """(3, 3), body to map."""
+    covariance: np.ndarray
+    """(6, 6), the observer's P over (2 lambda, p), p in the body frame: rad^2, rad m, m^2."""
+
+
+class Info(TypedDict):
+    """Entries of `infos[agent]`, always the same ones."""
+
+    truth: dict[str, np.ndarray]
+    """As of `Step`; with lasting errors of sensors, and faults, these too."""
+    estimate: EstimateInfo
+    visible: tuple[str, ...]
+    """Names of the targets measured in the last frame."""
+    position_error: float
+    """m, norm of the difference in the map frame."""
+    orientation_error: float
+    """deg, geodesic angle."""
+    nees: float
+    """Normalised error squared in the coordinates of P; 6 in the mean for a consistent estimate."""
+    log_determinant: float
+    """Of P."""
+    position_std: float
+    """m, root of the trace of the position's covariance in the map frame."""
+    gramian_min_eigenvalue: float
+    """Of the observability Gramian, mixed units."""
+    protection_level: list[float]
+    """Bounds that the observer states, of the horizontal error, m, and the angle, rad; infinite: unknown, or none."""
+    reward_terms: dict[str, float]
+    time: float
+    """s since the reset."""
+    outcome: str
+    """`under way`, `arrived`, `collided`, `off route`, or a condition of the scenario's own."""
+    late_ticks: int
+    """Camera ticks of this step that came late."""
+    missing_ticks: int
+    """Camera ticks of this step in which nothing came from the vehicle, which has gone on with its last odometry."""
+    car: NotRequired[dict[str, Any]]
+    """Of real cars: link and gate."""
+
+
 FLAGS = ("alive", "terminated", "truncated", "ended")
 FIELDS = ("observation", "action", "reward", *FLAGS, *QUALITIES, "targets_in_view")
 """Fields of an engine under the same name."""

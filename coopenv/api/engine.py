@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import warp as wp
@@ -23,6 +23,7 @@ from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
 from coopenv.base.errors import CoopenvError, check_memory, error_text, training_seed, world_keys
 from coopenv.base.installation import load_reference
+from coopenv.base.notebook import facts_html, one_line, picture_html
 from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup
@@ -318,6 +319,7 @@ class Saved:
     engine: Engine
     scenario: Scenario
     metadata: dict[str, Any]
+    close: Any
     _arguments: dict[str, Any]
     """Those that build an equal environment."""
 
@@ -325,6 +327,25 @@ class Saved:
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of the flat observation."""
         return self.engine.layout.copy()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)
+
+    def _repr_html_(self) -> str:
+        """Return the main figures and, once an episode has begun, the top view of the first world."""
+        picture = picture_html(self.engine.picture()) if self.engine.begun else ""
+        return facts_html(self.scenario.title, self._facts) + picture
+
+    @property
+    def _facts(self) -> dict[str, object]:
+        worlds = {} if self.engine.world.worlds == 1 else {"worlds": self.engine.world.worlds}
+        return {**worlds, **self.scenario.facts}
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""

@@ -198,12 +198,12 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _localisation(self, i: int) -> dict[str, Any]:
         view, estimated = self._engine.view, self._estimated(i)
-        state = (view(name)[0, i] for name in ("estimate_rotation", "estimate_position", "covariance"))
+        R_hat, p_hat, P = (view(name)[0, i] for name in ("estimate_rotation", "estimate_position", "covariance"))
         mirror = np.diag([1.0, -1.0])
         return {
             "position": estimated.xy,
             "heading": estimated.heading,
-            "position_covariance": mirror @ position_covariance(*state)[:2, :2] @ mirror,
+            "position_covariance": mirror @ position_covariance(R_hat, R_hat @ p_hat, P)[:2, :2] @ mirror,
             "position_error": float(view("position_error")[0, i]),
             "orientation_error": float(view("orientation_error")[0, i]),
             "visible": tuple(

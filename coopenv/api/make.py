@@ -11,15 +11,15 @@ from coopenv.api.arguments import RewardFunction
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
-from coopenv.backends.sources import open_backend, open_simulation, simulation_of
-from coopenv.base.errors import CoopenvError, ScenarioError
+from coopenv.backends.sources import open_backend, open_simulation
+from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import named
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.observers.registry import with_observer
+from coopenv.scenario import ScenarioLike, scenario_name
 
 
 def parallel_env(
-    name_or_path: str | Path | Scenario,
+    name_or_path: ScenarioLike,
     *,
     render_mode: str | None = None,
     observer: str | Factory | None = None,
@@ -43,8 +43,8 @@ def parallel_env(
 
     Args:
         name_or_path: for example "busy_intersection"; "mrclam_6", "drive.mcap" or "drive.bag" replay what was
-            recorded. A scenario of `coopenv.load_scenario` is simulated. Where `backend` is an object, any name for
-            the environment.
+            recorded. Whatever else `coopenv.load_scenario` takes is simulated: a TOML file, a dict, a `Scenario`. Where
+            `backend` is an object, any name for the environment.
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or an import path
             (`mine.py:Mine`, `package.module:Mine`); None: that of the scenario.
@@ -69,20 +69,17 @@ def parallel_env(
         ScenarioError: the file or an override is not valid.
         CoopenvError: another argument is not valid.
     """
-    changes = _with_observer(overrides, observer)
-    if isinstance(name_or_path, Scenario) and backend in (None, name_or_path.backend):
-        backend, changes = simulation_of(load_scenario(name_or_path, changes)), {}
     return CooperativeLocalisationEnv(
         open_backend(
-            _name_of(name_or_path),
+            name_or_path,
             backend,
-            changes,
+            with_observer(overrides, observer),
             data,
             variant,
             {"deployment": deployment, "car": car, "record": record, "connect": connect},
             topics,
         ),
-        Path(_name_of(name_or_path)).stem,
+        scenario_name(name_or_path),
         render_mode=render_mode,
         observation=observation,
         device=device,
@@ -92,7 +89,7 @@ def parallel_env(
 
 
 def make_vec(
-    name_or_path: str | Path | Scenario,
+    name_or_path: ScenarioLike,
     *,
     num_worlds: int,
     device: str = "cpu",
@@ -108,8 +105,10 @@ def make_vec(
 ) -> CooperativeVectorEnv:
     """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
 
+    Stable-Baselines3 has another interface: `coopenv.api.trainers.sb3.make_sb3_vec_env` takes the same arguments.
+
     Args:
-        name_or_path: environment, TOML file, or scenario of `coopenv.load_scenario`.
+        name_or_path: environment by name, TOML file, dict or scenario, as for `coopenv.load_scenario`.
         num_worlds: how many worlds.
         device: "cpu" or a CUDA device.
         dtype: precision of the worlds; observations and rewards are float32.
@@ -126,11 +125,9 @@ def make_vec(
     Raises:
         CoopenvError: any argument is not valid.
     """
-    changes = _with_observer(overrides, observer)
-    made = isinstance(name_or_path, Scenario)
     return CooperativeVectorEnv(
-        load_scenario(name_or_path, changes) if made else open_simulation(str(name_or_path), changes),
-        Path(_name_of(name_or_path)).stem,
+        open_simulation(name_or_path, with_observer(overrides, observer)),
+        scenario_name(name_or_path),
         num_worlds=num_worlds,
         device=device,
         dtype=dtype,
@@ -144,7 +141,7 @@ def make_vec(
 
 
 def make_rows(
-    name_or_path: str,
+    name_or_path: ScenarioLike,
     num_envs: int = 1,
     vectorization_mode: Literal["vector_entry_point"] | None = None,
     **options: Any,
@@ -163,19 +160,3 @@ def make_rows(
             f"of {name_or_path}"
         )
     return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)
-
-
-def _name_of(name_or_path: str | Path | Scenario) -> str:
-    """Return the name of an environment; of a scenario its title."""
-    return name_or_path.title if isinstance(name_or_path, Scenario) else str(name_or_path)
-
-
-def _with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory | None) -> dict[str, Any]:
-    """Return dotted keys and the observer's among them.
-
-    Raises:
-        ScenarioError: the overrides are no mapping.
-    """
-    if overrides is not None and not isinstance(overrides, Mapping):
-        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
-    return {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}

@@ -12,6 +12,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from coopenv.api.arguments import (
     QUALITIES,
     SETTINGS,
+    Info,
     RewardFunction,
     Step,
     checked_options,
@@ -28,7 +29,7 @@ from coopenv.world.reset import ABSENT
 from coopenv.world.state import FAULTS, LASTING_ERRORS
 
 Observations = dict[str, Any]
-Infos = dict[str, dict[str, Any]]
+Infos = dict[str, Info]
 
 RENDER_MODES = ("rgb_array", "human")
 LIMIT = 1e6
@@ -51,12 +52,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     that has ended leaves `agents` and goes on observing and sending, so that its followers keep their neighbour; a
     driven one parks where it is, a prescribed motion goes on.
 
-    Info: `truth`, `estimate`, `position_error` (m), `orientation_error` (deg), `visible` (target names), `nees`,
-    `log_determinant`, `position_std` (m), `gramian_min_eigenvalue`, `protection_level` (the observer's bounds of the
-    horizontal error, m, and of the angle, rad; infinite: unknown, or none stated), `reward_terms`, `time` (s),
-    `outcome`, and of the camera ticks of this step `late_ticks`, which came late, and `missing_ticks`, in which nothing
-    came from the vehicle: it has gone on with its last odometry. Truth that the backend does not know is NaN, and so is
-    what follows from it.
+    Info (per agent): see `coopenv.api.arguments.Info`. Truth that the backend does not know is NaN, and so is what
+    follows from it.
     """
 
     def __init__(
@@ -204,7 +201,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
             seen[i].append(self._targets[target])
         late, missing = engine.world.late.tolist(), engine.world.missing.tolist()
         time = float(step["time"][0, 0])
-        infos = {}
+        infos: Any = {}
         for agent in agents:
             i = self._index[agent]
             infos[agent] = {
@@ -219,7 +216,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
                 "missing_ticks": missing[i],
                 **({"car": self._notes(i)} if self._notes else {}),
             }
-        return infos
+        return dict(infos)
 
     def _checked_actions(self, actions: Mapping[str, np.ndarray], alive: list[str]) -> np.ndarray:
         """Return the actions (1, N, A); vehicles that have ended keep their last one, whatever is given.
@@ -355,7 +352,8 @@ class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
         return *results, self._numbers(infos)
 
     def _numbers(self, infos: Infos) -> dict[str, dict[str, float]]:
+        given: Mapping[str, Mapping[str, Any]] = infos
         return {
             agent: {name: float(info[name] if name in info else info["outcome"] == name) for name in NUMBERS}
-            for agent, info in infos.items()
+            for agent, info in given.items()
         }

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coopenv.backends.simulated import Simulated
     from coopenv.cars.bags import Bag
     from coopenv.observers.recording import Recording
-    from coopenv.scenario import Scenario
+    from coopenv.scenario import Scenario, ScenarioLike
 
 BACKENDS = ("simulated", "highway", "replay", "svea")
 
@@ -44,7 +44,7 @@ class SourceKind(Enum):
     BAG = "a ROS bag, which needs a map of its topics"
 
 
-def kind_of(name: str | Path) -> SourceKind:
+def kind_of(name: ScenarioLike) -> SourceKind:
     """Return what a name stands for, whether or not it exists."""
     if is_bag(name):
         return SourceKind.BAG
@@ -53,12 +53,14 @@ def kind_of(name: str | Path) -> SourceKind:
     return SourceKind.DATASET if DATASETS.fullmatch(str(name)) else SourceKind.ENVIRONMENT
 
 
-def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
+def is_bag(name: ScenarioLike, topics: str | Path | None = None) -> TypeGuard[str | Path]:
     """Return whether a name is that of a ROS bag; of MCAP files it is whatever coopenv has not written.
 
     With the map of its topics given it is one as well if it cannot be read, if it is a folder, and if it is a drive of
     cars: that is both. A folder that is called like an environment is ./NAME, unless a map is given.
     """
+    if not isinstance(name, str | Path):
+        return False
     if str(name).endswith(BAG_SUFFIXES):
         return True
     if str(name).endswith(LOG_SUFFIX):
@@ -76,7 +78,7 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
         return False
 
 
-def is_recorded(name: str | Path) -> bool:
+def is_recorded(name: ScenarioLike) -> TypeGuard[str | Path]:
     """Return whether a name is that of a recording and not of an environment."""
     return kind_of(name) is not SourceKind.ENVIRONMENT
 
@@ -112,7 +114,7 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
     return recording_of(load_dataset(str(name).removesuffix(IN_SPACE), data), chosen, in_space)
 
 
-def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
+def open_simulation(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """Return the scenario of an environment that is to be simulated in many worlds.
 
     Raises:
@@ -140,7 +142,7 @@ def simulation_of(scenario: Scenario) -> Simulated:
 
 
 def open_backend(
-    name_or_path: str | Path,
+    name_or_path: ScenarioLike,
     backend: str | Backend | None,
     overrides: Mapping[str, Any],
     data: str | Path | None = None,
@@ -151,7 +153,7 @@ def open_backend(
     """Return where the ticks of an environment or a recording come from.
 
     Args:
-        name_or_path: environment, TOML file, MCAP file, ROS bag or data set.
+        name_or_path: what `load_scenario` takes, or MCAP file, ROS bag or data set.
         backend: one of `BACKENDS`; None: by the name; a backend itself is returned as it is.
         overrides: dotted scenario keys.
         data: folder of the data sets.
@@ -166,7 +168,7 @@ def open_backend(
     recorded, cars = {"data": data, "variant": variant, "topics": topics}, cars or {}
     if backend == "svea":
         _refuse(recorded, " is for recorded data, backend='svea' has cars")
-        return _open_cars(name_or_path, overrides, cars)
+        return _open_cars(str(name_or_path), overrides, cars)
     if _is_backend(backend):
         _refuse(
             {**overrides, **cars, **recorded}, f": {type(backend).__name__} has its scenario already, choose it there"
@@ -179,7 +181,7 @@ def open_backend(
         return open_bags([name_or_path], topics, overrides, data, variant)
     _refuse({f"topics {topics}": topics}, f": is for ROS bags, '{name_or_path}' is none")
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
-        return _open_recorded(name_or_path, overrides, data, variant)
+        return _open_recorded(str(name_or_path), overrides, data, variant)
     _refuse(recorded, f" is for recorded data, '{name_or_path}' is simulated")
     from coopenv.scenario import load_scenario
 
@@ -203,9 +205,7 @@ def _refuse(options: Mapping[str, Any], why: str) -> None:
         raise CoopenvError(f"{name}{why}")
 
 
-def _open_recorded(
-    name: str | Path, overrides: Mapping[str, Any], data: str | Path | None, variant: str | None
-) -> Backend:
+def _open_recorded(name: str, overrides: Mapping[str, Any], data: str | Path | None, variant: str | None) -> Backend:
     """Return the replay of a recording, or of a drive of cars."""
     if kind_of(name) is SourceKind.LOG:
         from coopenv.cars.backend.drive import Drive, is_drive
@@ -217,14 +217,14 @@ def _open_recorded(
     return Replay(open_recording(name, data, variant), Path(name).name, overrides)
 
 
-def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:
+def _open_cars(name: str, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:
     """Return the cars of a deployment file: that which is given, or `name` itself."""
     from coopenv.cars.backend.backend import open_svea
 
     deployment = given.get("deployment")
-    if deployment is None and not str(name).endswith(".toml"):
+    if deployment is None and not name.endswith(".toml"):
         raise CoopenvError(f"deployment: needed by backend='svea': the file with the cars that drive {name}")
-    environment = None if deployment is None else str(name)
+    environment = None if deployment is None else name
     options = {key: given[key] for key in ("car", "record", "connect") if given.get(key) is not None}
     return open_svea(deployment or name, environment, overrides, **options)
 

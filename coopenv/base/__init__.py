@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from coopenv.base.errors import suggest
+
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return `__getattr__` and `__dir__` of a package whose names are loaded at their first use (PEP 562).
@@ -21,7 +23,8 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
     def get(name: str) -> Any:
         if name not in module_of:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+            near = suggest(name, module.__all__)
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{near}")
         value = getattr(import_module(str(module_of[name])), name)
         setattr(module, name, value)
         return value

@@ -152,5 +152,6 @@ def check_one_of(what: str, name: object, valid: Iterable[object], error: type[V
 
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
-    near = get_close_matches(word[:MAX_MESSAGE], list(valid), n=1)
-    return f" (did you mean '{near[0]}'?)" if near else ""
+    known = {name.lower(): name for name in valid}
+    near = get_close_matches(word[:MAX_MESSAGE].lower(), known, n=1)
+    return f" (did you mean '{known[near[0]]}'?)" if near else ""

@@ -97,6 +97,9 @@ def scenario_path(name_or_path: str | Path) -> Path:
                 f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
             )
         if not there:
+            for name in list_envs():
+                if text == environment_id(name):
+                    raise UnknownEnvironmentError(f"{text}: an id, for gymnasium.make; the environment is '{name}'")
             found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
             raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
         return path

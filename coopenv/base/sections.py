@@ -27,6 +27,11 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse a change; overrides of `load_scenario` return a changed copy."""
+        where = f"{type(self).__name__}.{name}"
+        raise CoopenvError(f"{where}: is frozen; load_scenario(scenario, {{'key': value}}) returns a changed scenario")
+
     @classmethod
     @cache
     def meanings(cls) -> dict[str, str]:

@@ -12,17 +12,22 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
+from coopenv.base.columns import Columns, Tabular
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
-from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
+from coopenv.base.notebook import one_line, terminal_html
+from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
-from coopenv.scenario import Scenario
+from coopenv.runs.console import number_table
+from coopenv.scenario import Scenario, ScenarioLike, scenario_name
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Reference of all comparisons, and the name of the same driver under ideal sensing."""
@@ -83,7 +88,7 @@ class Contest:
     @classmethod
     def of(
         cls,
-        environment: str,
+        environment: ScenarioLike,
         overrides: Mapping[str, Any],
         agents: Sequence[str],
         worlds: int,
@@ -94,7 +99,7 @@ class Contest:
         """Build the drivers.
 
         Args:
-            environment: name or TOML file.
+            environment: as for `load_scenario`.
             overrides: dotted keys of the scenario.
             agents: what `find_agent` takes; none: every shipped driver that was made for the environment.
             worlds: how many.
@@ -105,9 +110,9 @@ class Contest:
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
         """
-        scenario, name = open_simulation(environment, overrides), Path(environment).stem
+        scenario, name = open_simulation(environment, overrides), scenario_name(environment)
         if not scenario.driven:
-            raise CoopenvError(f"{environment}: all motion here is prescribed, there is nothing to drive")
+            raise CoopenvError(f"{name}: all motion here is prescribed, there is nothing to drive")
         found = [find_agent(text) for text in agents or agents_for(name)]
         if not found:
             raise CoopenvError(f"no agent of agents/ was made for {name}; name some with --agents A,B")
@@ -143,8 +148,11 @@ class Contest:
 
 
 @dataclass(frozen=True)
-class Evaluation(Contest):
-    """What drivers did, and their figures, by their names."""
+class Evaluation(Contest, Tabular):
+    """What drivers did, and their figures, by their names; printed, it is its tables.
+
+    As a table it has a row per driver and metric: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
+    """
 
     episodes: Mapping[str, Episodes]
 
@@ -172,6 +180,32 @@ class Evaluation(Contest):
             for entrant in self.entrants
             for result in self.results[entrant.name]
         ]
+
+    def columns(self) -> Columns:
+        """Return `rows` with the unit of each metric."""
+        rows = [{**row, "unit": METRICS[row["metric"]].unit} for row in self.rows()]
+        return Columns({name: [row[name] for row in rows] for name in rows[0]}, ("agent", "metric"))
+
+    def __repr__(self) -> str:
+        return one_line(self, self.environment, {"agents": tuple(self.episodes), "worlds": self.worlds})
+
+    def _repr_html_(self) -> str:
+        return terminal_html(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield f"{self.environment}: {self.worlds} held-out worlds, block {self.block} of the seeds, the same for all."
+        yield ""
+        yield _results_table(self)
+        if self.differences:
+            yield ""
+            yield _differences_table(self)
+        yield ""
+        yield "\n".join(f"{words}: {meaning}." for words, meaning in EXPLANATIONS.items())
+        for name, e in self.episodes.items():
+            pairs = [(e.vehicles[i], e.vehicles[j], e.seen_share[i, j]) for i, j in np.argwhere(e.seen_share >= 0.01)]
+            if pairs:
+                words = ", ".join(f"{own} measures {other} {share:.0%}" for own, other, share in pairs)
+                yield f"{name}, share of the time under way: {words}."
 
     def difference_rows(self) -> list[dict[str, Any]]:
         """Return one flat row per driver that was compared with the reference, and metric."""
@@ -248,6 +282,34 @@ def percent(change: Mapping[str, Any]) -> str:
 def signed(text: str) -> str:
     """Return a number with its sign."""
     return text if text.startswith("-") else f"+{text}"
+
+
+COMPARED = ("travel_time_s", "e50_m", "e95_m", "orientation_e95_deg")
+"""Metrics of which the differences are printed."""
+
+
+def _results_table(board: Evaluation) -> Table:
+    """Return one row per driver: figures, with their intervals below."""
+    table = number_table(("agent",), [heading for heading, _ in COLUMNS.values()], gap=0)
+    for name, results in board.results.items():
+        found = figures(results)
+        table.add_row(name, *(_cell(*shown(found[metric], factor)) for metric, (_, factor) in COLUMNS.items()))
+    return table
+
+
+def _differences_table(board: Evaluation) -> Table:
+    """Return one row per driver but the reference: relative differences, with their intervals below."""
+    headings = [COLUMNS[metric][0].split("\n")[0] for metric in COMPARED]
+    headings[-1] += " (deg)"
+    table = number_table((f"against {board.reference}",), [f"{heading}\n[%]" for heading in headings], gap=0)
+    for name, differences in board.differences.items():
+        found = changes(differences, COMPARED)
+        table.add_row(name, *(_cell(*map(signed, shown(found[metric], 100.0, "relative"))) for metric in COMPARED))
+    return table
+
+
+def _cell(mean: str, low: str, high: str) -> str:
+    return mean if low == NONE else f"{mean}\n{low}..{high}"
 
 
 CHANGES = {"e95_m": "e95", "e50_m": "e50", "travel_time_s": "travel time"}

@@ -1,36 +1,26 @@
-"""`coopenv evaluate`: from the options to tables and files."""
+"""`coopenv evaluate`: from the options to tables and files; `coopenv.evaluate`."""
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_new, replace_text, replacing_folder
-from coopenv.base.format import NONE, json_text
+from coopenv.base.format import json_text
 from coopenv.base.installation import version, versions
-from coopenv.bench.cards import (
-    COLUMNS,
-    EXPLANATIONS,
-    Contest,
-    Evaluation,
-    changes,
-    figures,
-    shown,
-    signed,
-)
+from coopenv.base.terminal import Terminal
+from coopenv.bench.cards import Contest, Evaluation
 from coopenv.evaluation import METRICS
 from coopenv.runs.command import REPLAY_FILE
-from coopenv.runs.console import Progress, compile_notice, number_table
+from coopenv.runs.console import Progress, compile_notice
+from coopenv.scenario import ScenarioLike
 from coopenv.viz import FORMATS
 
-COMPARED = ("travel_time_s", "e50_m", "e95_m", "orientation_e95_deg")
 JSON_FILE = "evaluation.json"
 FIGURES = ("error_along_the_way", "time_against_error", "looking")
 FILMS = ("video.mp4", "video.gif")
-WIDTH = 100
-"""Width of the tables without a terminal, characters."""
 
 
 def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
@@ -107,44 +97,31 @@ def run(
     return evaluation
 
 
-def report(evaluation: Evaluation, out: Console) -> None:
-    """Print the tables of an evaluation."""
-    seeds = f"{evaluation.worlds} held-out worlds, block {evaluation.block} of the seeds"
-    out.print(f"{evaluation.environment}: {seeds}, the same for all.", soft_wrap=True)
-    out.print()
-    out.print(_results_table(evaluation))
-    if evaluation.differences:
-        out.print()
-        out.print(_differences_table(evaluation))
-    out.print()
-    for words, meaning in EXPLANATIONS.items():
-        out.print(f"{words}: {meaning}.")
-    for name, e in evaluation.episodes.items():
-        pairs = [(e.vehicles[i], e.vehicles[j], e.seen_share[i, j]) for i, j in np.argwhere(e.seen_share >= 0.01)]
-        if pairs:
-            words = ", ".join(f"{own} measures {other} {share:.0%}" for own, other, share in pairs)
-            out.print(f"{name}, share of the time under way: {words}.")
+def evaluate(
+    environment: ScenarioLike,
+    agents: Iterable[str] = (),
+    worlds: int = 256,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    seed_block: int = 0,
+    ideal: bool = False,
+) -> Evaluation:
+    """Let agents drive in the same held-out worlds, as `coopenv evaluate` does; printed, the result is its tables.
 
+    For example `coopenv.evaluate("facade", ["route_follower", "peek"], worlds=64).to_pandas()`.
 
-def _results_table(evaluation: Evaluation) -> Table:
-    """Return one row per driver: figures, with their intervals below."""
-    table = number_table(("agent",), [heading for heading, _ in COLUMNS.values()], gap=0)
-    for name, results in evaluation.results.items():
-        found = figures(results)
-        table.add_row(name, *(_cell(*shown(found[metric], factor)) for metric, (_, factor) in COLUMNS.items()))
-    return table
+    Args:
+        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`.
+        agents: names, folders, or import paths (`mine.py:Mine`); none: every shipped agent made for the environment.
+        worlds: how many.
+        overrides: dotted scenario keys.
+        seed_block: number of the block of held-out seeds.
+        ideal: let `route_follower` drive under ideal sensing, too.
 
-
-def _differences_table(evaluation: Evaluation) -> Table:
-    """Return one row per driver but the reference: relative differences, with their intervals below."""
-    headings = [COLUMNS[metric][0].split("\n")[0] for metric in COMPARED]
-    headings[-1] += " (deg)"
-    table = number_table((f"against {evaluation.reference}",), [f"{heading}\n[%]" for heading in headings], gap=0)
-    for name, differences in evaluation.differences.items():
-        found = changes(differences, COMPARED)
-        table.add_row(name, *(_cell(*map(signed, shown(found[metric], 100.0, "relative"))) for metric in COMPARED))
-    return table
-
-
-def _cell(mean: str, low: str, high: str) -> str:
-    return mean if low == NONE else f"{mean}\n{low}..{high}"
+    Raises:
+        CoopenvError: an argument is not valid, or an agent cannot drive here.
+    """
+    if isinstance(agents, str):
+        raise CoopenvError(f"agents: expected a list such as ['{agents}']")
+    contest = Contest.of(environment, overrides or {}, [*agents], worlds, seed_block, ideal)
+    return run(contest, "", Terminal(stderr=True))

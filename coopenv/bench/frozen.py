@@ -36,7 +36,6 @@ from coopenv.runs.console import number_table
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-3
 """Relative, of the figures of records: other processors round differently."""
-WIDTH = 100
 SHOWN = ("robust", "split_covariance_intersection")
 """Observers of the zoo beside the new one in the table of scenes."""
 

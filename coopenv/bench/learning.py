@@ -291,10 +291,6 @@ def write_overview(agents: Iterable[TrainingPlan], folder: Path, judge: Judge) -
     replace_text(folder / PAGE_FILE, cards.rendered("agents.md.j2", sections=sections))
 
 
-WIDTH = 100
-"""Width of the table without a terminal, characters."""
-
-
 def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: int, log: Console) -> None:
     """Train every run of a part of a study that is not finished, and bring all cards up to date.
 

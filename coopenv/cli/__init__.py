@@ -19,7 +19,7 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
-from coopenv.cli.bench import bench
+from coopenv.cli.bench import bench, bench_observers
 from coopenv.cli.calibrate import calibrate, identify
 from coopenv.cli.run import bundle, export, figures, import_, record, run
 from coopenv.cli.svea import svea
@@ -29,8 +29,12 @@ from coopenv.cli.view import film, play, view, watch
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal
 
+LOOK, RUN, COMPARE, TRAIN, VIEW, CARS = "Look around", "Run and record", "Compare", "Train", "View", "Cars"
+"""Groups of the list of commands."""
+
 app = typer.Typer(
     name="coopenv",
+    cls=options.Grouped,
     help="Cooperative localisation of connected vehicles.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -39,7 +43,7 @@ app = typer.Typer(
 Kind = StrEnum("Kind", "envs observers agents variants scenes")
 
 
-@app.command("list")
+@app.command("list", rich_help_panel=LOOK)
 def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
@@ -63,7 +67,7 @@ class DescribeOptions(options.SourceOptions):
     as_json: options.AsJson = False
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 @options.command
 def describe(given: DescribeOptions) -> None:
     """Print a summary of an environment: vehicles, sensors, observer."""
@@ -88,7 +92,7 @@ def describe(given: DescribeOptions) -> None:
         out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def scene(
     name: Annotated[
         str,
@@ -108,7 +112,7 @@ def scene(
     options.write_text(scene_text(name), out)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def schema(out: options.TextFile = None) -> None:
     """Write the JSON schema of scenario files, for editors."""
     from coopenv.scenario.files import schema_text
@@ -116,27 +120,25 @@ def schema(out: options.TextFile = None) -> None:
     options.write_text(schema_text(), out)
 
 
-for command in (
-    run,
-    figures,
-    export,
-    bundle,
-    record,
-    import_,
-    calibrate,
-    identify,
-    dataset,
-    train,
-    evaluate,
-    watch,
-    play,
-    view,
-    film,
-):
-    app.command(command.__name__.rstrip("_"))(command)
+app.command(rich_help_panel=RUN)(run)
+app.command(rich_help_panel=RUN)(record)
+app.command(rich_help_panel=RUN)(export)
+app.command(rich_help_panel=RUN)(figures)
+app.command(rich_help_panel=RUN)(bundle)
+app.add_typer(bench, name="bench", rich_help_panel=COMPARE)
+app.command("compare", hidden=True)(bench_observers)  # its name in Python
+app.command(rich_help_panel=COMPARE)(evaluate)
+app.command(rich_help_panel=TRAIN)(train)
+app.command(rich_help_panel=TRAIN)(dataset)
+for command in (view, film, watch, play):
+    app.command(rich_help_panel=VIEW)(command)
+app.add_typer(svea, name="svea", rich_help_panel=CARS)
+app.command("import", rich_help_panel=CARS)(import_)
+app.command(rich_help_panel=CARS)(calibrate)
+app.command(rich_help_panel=CARS)(identify)
 
 
-@app.command()
+@app.command(rich_help_panel=VIEW)
 def page(
     environments: Annotated[
         list[str] | None,
@@ -194,10 +196,6 @@ def page(
     if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
         replace_text(out / pages.INDEX, pages.index_text(shipped))
     options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
-
-
-app.add_typer(bench, name="bench")
-app.add_typer(svea, name="svea")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -13,7 +13,7 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from coopenv.bench.observers.comparison import Plan
 
-bench = typer.Typer(help="Compare observers, study seeds.", no_args_is_help=True)
+bench = typer.Typer(cls=options.Grouped, help="Compare observers, study seeds.", no_args_is_help=True)
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
 
 
@@ -144,13 +144,12 @@ def bench_observers(given: ObserverOptions) -> None:
     from coopenv.bench.executors import find_executor
     from coopenv.bench.observers.command import REPORT_FILE, perform
     from coopenv.bench.observers.convergence import check_source
-    from coopenv.bench.observers.tables import WIDE
 
     if given.open_report and given.out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
     if given.width is not None and given.figures is None:
         raise CoopenvError(f"--width {given.width.value}: is for files of figures, --figures pdf")
-    printed, log = options.console(least=WIDE), options.console(stderr=True)
+    printed, log = options.console(), options.console(stderr=True)
     plan = given.plan()
     if given.basin:
         check_source(plan.source)
@@ -212,7 +211,7 @@ def bench_v1(
     if as_json:
         options.print_json(result)
         return
-    printed = options.console(least=frozen.WIDTH)
+    printed = options.console()
     for part in frozen.report(benchmark, result):
         printed.print(part, soft_wrap=isinstance(part, str), markup=False)
     printed.print(f"{out}: the result file", soft_wrap=True)
@@ -241,6 +240,6 @@ def bench_learning(
     for plans in chosen.agents.values():
         options.load(plans[0].environment, plans[0].settings.scenario)
     learning.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
-    printed = options.console(least=learning.WIDTH)
+    printed = options.console()
     printed.print(learning.results_table(chosen, folder))
     printed.print("Figures of the best seed, with 95 % intervals over worlds. More in every agent's card.md.")

@@ -41,7 +41,7 @@ def calibrate(
         if topics is not None:
             drive = drive_of_bag(open_bags(bags, topics, options.parse_overrides(overrides)))
         elif overrides:
-            raise CoopenvError("--set: needs the map of the bags' topics, --map topics.toml")
+            raise CoopenvError("--override: needs the map of the bags' topics, --map topics.toml")
         elif len(bags) > 1 or kind_of(bags[0]) is not SourceKind.LOG:
             raise CoopenvError(f"{bags[0]}: needs the map of its topics, --map topics.toml; a log of coopenv does not")
         else:
@@ -55,7 +55,7 @@ def calibrate(
         options.print_json({"rows": result.rows, "findings": result.findings, "noise": result.noise})
         return
     _print(result.rows)
-    console = options.console(least=100)
+    console = options.console()
     if any(car.lens is None for car in drive.cars):
         console.print("Bearings without pixels: intrinsics cannot be estimated.")
     console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
@@ -95,7 +95,7 @@ def identify(
     table = number_table(["quantity"], ["samples", "as given", "identified", "by chance"])
     for row in result.distances:
         table.add_row(row.quantity, str(row.samples), *(f"{d:.3f}" for d in (row.given, row.identified, row.seeds)))
-    console = options.console(least=100)
+    console = options.console()
     console.print(table)
     console.print(f"File: {out}", soft_wrap=True)
 
@@ -107,4 +107,4 @@ def _print(rows: Sequence[Row]) -> None:
     table = number_table(["constant", "unit", "finding"], ["given", "estimate", "std. error"])
     for row in rows:
         table.add_row(row.name, row.unit, row.finding, f"{row.given:.5g}", f"{row.value:.5g}", f"{row.error:.2g}")
-    options.console(least=100).print(table)
+    options.console().print(table)

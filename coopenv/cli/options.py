@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperGroup
 
-from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning
+from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning, check_one_of
 from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
@@ -157,6 +158,7 @@ Source = Annotated[str, _source(metavar="ENV|DATASET|FILE.mcap|BAG", help=_SOURC
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
+        "--override",
         "--set",
         metavar="KEY=VALUE",
         help="Override a dotted key of the scenario, e.g. noise.enabled=false. The value is TOML, or else a string. "
@@ -207,6 +209,14 @@ Station = Annotated[
         show_default=False,
     ),
 ]
+ObserverName = Annotated[
+    str | None,
+    typer.Option(
+        help="Observer by name or as mine.py:Mine (default: that of the environment).",
+        show_default=False,
+        **OBSERVERS,
+    ),
+]
 LogObserver = Annotated[
     str | None,
     typer.Option(
@@ -229,6 +239,27 @@ SteadyFrom = Annotated[
 
 
 Options = TypeVar("Options")
+
+
+class Grouped(TyperGroup):
+    """Lists its commands by the group that each names as its `rich_help_panel`, with whole sentences."""
+
+    def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
+        """Return the command that the arguments begin with."""
+        if args[0] not in self.commands:
+            check_one_of("no such command:", args[0], self.commands)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
+        """Write the list."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for name, one in self.commands.items():
+            panel = getattr(one, "rich_help_panel", None) or "Commands"
+            if not one.hidden:
+                groups.setdefault(panel, []).append((name, one.get_short_help_str(formatter.width * 10)))
+        for panel, rows in groups.items():
+            with formatter.section(panel):
+                formatter.write_dl(rows, col_max=12)
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:
@@ -302,16 +333,11 @@ class SourceOptions:
         return open_backend(self.environment, None, self.changes, self.data, self.variant, topics=self.topics)
 
 
-def console(stderr: bool = False, least: int = 0) -> Console:
-    """Return a console that prints scenario texts as they are; `least`: columns where there is no terminal."""
-    from rich.console import Console
+def console(stderr: bool = False) -> Console:
+    """Return a console that prints scenario texts as they are."""
+    from coopenv.base.terminal import Terminal
 
-    made = Console(stderr=stderr, markup=False, highlight=False, emoji=False)
-    if made.width < 1:  # COLUMNS=0
-        made.width = 80
-    if not made.is_terminal:
-        made.width = max(made.width, least)
-    return made
+    return Terminal(stderr=stderr)
 
 
 def print_json(result: Any) -> None:
@@ -393,7 +419,7 @@ def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:
         key, equals, text = assignment.partition("=")
         key, text = key.strip(), text.strip()
         if not equals or not key:
-            raise CoopenvError(f"--set {assignment}: expected KEY=VALUE, e.g. --set noise.enabled=false")
+            raise CoopenvError(f"--override {assignment}: expected KEY=VALUE, e.g. --override noise.enabled=false")
         overrides[key] = parse_value(text)
     return overrides
 

@@ -24,16 +24,13 @@ if TYPE_CHECKING:
 class RunOptions(options.SourceOptions):
     """Options of `coopenv run`."""
 
-    observer: Annotated[
-        str | None,
-        typer.Option(help="In place of the scenario's own: a name, or mine.py:Mine.", **options.OBSERVERS),
-    ] = None
     seed: options.Seed = 0
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None
     device: Annotated[str, typer.Option(help="Device that computes: cpu, cuda, cuda:0, ...")] = "cpu"
     dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64"
     policy: options.PolicyName = "zero"
+    observer: options.ObserverName = None
     steady_from: options.SteadyFrom = None
     figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png
     width: options.FigureWidth = None
@@ -48,9 +45,9 @@ class RunOptions(options.SourceOptions):
     @property
     def changes(self) -> dict[str, Any]:
         """The overrides of the scenario, its observer included."""
-        from coopenv.observers.registry import named
+        from coopenv.observers.registry import with_observer
 
-        return super().changes | ({} if self.observer is None else {"observer.name": named(self.observer)})
+        return with_observer(super().changes, self.observer)
 
 
 @options.command
@@ -84,12 +81,12 @@ def run(given: RunOptions) -> None:
         width=given.width and given.width.value,
     )
     if given.as_json:
-        options.print_json(result)
+        options.print_json({**result.metrics, "files": result.files})
     else:
         report(rollout, result, folder, options.console())
     if given.open_out:
         page = folder / REPLAY_FILE
-        options.show_page(page) if page in result["files"] else options.show(folder)
+        options.show_page(page) if page in result.files else options.show(folder)
 
 
 BUNDLE = ".zip"
@@ -193,7 +190,7 @@ def record(given: RecordOptions) -> None:
 
     if replayed:
         if given.changes:
-            raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
+            raise CoopenvError(f"--override: is for a simulation, {environment} is recorded")
         recording = open_recording(environment, given.data, given.variant)
     else:
         for option, value in () if bag else (("--data", given.data), ("--variant", given.variant)):
@@ -235,7 +232,7 @@ def check_log(out: Path, observer: str | None, scene: bool) -> None:
 
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
-ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "layout": "foxglove-layout"})
+ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "csv": "csv", "parquet": "parquet", "layout": "foxglove-layout"})
 Exported = Annotated[
     Path, typer.Argument(metavar="RUN|FILE.mcap", help="Folder that `coopenv run` has written, or log of `record`.")
 ]
@@ -256,7 +253,7 @@ def figures(
 
     results, folder = Results.read(run), out or run / "figures"
     with Progress(options.console(stderr=True), "drawing figures"):
-        paths = results.save_figures(folder, file_format.value, width and width.value, results.scenario())
+        paths = results.save_figures(folder, file_format.value, width and width.value)
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 
@@ -266,13 +263,16 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="tum: true and estimated trajectories of a run, which evo reads. foxglove-layout: how Foxglove and "
-            "Lichtblick arrange a log.",
+            help="tum: true and estimated trajectories of a run, which evo reads. csv, parquet: its table, a row per "
+            "tick and vehicle. foxglove-layout: how Foxglove and Lichtblick arrange a log.",
         ),
     ] = ExportFormat.tum,
     out: Annotated[
         Path | None,
-        typer.Option(help=f"Folder of the trajectories (default: RUN/tum), or file (default: {LAYOUT_FILE})."),
+        typer.Option(
+            help="Folder of the trajectories (default: RUN/tum), or file (default: RUN/trajectory.csv or .parquet; "
+            f"{LAYOUT_FILE})."
+        ),
     ] = None,
 ) -> None:
     """Write a run or a log in the formats of other programs."""
@@ -282,8 +282,14 @@ def export(
     from coopenv.runs.command import Results
     from coopenv.runs.recorder import write_tum
 
+    results = Results.read(source)
+    if file_format in (ExportFormat.csv, ExportFormat.parquet):
+        path = out or source / f"trajectory.{file_format.value}"
+        results.to_csv(path) if file_format is ExportFormat.csv else results.to_parquet(path)
+        options.console().print(f"{path}: {len(results.trajectory.t)} ticks", soft_wrap=True)
+        return
     folder = out or source / file_format.value
-    paths = write_tum(Results.read(source).trajectory, folder)
+    paths = write_tum(results.trajectory, folder)
     options.console().print(f"Files in {folder}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 
@@ -298,10 +304,6 @@ def _export_layout(log: Path, out: Path) -> None:
         raise DataError(f"{log}: has no scene, `coopenv record --scene` writes one")
     replace_text(out, layout_text(topics))
     options.console().print(f"{out}: import it in Foxglove or Lichtblick (Layouts, Import from file)", soft_wrap=True)
-
-
-WIDTH = 116
-"""Columns of a table that is not for a terminal."""
 
 
 def import_(
@@ -326,7 +328,9 @@ def import_(
         raise CoopenvError("--propose: writes a map, --map names one; give one of them")
     if topics is None:
         if out is not None or overrides:
-            raise CoopenvError(f"{'--out' if out else '--set'}: needs the map of the bags' topics, --map topics.toml")
+            raise CoopenvError(
+                f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
+            )
         from coopenv.base.files import check_new, replace_text
         from coopenv.cars.bags.doctor import examined, proposed
         from coopenv.cars.bags.files import BagFile
@@ -388,8 +392,6 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
         *(["leads\n[ms]"] if read else []),
     ]
     table = number_table(names, numbers)
-    for column in table.columns[: len(names)]:
-        column.no_wrap, column.overflow = False, "fold"
     for row in rows:
         about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
         offset = None if row.offset is None else 1e3 * row.offset
@@ -398,4 +400,4 @@ def _print(rows: Sequence[TopicRow], as_json: bool) -> None:
         shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
         lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
         table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
-    options.console(least=WIDTH).print(table)
+    options.console().print(table)

@@ -21,7 +21,13 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
-svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None)
+svea = typer.Typer(
+    name="svea",
+    cls=options.Grouped,
+    help="SVEA cars, real ones and fakes.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3
@@ -402,7 +408,7 @@ def run(given: SveaRunOptions) -> None:
         except NoTruthError:
             raise CoopenvError(truth_report(backend)) from None
     if given.as_json:
-        options.print_json(result)
+        options.print_json({**result.metrics, "files": result.files})
     else:
         report(rollout, result, folder, options.console())
         links_report(backend, options.console())

@@ -61,7 +61,7 @@ class TrainOptions:
             except CoopenvError as error:  # of the settings, because the options alone are possible
                 raise CoopenvError(str(error).replace(OVERRIDES, str(self.settings or "settings"), 1)) from None
             return plan
-        decided = {"--set": self.overrides}
+        decided = {"--override": self.overrides}
         decided |= {
             f"--{name}": getattr(self, name) for name in ("agent", "settings", "arm", "seed", "steps", "minutes")
         }
@@ -182,8 +182,6 @@ class EvaluateOptions:
     as_json: options.AsJson = False
 
 
-SHORT_NAME = 20
-"""Characters of an agent's name from which on the tables are wider."""
 OF_THE_OUTPUT = ("out", "figures", "width", "no_figures", "film", "write_card", "force", "as_json")
 """Options of `evaluate` that do not change what is measured."""
 
@@ -214,8 +212,8 @@ def evaluate(given: EvaluateOptions) -> None:
     if given.as_json:
         options.print_json(evaluate.document(result, command))
         return
-    printed = options.console(least=evaluate.WIDTH + max(0, max(map(len, result.results)) - SHORT_NAME))
-    evaluate.report(result, printed)
+    printed = options.console()
+    printed.print(result)
     if out is not None:
         printed.print(f"Files in {out}:", soft_wrap=True)
         printed.print(f"  {', '.join(sorted(path.name for path in out.iterdir()))}")

@@ -25,14 +25,6 @@ Agent = Annotated[
         **options.POLICY,
     ),
 ]
-ObserverName = Annotated[
-    str | None,
-    typer.Option(
-        help="Observer by name or as mine.py:Mine (default: that of the environment).",
-        show_default=False,
-        **options.OBSERVERS,
-    ),
-]
 SceneSource = Annotated[
     str,
     typer.Argument(
@@ -51,7 +43,7 @@ class SceneOptions(options.SourceOptions):
 
     environment: SceneSource
     agent: Agent = None
-    observer: ObserverName = None
+    observer: options.ObserverName = None
     seed: options.Seed = 0
 
     def open(self, more: Mapping[str, Any] | None = None) -> "Backend":

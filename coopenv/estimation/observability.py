@@ -36,10 +36,12 @@ from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 
-from coopenv.base.errors import DataError
+from coopenv.base.columns import Columns, Tabular
+from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
-from coopenv.estimation.poses import Array, skew
+from coopenv.base.notebook import facts_html, one_line
+from coopenv.estimation.poses import Array, position_covariance, roll_pitch_yaw_deg, skew
 
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
@@ -65,13 +67,15 @@ class RecordedGeometry:
 
 
 @dataclass(frozen=True)
-class Trajectory(RecordedGeometry):
+class Trajectory(RecordedGeometry, Tabular):
     """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).
 
     Each array is annotated with the kinds of its dtype and its axes; there are R reward terms.
 
     Frames: `position*` in the map frame; `rotation*` maps body to map; velocities in the body frame;
     `covariance` is the observer's P over (2 lambda, p), p being the position in the body frame.
+
+    As a table it has a row per tick and vehicle: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
 
     rotation: Annotated[np.ndarray, "f K N 3 3"]  # true, body to map
@@ -89,6 +93,44 @@ class Trajectory(RecordedGeometry):
     terms: Annotated[np.ndarray, "U R"]  # names of the terms
     targets: Annotated[np.ndarray, "U T"]  # names
     target_moving: Annotated[np.ndarray, "b T"]  # vehicles and moving landmarks
+
+    def columns(self) -> Columns:
+        """Return a row per tick and vehicle; `_std_` are of the position in the map frame, from P to first order."""
+        P = position_covariance(self.rotation_estimate, self.position_estimate, self.covariance)
+        std, N = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1)), len(self.vehicles)
+        parts = {
+            "x_m y_m z_m": self.position,
+            "roll_deg pitch_deg yaw_deg": roll_pitch_yaw_deg(self.rotation),
+            "x_estimate_m y_estimate_m z_estimate_m": self.position_estimate,
+            "roll_estimate_deg pitch_estimate_deg yaw_estimate_deg": roll_pitch_yaw_deg(self.rotation_estimate),
+            "x_std_m y_std_m z_std_m": std,
+            "position_error_m": self.position_error,
+            "orientation_error_deg": self.orientation_error,
+            "nees": self.nees,
+            "protection_level_m protection_level_rad": self.protection_level,
+            "velocity_x_m_per_s velocity_y_m_per_s velocity_z_m_per_s": self.velocity,
+            "turn_x_rad_per_s turn_y_rad_per_s turn_z_rad_per_s": self.angular_velocity,
+            "targets_in_view": self.visible.sum(axis=-1),
+            " ".join(f"reward_{term}" for term in self.terms): self.reward_terms,
+        }
+        values = {"t_s": np.repeat(self.t, N), "vehicle": np.tile(self.vehicles, len(self.t))}
+        for names, array in parts.items():
+            values |= dict(zip(names.split(), array.reshape(len(self.t) * N, -1).T, strict=True))
+        return Columns(values, ("t_s", "vehicle"))
+
+    def __getitem__(self, vehicle: str) -> Self:
+        """Return the record of one vehicle. Raises CoopenvError: there is none of that name."""
+        names = self.vehicles.tolist()
+        check_one_of("unknown vehicle", vehicle, names)
+        return self.of_vehicles([names.index(vehicle)])
+
+    def __repr__(self) -> str:
+        facts = {"ticks": len(self.t), "vehicles": len(self.vehicles), "targets": len(self.targets)}
+        return one_line(self, f"{self.t[0]:g} to {self.t[-1]:g} s", facts)
+
+    def _repr_html_(self) -> str:
+        arrays = {name: f"{(array := getattr(self, name)).dtype} {array.shape}" for name in self.kinds()}
+        return facts_html(repr(self), arrays)
 
     def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""

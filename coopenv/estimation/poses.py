@@ -246,14 +246,16 @@ def covariance_in_map(coordinates: Coordinates, rotation: Array, position: Array
 def position_covariance(rotation: Array, position: Array, covariance: Array) -> Array:
     """Return covariances (..., 3, 3) of estimated positions in the map frame, m^2, to first order.
 
+    Infos and trajectories have an estimate as (Rhat, phat) and P over (2 lambda, R^T p - Rhat^T phat), rad and m:
+
+        position_covariance(**info["estimate"])
+
     Args:
         rotation: Rhat (..., 3, 3), body to map.
-        position: phat (..., 3), body frame, m.
-        covariance: P (..., 6, 6) in the paper's coordinates, over (2 lambda, p - phat).
+        position: phat (..., 3), map frame, m.
+        covariance: P (..., 6, 6) in the paper's coordinates.
     """
-    R, p = np.asarray(rotation, float), np.asarray(position, float)
-    in_map = (R @ p[..., None])[..., 0]
-    return covariance_in_map(Coordinates.RICCATI, R, in_map, covariance)[..., :3, :3]
+    return covariance_in_map(Coordinates.RICCATI, rotation, position, covariance)[..., :3, :3]
 
 
 def riccati_covariance(coordinates: Coordinates, rotation: Array, position: Array, covariance: Array) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -17,7 +18,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopenv.base.errors import CoopenvError, error_text, shown, suggest
+from coopenv.base.errors import CoopenvError, ScenarioError, error_text, shown, suggest
 from coopenv.base.installation import absolute_reference, install_command, is_reference, load_reference
 
 if TYPE_CHECKING:
@@ -191,6 +192,17 @@ def _docstring(place: str) -> str | None:
     kinds = ast.ClassDef | ast.FunctionDef
     [found] = [node for node in ast.parse(source).body if isinstance(node, kinds) and node.name == name]
     return ast.get_docstring(found)
+
+
+def with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory | None) -> dict[str, Any]:
+    """Return dotted keys and the observer's among them.
+
+    Raises:
+        ScenarioError: the overrides are no mapping.
+    """
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
+    return {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}
 
 
 def check_known(name: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -14,7 +13,7 @@ from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.policies.base import Policy, decide, restart, zero_policy
 from coopenv.policies.loader import load_agent
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, ScenarioLike
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -39,7 +38,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
 
     def __init__(
         self,
-        name_or_path: str | Path | Scenario,
+        name_or_path: ScenarioLike,
         *,
         vehicle: str | None = None,
         others: str | Policy | None = None,
@@ -92,7 +91,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         else:
             raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
         restart(self._others, np.ones(len(self.world.scenario.vehicles), dtype=bool))
-        return observations[self.vehicle], infos[self.vehicle]
+        return observations[self.vehicle], dict(infos[self.vehicle])
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive the vehicle for one decision period.
@@ -109,7 +108,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         v = self.vehicle
         if v not in rewards:
             raise CoopenvError(f"step() called although {v} has ended; call reset()")
-        return observations[v], rewards[v], terminated[v], truncated[v], infos[v]
+        return observations[v], rewards[v], terminated[v], truncated[v], dict(infos[v])
 
     def render(self) -> Any:
         """Draw the top view."""

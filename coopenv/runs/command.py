@@ -1,31 +1,40 @@
-"""`coopenv run`: simulate with progress shown, write the results, print the table."""
+"""`coopenv run` and `coopenv.run`: simulate with progress shown, write the results, print the table."""
 
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.backends.base import Repeating
-from coopenv.base.errors import CoopenvError, DataError, listed
+from coopenv.backends.sources import open_backend
+from coopenv.base.columns import Columns, Tabular
+from coopenv.base.errors import CoopenvError, DataError, checked_seed, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
+from coopenv.base.notebook import WIDTH, one_line, picture_html, terminal_html
+from coopenv.base.terminal import Terminal, text_of
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
-from coopenv.observers.registry import states_covariance
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import states_covariance, with_observer
+from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
 from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import VIDEO_FILES, Keeper, frame_stride, source_of, video_path, write_film, write_page
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
 from coopenv.viz.scene import SCENE_FILE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 METRICS_FILE, TRAJECTORY_FILE, REPLAY_FILE = "metrics.json", "trajectory.npz", "replay.html"
 
@@ -43,16 +52,16 @@ class NoTruthError(CoopenvError):
 def execute(
     name: str,
     run: Rollout,
-    out: Path,
+    out: Path | None,
     log: Console,
     overrides: Mapping[str, Any],
-    steady_from: float | None,
-    figures: str | None,
-    video: bool,
+    steady_from: float | None = None,
+    figures: str | None = None,
+    video: bool = False,
     describe: Callable[[], str] | None = None,
     width: str | None = None,
-) -> dict[str, Any]:
-    """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
+) -> "Results":
+    """Run, write to the folder `out` (None: no files), and return what came of it.
 
     A run that does not reach its end writes nothing to `out`; that of an error leaves its record in the folder
     `OUT_failed`, see `coopenv.runs.bundle`. `figures` is their format; None: no figures. `width` is a column
@@ -68,11 +77,11 @@ def execute(
     steady = steady_start(steady_from, scenario.horizon, run.ticks_planned / scenario.rates.camera)
     able = run.engine.backend.capabilities
     doing = "replaying" if able.recorded else "driving" if able.real_time else "simulating"
-    with replacing_folder(out, result_names()) as folder:
+    with nullcontext() if out is None else replacing_folder(out, result_names()) as folder:
         with compile_notice(log):
             run.engine.load()
         keeper = Keeper(run.engine, source_of(run.engine, name, run.seed, run.policy_name))
-        record = None if able.recorded or able.real_time else RunRecord(run)
+        record = None if able.recorded or able.real_time or out is None else RunRecord(run)
         with (
             Progress(log, doing, run.ticks_planned, scenario.rates.camera if able.real_time else None) as progress,
             _kept_if_failed(record, out, name, log),
@@ -82,24 +91,25 @@ def execute(
                     record.tick(tick)
                 if keeper.tick(tick):
                     progress.update(tick, describe() if describe is not None else None)
-        scene = keeper.record()
-        trajectory = run.trajectory()
-        judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
+        judged, endings = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
             raise NoTruthError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
         vehicles = vehicle_metrics(judged, observability, endings, steady, theory_rates(run, judged))
-        metrics = run_metrics(name, overrides, run, vehicles, steady)
+        results = Results(run_metrics(name, overrides, run, vehicles, steady), judged, scenario)
+        if folder is None or out is None:
+            return results
+        scene = keeper.record()
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
-        replace_text(paths[0], json_text(metrics))
-        trajectory.save(paths[1])
+        replace_text(paths[0], json_text(results.metrics))
+        run.trajectory().save(paths[1])
         scene.save(paths[2])
         if record is not None:
             paths.append(folder / RECORD_FILE)
             record.save(paths[-1], name)
         if figures is not None:
             with Progress(log, "drawing figures"):
-                paths += Results(metrics, judged).save_figures(folder, figures, width, scenario, observability)
+                paths += results.save_figures(folder, figures, width, observability)
             page = write_page(scene, folder / REPLAY_FILE, log)
             paths += [] if page is None else [page]
         if video:
@@ -109,16 +119,16 @@ def execute(
                 write_film(scene, paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
-    return {**metrics, "files": [out / path.name for path in paths]}
+    return replace(results, files=tuple(out / path.name for path in paths))
 
 
 @contextmanager
-def _kept_if_failed(record: RunRecord | None, out: Path, name: str, log: Console) -> Iterator[None]:
+def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: Console) -> Iterator[None]:
     """Write the record of a run that fails to a folder of its own."""
     try:
         yield
     except CoopenvError as error:
-        if record is not None:
+        if record is not None and out is not None:
             folder = out.with_name(f"{out.name}_failed")
             with new_folder(folder):
                 record.save(folder / RECORD_FILE, name, str(error))
@@ -126,33 +136,73 @@ def _kept_if_failed(record: RunRecord | None, out: Path, name: str, log: Console
         raise
 
 
-def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:
+def run(
+    environment: ScenarioLike,
+    seed: int = 0,
+    *,
+    policy: str | Policy = "zero",
+    observer: str | Factory | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    steps: int | None = None,
+    out: str | Path | None = None,
+    steady_from: float | None = None,
+    data: str | Path | None = None,
+    variant: str | None = None,
+    topics: str | Path | None = None,
+    device: str = "cpu",
+    dtype: str = "float64",
+) -> "Results":
+    """Run an episode and judge its estimates, as `coopenv run` does; printed, the result is its table.
+
+    For example `coopenv.run("facade", seed=1, policy="peek", observer="robust").trajectory.to_pandas()`.
+
+    Args:
+        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`, or a recording.
+        seed: of all that is drawn.
+        policy: of driven vehicles: "zero", "random", an agent, or a function of the observations.
+        observer: name, class or import path; None: that of the scenario.
+        overrides: dotted scenario keys, for example {"noise.enabled": False}.
+        steps: decisions; None: up to the horizon.
+        out: folder for files, figures and replay; None: no files.
+        steady_from: start of the steady state, s; None: after 70 % of the horizon.
+        data: folder of recorded data sets.
+        variant: of a data set.
+        topics: TOML file with the map of a ROS bag's topics.
+        device: "cpu" or a CUDA device.
+        dtype: "float32" or "float64".
+
+    Raises:
+        CoopenvError: an argument is not valid, or the results cannot be written.
+    """
+    changes, log = with_observer(overrides, observer), Terminal(stderr=True)
+    backend = open_backend(environment, None, changes, data, variant, topics=topics)
+    with compile_notice(log):
+        made = Rollout(backend.scenario, checked_seed(seed), steps, dtype, device, policy, backend)
+    name, folder = scenario_name(environment), None if out is None else Path(out)
+    return execute(name, made, folder, log, changes, steady_from, "png")
+
+
+def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
     """Print what `execute` returned for people."""
-    able, pace = run.engine.backend.capabilities, f"{result['real_time_factor']:.3g} times real time"
+    able, metrics = run.engine.backend.capabilities, result.metrics
     source = f"seed {run.seed}, noise {'on' if run.scenario.noise.enabled else 'off'}"
-    done = f"Simulated at {pace}"
+    done = f"Simulated at {metrics['real_time_factor']:.3g} times real time"
     if able.recorded:
-        source, done = "recorded", f"Replayed at {pace}"
+        source, done = "recorded", done.replace("Simulated", "Replayed")
     elif able.real_time:
-        source, done = f"in real time, seed {run.seed}", f"It took {result['simulated_time_s']:.4g} s of real time"
-    out.print(f"{run.scenario.title}: {source}, {result['dtype']} on {result['device']}", soft_wrap=True)
+        source, done = f"in real time, seed {run.seed}", f"It took {metrics['simulated_time_s']:.4g} s of real time"
+    out.print(f"{run.scenario.title}: {source}, {metrics['dtype']} on {metrics['device']}", soft_wrap=True)
     out.print()
-    out.print(metrics_table(result["vehicles"]))
-    out.print()
-    for part in rates(result["vehicles"]):
-        out.print(part)
-    explained = legend(result["steady_from_s"], result["simulated_time_s"])
-    for line in (*explained, *remarks(result["vehicles"])):
-        out.print(line)
+    out.print(result)
     if others := [name for i, name in enumerate(run.scenario.vehicle_names) if i not in run.vehicles]:
         out.print(f"{listed(others)}: received by radio, not estimated here", soft_wrap=True)
-    out.print(f"Outcome: {result['outcome']}. {done}.")
+    out.print(f"Outcome: {metrics['outcome']}. {done}.")
     if isinstance(run.engine.backend, Repeating) and run.engine.backend.stopped:
         out.print(f"Stopped: {run.engine.backend.stopped}", soft_wrap=True, markup=False)
     out.print(f"Files in {folder}:", soft_wrap=True)
-    names = ", ".join(path.name for path in result["files"])
+    names = ", ".join(path.name for path in result.files)
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))
-    if (page := folder / REPLAY_FILE) in result["files"]:
+    if (page := folder / REPLAY_FILE) in result.files:
         out.print(f"To watch it in a browser, open {page}", soft_wrap=True)
 
 
@@ -160,12 +210,20 @@ _NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_fro
 
 
 @dataclass(frozen=True)
-class Results:
-    """What a run has come to, as in its folder."""
+class Results(Tabular):
+    """What a run has come to, as in its folder; printed, it is its table.
+
+    The trajectory as a table: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
+    """
 
     metrics: dict[str, Any]
+    """Contents of `metrics.json`."""
     trajectory: Trajectory
     """Of the vehicles that were estimated, at the ticks at which their truth is known."""
+    scenario: Scenario | None = None
+    """The world of the run; None where only its file could tell, such as of a recording."""
+    files: tuple[Path, ...] = ()
+    """What was written."""
 
     @classmethod
     def read(cls, folder: str | Path) -> "Results":
@@ -197,31 +255,62 @@ class Results:
             raise DataError(f"{path}: vehicles are not those of {TRAJECTORY_FILE} ({error})") from None
         if not all(end is None or isinstance(end, float | int) for end in ends):
             raise DataError(f"{path}: ended_at_s: expected numbers")
-        return cls(metrics, whole.of_vehicles(judged).where_truth_is_known())
+        metrics["vehicles"] = _with_nan(metrics["vehicles"])
+        try:
+            scenario = load_scenario(metrics["environment"], metrics["overrides"])
+        except CoopenvError:
+            scenario = None
+        return cls(metrics, whole.of_vehicles(judged).where_truth_is_known(), scenario)
+
+    def columns(self) -> Columns:
+        """Return the trajectory, a row per tick and vehicle."""
+        return self.trajectory.columns()
+
+    def __repr__(self) -> str:
+        facts = {key: self.metrics.get(key) for key in ("observer", "policy", "seed", "outcome")}
+        return one_line(self, self.metrics["environment"], facts)
+
+    def _repr_html_(self) -> str:
+        return terminal_html(self) + picture_html(self.figure("trajectories_2d"))
+
+    def __str__(self) -> str:
+        return text_of(self, WIDTH)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        vehicles, end = self.metrics["vehicles"], float(self.trajectory.t[-1])
+        yield metrics_table(vehicles)
+        yield ""
+        yield from rates(vehicles)
+        yield from legend(self.steady_from, end)
+        yield from remarks(vehicles)
 
     @property
     def ends(self) -> list[float]:
         """When each vehicle ended, s; NaN: it did not."""
-        return [math.nan if row["ended_at_s"] is None else float(row["ended_at_s"]) for row in self.metrics["vehicles"]]
+        return [float(row["ended_at_s"]) for row in self.metrics["vehicles"]]
 
     @property
     def steady_from(self) -> float:
         """Start of the steady state, s."""
         return float(self.metrics["steady_from_s"])
 
-    def scenario(self) -> Scenario | None:
-        """Return the world of the run; None where only its file could tell, such as of a recording."""
-        try:
-            return load_scenario(self.metrics["environment"], self.metrics["overrides"])
-        except CoopenvError:
-            return None
+    def figure(self, kind: str = "errors", *, width: str | float | None = None) -> "Figure":
+        """Return a figure of `coopenv.viz.FIGURE_NAMES`; width and errors as of `coopenv.viz.figures.draw_figure`."""
+        from coopenv.viz.figures import draw_figure
+
+        return draw_figure(kind, self.trajectory, width=width, **self._drawn)
+
+    @property
+    def _drawn(self) -> dict[str, Any]:
+        """Options of all figures."""
+        gain = not states_covariance(self.metrics["observer"])
+        return {"scenario": self.scenario, "ends": self.ends, "steady_from": self.steady_from, "gain": gain}
 
     def save_figures(
         self,
         folder: Path,
         file_format: str,
         width: str | None,
-        scenario: Scenario | None,
         observability: Observability | None = None,
     ) -> list[Path]:
         """Write the figures to a folder and return their paths; arguments as of `coopenv.viz.figures.save_figures`.
@@ -236,12 +325,16 @@ class Results:
             self.trajectory,
             folder,
             observability,
-            scenario=scenario,
-            ends=self.ends,
-            steady_from=self.steady_from,
             file_format=file_format,
             about={"coopenv": self.metrics["versions"]["coopenv"], **about},
-            gain=not states_covariance(about["observer"]),
             width=width,
             note=note,
+            **self._drawn,
         )
+
+
+def _with_nan(value: Any) -> Any:
+    """Return data from JSON with NaN in place of null."""
+    if isinstance(value, dict):
+        return {key: _with_nan(entry) for key, entry in value.items()}
+    return [_with_nan(entry) for entry in value] if isinstance(value, list) else math.nan if value is None else value

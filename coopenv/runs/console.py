@@ -16,6 +16,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from coopenv.base.format import column, number, seconds
+from coopenv.base.terminal import NumberTable
 from coopenv.estimation.metrics import CONVERGED, SETTLED
 from coopenv.world import launch
 from coopenv.world.launch import start_warp
@@ -23,7 +24,7 @@ from coopenv.world.launch import start_warp
 T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
-ENOUGH = 1.0  # s of work from which on its pace can be estimated; with less than 2 % done, LINE_PERIOD
+ENOUGH = 1.0  # s of work after its first part, from which on its pace can be estimated; at least 2 % are then done
 HINT_FROM = 20.0  # s of work left as soon as its pace is known, from which on there is a line at once
 COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; shorter compilations are not announced
 
@@ -48,6 +49,8 @@ class Progress:
         """
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
         self._rate, self._hinted = rate, False
+        self._first: tuple[float, float] | None = None
+        """When the first part was done, s, and how much it was; compiling may have made it slow."""
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         self._bar = Bar(*columns, console=log, transient=True)
@@ -71,6 +74,8 @@ class Progress:
         """Say how much is done, and what is being done now; time counts from a first word that nothing is done yet."""
         if completed == 0.0 and self._completed == 0.0:
             self._begin = monotonic()
+        if completed > 0.0 and self._first is None:
+            self._first = monotonic(), completed
         self._completed, self._description = completed, description or self._description
         self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
         if not self._hinted and not isnan(left := self._left()):
@@ -102,15 +107,16 @@ class Progress:
         return self._completed / self._total if self._total else 0.0
 
     def _left(self) -> float:
-        """Return the time that the rest will take at the pace so far, s; NaN where that is not known yet."""
-        share, elapsed = self._share, monotonic() - self._begin
-        if not 0.0 < share <= 1.0:
+        """Return the time that the rest will take at the pace since the first part, s; NaN: not known yet."""
+        if self._first is None or not self._share <= 1.0:
             return nan
+        left = (self._total or nan) - self._completed
         if self._rate is not None:
-            return ((self._total or nan) - self._completed) / self._rate
-        if elapsed < ENOUGH or (share < 0.02 and elapsed < LINE_PERIOD):
+            return left / self._rate
+        (begin, first), now = self._first, monotonic()
+        if now - begin < ENOUGH or self._share < 0.02 or self._completed <= first:
             return nan
-        return elapsed * (1.0 - share) / share
+        return left * (now - begin) / (self._completed - first)
 
     def _write_lines(self) -> None:
         while not self._over.wait(LINE_PERIOD):
@@ -172,7 +178,7 @@ VERDICTS = {
 
 def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> Table:
     """Return an empty table: columns of names, then of numbers, `gap` + 1 spaces between them."""
-    table = Table(box=box.HORIZONTALS, padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
+    table = NumberTable(box=box.HORIZONTALS, padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
     for heading in names:
         table.add_column(heading, no_wrap=True)
     for heading in numbers:

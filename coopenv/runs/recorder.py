@@ -17,7 +17,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, observation_layout, observation_space
 from coopenv.backends.base import Backend
-from coopenv.backends.sources import simulation_of
+from coopenv.backends.sources import open_backend
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import check_new, replace_text, replacing_folder, writing
 from coopenv.base.installation import environment, environment_id, install_command, needing, version
@@ -27,11 +27,11 @@ from coopenv.evaluation.episodes import Views, driven_vehicles, play
 from coopenv.observers.mailbox import Interference, interference_of, stacked
 from coopenv.observers.recording import MEASURED, Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, ScenarioLike
 
 
 def record(
-    source: Scenario | Backend,
+    source: ScenarioLike | Backend,
     seed: int = 0,
     policy: str | Policy = "zero",
     on_progress: Callable[[float], None] = lambda share: None,
@@ -40,7 +40,7 @@ def record(
     """Drive a backend in float64 to its horizon, or as long as it has ticks, and keep what is sensed.
 
     Args:
-        source: where the ticks come from; a scenario is simulated.
+        source: where the ticks come from: a backend, a scenario as for `coopenv.load_scenario`, or a recording.
         seed: of the episode.
         policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
         on_progress: called with the share of the horizon that is done.
@@ -49,7 +49,7 @@ def record(
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
-    backend: Backend = simulation_of(source) if isinstance(source, Scenario) else source
+    backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
     engine = Engine(scenario, 1, "float64", backend=backend)

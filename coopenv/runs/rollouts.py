@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from platform import python_version
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ from coopenv.estimation.observability import ConvergenceRates, Observability, Tr
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.evaluation.episodes import Views, estimated_here, play
 from coopenv.policies import Policy, load_policy
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario import Scenario, ScenarioLike, load_scenario
 
 RECORDED = (
     *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),
@@ -133,7 +132,7 @@ class Rollout:
 
 
 def rollout(
-    scenario: Scenario | str | Path,
+    scenario: ScenarioLike,
     seed: int = 0,
     steps: int | None = None,
     dtype: str = "float64",
@@ -146,7 +145,7 @@ def rollout(
         trajectory = rollout(coopenv.load_scenario("busy_intersection"), seed=3)
 
     Args:
-        scenario: the world, or the name or the TOML file of one.
+        scenario: the world, as for `coopenv.load_scenario`: name, TOML file, dict or scenario.
         seed: of all that is drawn: starts, noise, losses, and the actions of the policy "random".
         steps: decisions (None: up to the horizon, where a run ends in any case).
         dtype: "float32" or "float64".

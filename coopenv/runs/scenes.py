@@ -25,7 +25,7 @@ from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
-from coopenv.observers.registry import find, named, states_covariance
+from coopenv.observers.registry import find, named, states_covariance, with_observer
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.scenario import Scenario
@@ -167,11 +167,9 @@ def open_source(
     Raises:
         CoopenvError: there is no such thing, or it is of a form that cannot be opened.
     """
-    changes = dict(overrides)
     if observer is not None:
-        changes["observer.name"] = named(observer)
-        find(changes["observer.name"])  # before anything is read
-    return open_backend(name, None, changes, data, variant, topics=topics)
+        find(named(observer))  # before anything is read
+    return open_backend(name, None, with_observer(overrides, observer), data, variant, topics=topics)
 
 
 def title_of(name: str) -> str:

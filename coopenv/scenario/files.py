@@ -5,6 +5,7 @@ import re
 import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,20 @@ from coopenv.scenario.schema import Scenario
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""
 
-OVERRIDES = "overrides (--set)"
+OVERRIDES = "overrides"
 """Where a field stands that an override has made wrong."""
 
 
-def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, Any] | None = None) -> Scenario:
+ScenarioLike = str | Path | Mapping[str, Any] | Scenario
+"""What stands for a scenario: its name (`facade`, `lane:20`), its TOML file, the contents of such a file, or itself."""
+
+
+def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
 
     Args:
-        name_or_path: file stem of `envs/`, a scene such as `lane:20`, the path of a TOML file, or a scenario.
+        name_or_path: file stem of `envs/`, a scene such as `lane:20`, the path of a TOML file, a dict of what such a
+            file holds, or a scenario.
         overrides: dotted key to value; list entries by index or `*` for all (`vehicles.*.goal.radius`).
 
     Raises:
@@ -43,10 +49,18 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
         raw = name_or_path.model_dump(mode="json", exclude_unset=True)
         override(raw, overrides)
         return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
+    if not isinstance(name_or_path, str | Path | Mapping):
+        kind = type(name_or_path).__name__
+        raise ScenarioError(f"environment: expected a name, a path, a dict of its keys or a Scenario, got {kind}")
     made = is_scene(str(name_or_path))
-    path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
+    if isinstance(name_or_path, Mapping):
+        path = Path("scenario")
+    else:
+        path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     try:
-        if made:
+        if isinstance(name_or_path, Mapping):
+            raw = located(deepcopy(dict(name_or_path)), Path.cwd())
+        elif made:
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
             raw = located(read_toml(path, ScenarioError, path.name), path.parent)
@@ -62,8 +76,16 @@ def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, A
         raise
 
 
-def _is_valid(name_or_path: str | Path) -> bool:
-    """Return whether a file or scene by itself describes a world."""
+def scenario_name(name_or_path: ScenarioLike) -> str:
+    """Return what results call a scenario: the stem of its file, the name of a scene; without these its title."""
+    if isinstance(name_or_path, str | Path):
+        return Path(name_or_path).stem
+    title = name_or_path.title if isinstance(name_or_path, Scenario) else name_or_path.get("title", "scenario")
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", str(title)).strip("_") or "scenario"
+
+
+def _is_valid(name_or_path: ScenarioLike) -> bool:
+    """Return whether a file, a scene or a dict by itself describes a world."""
     with warnings.catch_warnings(action="ignore"):
         try:
             load_scenario(name_or_path)

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.errors import ScenarioWarning, check_one_of, listed, shown, suggest
+from coopenv.base.notebook import facts_html, one_line
 from coopenv.base.sections import Section
 from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
@@ -120,6 +121,20 @@ class Scenario(Section):
     action: Action = Action()
     reward: Reward = Reward()
     termination: Termination = Termination()
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """The main figures: of vehicles and landmarks, the observer's name, and the length, s."""
+        counts = {"vehicles": len(self.vehicles), "landmarks": len(self.landmarks)}
+        return {**counts, "observer": self.observer.name, "horizon": self.horizon}
+
+    def __repr__(self) -> str:
+        return one_line(self, self.title, self.facts)
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        return facts_html(self.title, {"description": self.description, **self.facts})
 
     @property
     def paced(self) -> bool:

@@ -126,7 +126,7 @@ class Settings(Section):
     minutes: Positive | None = None
     """Length of the training, min, instead of `steps`."""
     scenario: dict[str, Any] = Field(default={})
-    """Overrides of the scenario, as tables or dotted keys, as with `--set`."""
+    """Overrides of the scenario, as tables or dotted keys, as with `--override`."""
     randomised: dict[str, Any] = Field(default={})
     """Further ones for the worlds to learn in alone, such as `randomisation.camera_range = [0.7, 2.0]`."""
     variations: tuple[Variation, ...] = ()

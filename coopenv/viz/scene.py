@@ -92,10 +92,10 @@ class Frame:
         R_hat, p_hat = kept["estimate_rotation"], kept["estimate_position"]
         covariance = np.array(shown.view("covariance")[world], float)
         estimate = (R_hat @ p_hat[..., None])[..., 0]
+        spread = position_covariance(R_hat, estimate, covariance)
         absent = np.asarray(shown.view("present")[world]) == 0
         kept["position"][absent] = np.nan
         estimate[absent[len(absent) - len(estimate) :]] = np.nan
-        spread = position_covariance(R_hat, p_hat, covariance)
         return cls(**{**kept, "estimate_position": estimate, "position_covariance": spread})
 
     @property

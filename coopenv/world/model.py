@@ -36,10 +36,11 @@ def _precision(scalar: Any) -> Precision:
 PRECISIONS = {"float32": _precision(wp.float32), "float64": _precision(wp.float64)}
 
 
-def precision(dtype: str) -> Precision:
-    """Return the types for `float32` or `float64`. Raises DeviceError: another name."""
-    if not isinstance(dtype, str) or dtype not in PRECISIONS:
-        raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), PRECISIONS)}; known: float32, float64")
+def precision(dtype: object) -> Precision:
+    """Return the types for `float32` or `float64`, by name or as a type of NumPy. Raises DeviceError: another one."""
+    dtype = str(getattr(dtype, "__name__", dtype))
+    if dtype not in PRECISIONS:
+        raise DeviceError(f"unknown dtype '{dtype}'{suggest(dtype, PRECISIONS)}; known: float32, float64")
     return PRECISIONS[dtype]
 
 

@@ -44,14 +44,16 @@ def wait_for(text: io.StringIO, words: str) -> None:
 
 
 def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([100.0])
-    monkeypatch.setattr(module, "monotonic", lambda: next(clock, 120.0))
+    clock = [100.0]
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
     with Progress(Console(file=text, width=20), "simulating a long name", total=4) as progress:
+        clock[0] = 120.0
         wait_for(text, "simulating a long name: 20 s\n")
-        progress.update(1)
-        wait_for(text, "simulating a long name: 25 % after 20 s, about 60 s left\n")
+        progress.update(1)  # the first part took longer than others, as it compiled something
+        wait_for(text, "simulating a long name: 25 % after 20 s\n")
+        clock[0] = 130.0
         progress.advance("drawing")
-        wait_for(text, "drawing: 50 % after 20 s, about 20 s left\n")
+        wait_for(text, "drawing: 50 % after 30 s, about 20 s left\n")
 
 
 def test_time_left_is_not_told_before_there_is_enough_to_go_by(
@@ -70,11 +72,11 @@ def test_time_left_is_not_told_before_there_is_enough_to_go_by(
     monkeypatch.setattr(module, "LINE_PERIOD", 10.0)
     clock[0] = 104.8  # of a slow beginning
     assert progress.line() == "simulating: 0 % after 2 s"
-    clock[0] = 105.0
-    progress.update(20)
+    clock[0] = 105.4
+    progress.update(20)  # 19 more in 1.9 s
     progress.__exit__()
     assert "simulating: 5 % after 2 s, about 38 s left\n" in text.getvalue()
-    assert "535" not in text.getvalue() and "199" not in text.getvalue()
+    assert "left" not in text.getvalue().partition("simulating: 5 %")[0]
 
 
 def test_in_real_time_the_time_left_is_known(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -373,7 +373,7 @@ def test_mistakes_in_a_deployment_name_file_and_field(change: tuple[str, str], l
 
 def test_a_mistake_of_the_command_line_is_not_the_files(tmp_path: Path) -> None:
     path = write_fleet(tmp_path, 'overrides = { "noise.velocity" = 0.1 }\n' + OVERTAKING)
-    with pytest.raises(CoopenvError, match=r"^overrides \(--set\): noise\.velosity: unknown key"):
+    with pytest.raises(CoopenvError, match=r"^overrides: noise\.velosity: unknown key"):
         open_svea(path, None, {"noise.velosity": 1}, transport=Hub().connect())
     with pytest.raises(CoopenvError, match=r"^unknown environment 'gone'"):
         open_svea(path, "gone", transport=Hub().connect())

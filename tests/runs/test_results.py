@@ -42,7 +42,7 @@ def test_a_run_is_read_again(folder: Path) -> None:
     assert results.metrics["observer"] == "robust" and results.metrics["seed"] == 2
     assert results.trajectory.vehicles.tolist() == ["vehicle_1", "vehicle_2"]
     assert np.isnan(results.ends).all() and results.steady_from == pytest.approx(1.4)
-    scenario = results.scenario()
+    scenario = results.scenario
     assert scenario is not None and scenario.observer.name == "robust" and scenario.horizon == 2.0
 
 

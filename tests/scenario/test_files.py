@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pytest
 
 from coopenv.base.errors import ScenarioError, ScenarioWarning, UnknownEnvironmentError
 from coopenv.base.installation import list_envs
-from coopenv.scenario import load_scenario, scenario_path
+from coopenv.scenario import load_scenario, scenario_name, scenario_path
 
 MINIMAL = """
 title = "t"
@@ -204,6 +205,34 @@ def test_star_means_every_entry_and_later_overrides_win(file: Path) -> None:
     assert [v.body.size[0] for v in made.vehicles if v.body] == [1.0, 2.0]
 
 
+def test_a_dict_is_what_its_file_is(file: Path) -> None:
+    raw = tomllib.loads(MINIMAL)
+    assert load_scenario(raw) == load_scenario(file)
+    changes = {"vehicles.*.goal.radius": 0.9, "landmarks.A.position": [1, 1, 1]}
+    assert load_scenario(raw, changes) == load_scenario(file, changes)
+    assert raw == tomllib.loads(MINIMAL)
+    whole = load_scenario(file)
+    assert load_scenario(whole.model_dump()) == whole
+    assert repr(whole) == "Scenario('t', vehicles=2, landmarks=3, observer='riccati', horizon=5.0)"
+    assert (scenario_name(raw), scenario_name(whole), scenario_name(file)) == ("t", "t", "mine")
+    assert scenario_name({"title": " A b/c "}) == "A_b_c"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "changes", "words"),
+    [
+        ({}, {}, "^scenario: title: Field required"),
+        ({"horizn": 2.0}, {}, r"^scenario: horizn: unknown key \(did you mean 'horizon'"),
+        (tomllib.loads(MINIMAL), {"horizn": 2.0}, r"^overrides: horizn: unknown key"),
+        (3, {}, "^environment: expected a name, a path, a dict of its keys or a Scenario, got int"),
+        (None, {}, "got NoneType"),
+    ],
+)
+def test_what_is_no_scenario(wrong: Any, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(wrong, changes)
+
+
 def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:
     before = load_scenario(file)
     load_scenario(file, {"vehicles.*.goal.radius": 0.9, "noise.enabled": False, "landmarks.A.position": [1, 1, 1]})
@@ -235,7 +264,7 @@ def test_wrong_overrides(file: Path, key: str, words: str) -> None:
 def test_override_values_are_checked(file: Path) -> None:
     with pytest.raises(
         ScenarioError,
-        match=r"overrides \(--set\): rates.camera: Input should be greater than or equal to 0.001, got -5",
+        match=r"overrides: rates.camera: Input should be greater than or equal to 0.001, got -5",
     ):
         load_scenario(file, {"rates.camera": -5})
     with pytest.raises(ScenarioError, match="whole multiple of the decision rate"):

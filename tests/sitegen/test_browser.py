@@ -99,7 +99,7 @@ def test_code_is_copied_as_it_stands(site: Path, browser: Any) -> None:
     page.locator("article .wraps button").first.click()
     page.wait_for_function("window.copied")
     lines = page.evaluate("window.copied").splitlines()
-    assert lines[0] == "coopenv run busy_intersection --set horizon=5 --figures pdf --width ieee1 --out out/paper"
+    assert lines[0] == "coopenv run busy_intersection --override horizon=5 --figures pdf --width ieee1 --out out/paper"
     assert len(lines) == 2
     page.close()
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from itertools import count, repeat
-from pathlib import Path
 from typing import Any
 
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import NUMBERS, PlainInfos
 from coopenv.base.installation import install_command
+from coopenv.scenario import ScenarioLike, scenario_name
 
 try:
     from benchmarl.environments.pettingzoo.common import PettingZooClass
@@ -64,11 +64,11 @@ class CooperativeTask(PettingZooClass):
         }
 
 
-def task(name_or_path: str | Path, **options: Any) -> CooperativeTask:
+def task(name_or_path: ScenarioLike, **options: Any) -> CooperativeTask:
     """Return an environment as a task for `benchmarl.experiment.Experiment`.
 
     Args:
         name_or_path: for example "urban_crossing".
         options: those of `coopenv.parallel_env`.
     """
-    return CooperativeTask(name=Path(str(name_or_path)).stem, config={"env": name_or_path, **options})
+    return CooperativeTask(name=scenario_name(name_or_path), config={"env": name_or_path, **options})

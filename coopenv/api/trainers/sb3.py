@@ -3,7 +3,6 @@
 import copy
 import time
 from collections.abc import Generator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from coopenv.api.vector_env import CooperativeVectorEnv, RecordVehicleEpisodes
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.base.installation import install_command
 from coopenv.estimation.outcomes import Outcome
+from coopenv.scenario import ScenarioLike
 
 try:
     from stable_baselines3.common.buffers import RolloutBuffer
@@ -184,11 +184,11 @@ class CooperativeSB3VecEnv(VecEnv):
             raise CoopenvError(f"{what}: rows share one batch, so it cannot be done for some rows only")
 
 
-def make_sb3_vec_env(name_or_path: str | Path, *, seed: int | None = None, **options: Any) -> CooperativeSB3VecEnv:
+def make_sb3_vec_env(name_or_path: ScenarioLike, *, seed: int | None = None, **options: Any) -> CooperativeSB3VecEnv:
     """Return num_worlds x vehicles rows as an SB3 `VecEnv`.
 
     Args:
-        name_or_path: environment or TOML file.
+        name_or_path: as for `coopenv.make_vec`.
         seed: of the first reset, as for `CooperativeVectorEnv.reset`.
         options: `num_worlds` and whatever else `coopenv.make_vec` takes but `autoreset` and `arrays`, which are those
             that SB3 expects.

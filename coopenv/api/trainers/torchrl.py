@@ -1,6 +1,5 @@
 """TorchRL: a batch as one batched environment, rows (world, vehicle). Needs the extra `torchrl`."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from coopenv.api.make import make_vec
 from coopenv.api.vector_env import CooperativeVectorEnv, TrueEnds
 from coopenv.base.installation import install_command
+from coopenv.scenario import ScenarioLike
 
 try:
     from torchrl.envs import GymWrapper
@@ -46,13 +46,13 @@ class WholeWorlds(VectorWrapper):
         return *self.env.step(actions)[:4], {}
 
 
-def batched_env(name_or_path: str | Path, *, num_worlds: int, **options: Any) -> GymWrapper:
+def batched_env(name_or_path: ScenarioLike, *, num_worlds: int, **options: Any) -> GymWrapper:
     """Return num_worlds x vehicles rows as one TorchRL environment of that batch size, for a policy that they share.
 
     A row is done when its vehicle's episode ends, see `coopenv.api.vector_env.TrueEnds`.
 
     Args:
-        name_or_path: environment or TOML file.
+        name_or_path: as for `coopenv.make_vec`.
         num_worlds: how many worlds.
         options: whatever else `coopenv.make_vec` takes but `autoreset` and `arrays`.
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
@@ -81,6 +80,8 @@ def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
     late = np.arange(recording.ticks) >= _first_tick(recording, fault)
     bias = fault.value * np.outer(late, _on(recording, fault))[..., None] * (0.0, 0.0, 1.0)
+    from scipy.spatial.transform import Rotation  # late: `coopenv list` imports this module
+
     turn = Rotation.from_rotvec((bias * recording.dt).reshape(-1, 3)).as_matrix().reshape(recording.rotation.shape)
     return replace(recording, rotation=recording.rotation @ turn, angular_velocity=recording.angular_velocity + bias)
 

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from coopenv.base.columns import Columns
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text, replacing_folder
 from coopenv.base.format import json_text, jsonable, with_error
@@ -25,7 +26,6 @@ from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import KINDS, PLOTLY, basin_figure, chart_data, packed, page_file, stanford_figure
 from coopenv.bench.observers.rows import BOUNDS, Leaderboard, Row, spread
 from coopenv.bench.observers.tables import (
-    csv_text,
     environment,
     failures,
     headline,
@@ -124,8 +124,8 @@ def write_files(
 ) -> None:
     """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
     content = document(board, command)
-    texts = {JSON_FILE: json_text(content), CSV_FILE: board.to_csv(), WINDOWS_FILE: csv_text(board.window_rows)}
-    texts |= {BASIN_FILE: csv_text(board.draws)} if board.draws else {}
+    texts = {JSON_FILE: json_text(content), CSV_FILE: board.to_csv(), WINDOWS_FILE: board.to_csv(windows=True)}
+    texts |= {BASIN_FILE: Columns.of_rows(board.draws).csv()} if board.draws else {}
     texts |= {LATEX_FILE: board.to_latex(), REPORT_FILE: report_text(board, content)}
     for name, text in texts.items():
         replace_text(out / name, text)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from io import StringIO
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,25 +11,30 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
+from coopenv.base.columns import Columns, Tabular, written
 from coopenv.base.errors import CoopenvError, check_one_of, checked_seed
-from coopenv.base.files import replace_text
-from coopenv.base.installation import needing
+from coopenv.base.notebook import one_line, picture_html, terminal_html
+from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
-from coopenv.bench.observers.rows import EDGES, Leaderboard, Row, WindowRow, checked_edges
+from coopenv.bench.observers.rows import EDGES, Leaderboard, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
 from coopenv.runs.console import Progress
+from coopenv.scenario import ScenarioLike
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 
-class Comparison(Leaderboard):
-    """How observers did on the same records, as tables, files and figures. Printed, it is its tables."""
+class Comparison(Leaderboard, Tabular):
+    """How observers did on the same records, as tables, files and figures.
+
+    Printed, it is its tables; `found["riccati"]` has the results of one observer. Tables of whole runs, or with
+    `windows=True` of every window of time: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
+    """
 
     def table(self, variant: str | None = None) -> Table:
         """Return the position RMSE of every observer and vehicle beside the bounds, m, as a table for a terminal.
@@ -45,24 +49,30 @@ class Comparison(Leaderboard):
         """
         return tables.error_table(self, self._checked(variant))
 
-    def to_pandas(self, windows: bool = False) -> DataFrame:
-        """Return the rows with all columns, of whole runs or of every window.
+    def columns(self, windows: bool = False) -> Columns:
+        """Return the rows with all columns, of whole runs or of every window of time."""
+        keys = ("variant", "observer", *(("window",) if windows else ()), "vehicle")
+        return Columns.of_rows(self.window_rows if windows else self.rows, *keys)
+
+    def __getitem__(self, observer: str) -> Comparison:
+        """Return the results of one observer alone.
 
         Raises:
-            CoopenvError: pandas is not installed.
+            CoopenvError: it was not compared.
         """
-        with needing("a table of pandas needs pandas: pip install pandas"):
-            from pandas import DataFrame
-        rows, kind = (self.window_rows, WindowRow) if windows else (self.rows, Row)
-        return DataFrame([asdict(row) for row in rows], columns=[f.name for f in fields(kind)])
+        check_one_of("unknown observer", observer, self.observers)
+        samples = [sample for sample in self.samples if sample.observer == observer]
+        draws = [draw for draw in self.draws if draw.observer == observer]
+        return replace(self, observers=(observer,), samples=samples, draws=draws)
 
-    def to_csv(self, path: str | Path | None = None) -> str:
-        """Return the rows with all columns as CSV, and write them where a path is given.
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.observers)
 
-        Raises:
-            OutputError: the file cannot be written.
-        """
-        return _written(tables.csv_text(self.rows), path)
+    def __len__(self) -> int:
+        return len(self.observers)
+
+    def __contains__(self, observer: object) -> bool:
+        return observer in self.observers
 
     def to_latex(self, path: str | Path | None = None, variant: str | None = None) -> str:
         """Return the position RMSE with standard errors as a LaTeX table (package booktabs); write it to a path.
@@ -74,7 +84,7 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: the variant was not run, or the file cannot be written.
         """
-        return _written(tables.latex(self, self._checked(variant)), path)
+        return written(tables.latex(self, self._checked(variant)), path)
 
     def figure(
         self,
@@ -118,10 +128,16 @@ class Comparison(Leaderboard):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         return tables.everything(self, options.max_width)
 
+    def __repr__(self) -> str:
+        facts = {"observers": self.observers, "variants": tuple(self.variants), "seeds": len(self.seeds)}
+        return one_line(self, self.environment, facts)
+
+    def _repr_html_(self) -> str:
+        drawn = any(self.samples_in(next(iter(self.variants))))  # unless all observers failed
+        return terminal_html(self) + (picture_html(self.figure()) if drawn else "")
+
     def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=tables.WIDTH, markup=False, highlight=False).print(self)
-        return text.getvalue()
+        return text_of(self, tables.WIDTH)
 
     def _checked(self, variant: str | None) -> str:
         if variant is None:
@@ -131,16 +147,9 @@ class Comparison(Leaderboard):
         return variant
 
 
-def _written(text: str, path: str | Path | None) -> str:
-    """Return a text, which is also written where a path is given."""
-    if path is not None:
-        replace_text(path, text)
-    return text
-
-
 def compare(
     observers: Iterable[str | Factory] | None,
-    environment: str | Path,
+    environment: ScenarioLike,
     seeds: int | Iterable[int] = 5,
     *,
     variants: str | Sequence[str] | None = None,
@@ -159,7 +168,8 @@ def compare(
 
     Args:
         observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
-        environment: name, TOML file, recorded robots (`mrclam_1`, `mrclam_1_space`, ...), MCAP file or ROS bag.
+        environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
+            `mrclam_1_space`, ...), MCAP file or ROS bag.
         seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
@@ -179,7 +189,7 @@ def compare(
     source = find_source(environment, overrides, data, topics, faults, policy)
     plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
-    with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
+    with Progress(Terminal(stderr=True), plan.work, total=1.0) as progress:
         return plan.run(Local(jobs), progress.update)
 
 

@@ -249,14 +249,12 @@ def variant_rows() -> list[dict[str, str]]:
     return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
 
 
-def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]) -> FaultVariant:
+def with_world(variant: FaultVariant, scenario: Scenario) -> FaultVariant:
     """Return a variant with the world that has its faults, where any is of the world.
 
     Args:
         variant: which one.
-        text: name or file of the environment.
         scenario: the environment with its overrides.
-        overrides: these.
 
     Raises:
         CoopenvError: unknown vehicle, no followers, errors of sensors without noise, or a value is not possible.
@@ -281,7 +279,7 @@ def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: 
             ):
                 raise CoopenvError(f"fault {fault.text}: needs noise.enabled = true, which is off")
             found |= {f"vehicles.{name}.{section}.{k}": value for k, value in given.items()}
-    return replace(variant, scenario=load_scenario(text, {**overrides, **found})) if found else variant
+    return replace(variant, scenario=load_scenario(scenario, found)) if found else variant
 
 
 def check_names(fault: Fault, vehicles: Sequence[str], landmarks: Sequence[str]) -> None:

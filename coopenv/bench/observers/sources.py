@@ -30,7 +30,7 @@ from coopenv.estimation.metrics import steady_start
 from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
 
 already_warned = partial(warnings.catch_warnings, action="ignore", category=DataWarning)
 """Silences the warnings on recorded data that `Source.check` has given."""
@@ -212,14 +212,14 @@ ALL = "all"  # asks for every variant that the source can have
 
 
 def find_source(
-    text: str | Path,
+    text: ScenarioLike,
     overrides: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     topics: str | Path | None = None,
     faults: Sequence[str] = (),
     policy: str | None = None,
 ) -> RecordSource:
-    """Return the source of an environment's name, a scenario file, a sub-dataset's name, a log file or a ROS bag.
+    """Return the source of an environment as for `load_scenario`, a sub-dataset's name, a log file or a ROS bag.
 
     Args:
         text: which one.
@@ -232,22 +232,19 @@ def find_source(
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    if not isinstance(text, str | Path):
-        kind = type(text).__name__
-        raise CoopenvError(f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}")
     if isinstance(faults, str):
         raise CoopenvError(f"faults: expected a list such as ['{faults}']")
     sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(faults))
-    bag, path = is_bag(text, topics), Path(text)
+    bag = is_bag(text, topics)
     if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
         scenario = load_scenario(text, overrides)
-        worlds = tuple(with_world(made, str(text), scenario, overrides or {}) for made in added)
+        worlds = tuple(with_world(made, scenario) for made in added)
         if policy is not None:
             if not scenario.driven:
                 raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
             load_policy(policy, scenario, 0)
-        return SimulatedRecords(path.stem, scenario, policy or "zero", added=worlds)
-    robots = sort is SourceKind.DATASET
+        return SimulatedRecords(scenario_name(text), scenario, policy or "zero", added=worlds)
+    robots, path = sort is SourceKind.DATASET, Path(str(text))
     folder, topic_map = (None if given is None else Path(given) for given in (data, topics))
     refused = {
         f"--policy {policy}: {text} is recorded, its vehicles cannot be driven": policy is not None,
@@ -256,7 +253,7 @@ def find_source(
         ),
         f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9": data and not robots,
         f"--map {topics}: is for ROS bags, {text} is none": topics and not bag,
-        f"--set {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
+        f"--override {next(iter(overrides or ()), '')}: {text} is recorded, it has no scenario to change": (
             overrides and not bag
         ),
         f"no such log file: {text}": not (bag or robots or path.is_file()),

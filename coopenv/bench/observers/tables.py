@@ -1,17 +1,15 @@
 """The tables of a comparison of observers."""
 
-import csv
 import re
 from collections.abc import Callable, Iterator, Sequence
-from io import StringIO
 from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.table import Table
 
-from coopenv.base.format import in_parentheses, jsonable, number, with_error
-from coopenv.bench.observers.convergence import Draw, basin_failures, basin_table
+from coopenv.base.format import in_parentheses, number, with_error
+from coopenv.bench.observers.convergence import basin_failures, basin_table
 from coopenv.bench.observers.faults import NOMINAL, VARIANTS
 from coopenv.bench.observers.judge import TimeWindow
 from coopenv.bench.observers.rows import (
@@ -104,7 +102,6 @@ def mean_of(rows: Sequence[Row], column: str) -> float:
 
 
 WIDTH = 80
-WIDE = 100  # without a terminal: vehicles have columns of their own
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 
 
@@ -330,16 +327,6 @@ def failures(rows: Sequence[Row]) -> list[str]:
         if row.failure:
             failed.setdefault((row.observer, row.failure), {})[row.variant] = None
     return [f"{observer} ({', '.join(variants)}): failed {why}" for (observer, why), variants in failed.items()]
-
-
-def csv_text(rows: Sequence[Row] | Sequence[Draw] | Sequence[WindowRow]) -> str:
-    """Return rows as CSV; figures that do not exist are empty."""
-    table = [jsonable(row) for row in rows]
-    text = StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(table[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    return text.getvalue()
 
 
 def latex(board: Leaderboard, variant: str) -> str:

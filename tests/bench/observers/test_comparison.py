@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import subprocess
-import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -160,13 +159,30 @@ def test_the_table_fits_a_column_of_a_paper(tmp_path: Path) -> None:
     assert done.returncode == 0 and "Overfull" not in done.stdout, done.stdout[-2000:]
 
 
-def test_pandas_is_given_every_column(comparison: coopenv.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(CoopenvError, match="pip install pandas"):
-        comparison.to_pandas()
-    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda rows, columns: (rows, columns)))
-    rows, columns = comparison.to_pandas()  # type: ignore[misc]
-    assert [list(row) for row in rows] == [columns] * 12
+def test_tables_have_the_units_that_the_columns_state(comparison: coopenv.Comparison) -> None:
+    frame, units = comparison.to_pandas(), comparison.columns().units
+    assert len(frame) == 12 and frame.attrs["units"] == units
+    for column in fields(Row):
+        meaning = column.metadata["meaning"].partition(";")[0]
+        if unit := re.search(r", (m|deg|s|1/s|bytes per second|microseconds)$", meaning):
+            assert units[column.name] == {"bytes per second": "byte/s", "microseconds": "us"}.get(unit[1], unit[1])
+    data = comparison.to_xarray(windows=True)
+    assert list(data.observer.values) == list(comparison) and data.sizes["vehicle"] == 2
+    for row in comparison.window_rows:
+        cell = data.sel(variant=row.variant, observer=row.observer, window=row.window, vehicle=row.vehicle)
+        np.testing.assert_equal(float(cell.position_rmse_m), row.position_rmse_m)
+    assert comparison.to_polars().columns == list(frame.columns)
+
+
+def test_one_observer_of_a_comparison(comparison: coopenv.Comparison) -> None:
+    assert len(comparison) == 3 and "riccati" in comparison and "robust" not in comparison
+    alone = comparison["riccati"]
+    assert str(alone.rows) == str([row for row in comparison.rows if row.observer == "riccati"])
+    assert "riccati" in str(alone) and "Mine" not in str(alone)
+    assert repr(alone).startswith("Comparison('overtaking', observers=('riccati',), variants=('nominal', 'v2x_loss')")
+    assert "<pre" in alone._repr_html_() and "data:image/png;base64" in alone._repr_html_()
+    with pytest.raises(CoopenvError, match=r"unknown observer 'ricati' \(did you mean 'riccati'\?\); known: Raises"):
+        comparison["ricati"]
 
 
 @pytest.mark.parametrize("kind", ["errors", "consistency", "variants", "cost"])

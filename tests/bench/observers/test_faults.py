@@ -185,7 +185,7 @@ def test_variants_and_the_command_that_gives_them_again() -> None:
     assert plan.variants == ("nominal", *faults)
     assert given.command_of(plan) == (
         f"coopenv bench observers {ENV} --observers mekf --variants nominal "
-        "--fault lie=drift:0.5@0.1 --fault v2x_loss=0.5 --seeds 2 --first 7 --set horizon=0.5"
+        "--fault lie=drift:0.5@0.1 --fault v2x_loss=0.5 --seeds 2 --first 7 --override horizon=0.5"
     )
     names = figure_files(plan.variants, "svg")
     assert all("/" not in name and ":" not in name and "," not in name for name in names)

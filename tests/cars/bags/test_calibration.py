@@ -211,13 +211,13 @@ BAD: list[tuple[list[str], str]] = [
     (["nowhere.bag"], "nowhere.bag: needs the map of its topics, --map topics.toml"),
     (["svea_crossing"], "svea_crossing: needs the map of its topics"),
     (["LOG", "LOG"], "needs the map of its topics"),
-    (["LOG", "--set", "camera.position=[0,0,0]"], "--set: needs the map"),
+    (["LOG", "--set", "camera.position=[0,0,0]"], "--override: needs the map"),
     (["empty.bag", "--map", "nowhere.toml"], "nowhere.toml: cannot be read"),
     (["nowhere.bag", "--map", "good.toml"], "no such bag: nowhere.bag"),
     (["empty.bag", "--map", "calibrated.toml"], "nowhere.toml"),
     (["empty.bag", "--map", "number.toml"], "calibration"),
     (["short.mcap"], "short.mcap: vehicle_1 has"),
-    (["nowhere.bag", "--map", "good.toml", "--set", "camera"], "--set camera: expected KEY=VALUE"),
+    (["nowhere.bag", "--map", "good.toml", "--set", "camera"], "--override camera: expected KEY=VALUE"),
 ]
 
 

@@ -206,7 +206,7 @@ def test_dead_reckoning_only_predicts() -> None:
     assert_allclose(position, 0.4, atol=1e-10)
     assert angle.max() < 1e-10
     R, p, P = (state[name][0, 0] for name in ("estimate_rotation", "estimate_position", "covariance"))
-    assert_allclose(position_covariance(R, p, P), 100.0 * np.eye(3), rtol=1e-5, atol=1e-3)
+    assert_allclose(position_covariance(R, R @ p, P), 100.0 * np.eye(3), rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["busy_intersection_tracking", "urban_crossing", "overtaking"])

@@ -1,0 +1,170 @@
+"""What users of PettingZoo, Gymnasium and notebooks try without a page: it works, or one line says what does."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from pettingzoo.utils import BaseParallelWrapper, aec_to_parallel, parallel_to_aec
+
+import coopenv
+from coopenv.api.arguments import Info
+from coopenv.cli import main
+from coopenv.runs import record, rollout
+from coopenv.scenario import Scenario
+from tests.helpers.commands import refused
+from tests.helpers.four_way import FOUR_WAY
+
+ENV = "facade"
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return coopenv.load_scenario(ENV, {"horizon": 0.5})
+
+
+def kinds(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "scenario": scenario,
+        "dict": scenario.model_dump(),
+        "JSON": json.loads(scenario.model_dump_json(exclude_unset=True)),
+        "changed copy": coopenv.load_scenario(coopenv.load_scenario(ENV), {"horizon": 0.5}),
+    }
+
+
+@pytest.mark.parametrize("kind", ["scenario", "dict", "JSON", "changed copy"])
+def test_whatever_stands_for_a_scenario_goes_everywhere(scenario: Scenario, kind: str) -> None:
+    given = kinds(scenario)[kind]
+    with coopenv.parallel_env(given) as env, coopenv.make_vec(given, num_worlds=1) as batch:
+        observations, _ = env.reset(seed=4)
+        rows, _ = batch.reset(seed=4)
+        np.testing.assert_array_equal(rows[0], observations["vehicle_1"])
+        assert env.scenario == batch.scenario == scenario
+    np.testing.assert_array_equal(rollout(given, seed=4).position, coopenv.run(given, seed=4).trajectory.position)
+    assert len(record(given, seed=4).t) == 1 + scenario.horizon_ticks
+    if kind == "dict":
+        assert coopenv.compare(["dead_reckoning"], given, seeds=1).environment == "Facade"
+        assert list(coopenv.evaluate(given, ["peek"], worlds=2).episodes) == ["peek"]
+
+
+def test_paths_and_scenes_are_names_as_well() -> None:
+    whole = coopenv.load_scenario(FOUR_WAY)
+    assert coopenv.parallel_env(Path(FOUR_WAY)).scenario == whole
+    assert repr(coopenv.make_vec("lane:3", num_worlds=2)).startswith(
+        "CooperativeVectorEnv('lane:3', worlds=2, vehicles=3"
+    )
+
+
+def test_an_environment_prints_copies_pickles_and_closes() -> None:
+    env = coopenv.parallel_env(ENV)
+    assert (
+        repr(env) == "CooperativeLocalisationEnv('facade', vehicles=1, landmarks=14, observer='robust', horizon=40.0)"
+    )
+    assert "<img" not in env._repr_html_()  # nothing has begun
+    assert (env.unwrapped, env.agents, env.max_num_agents) == (env, [], 1)
+    env.reset(seed=np.int64(3))
+    assert "data:image/png;base64," in env._repr_html_()
+    action = {"vehicle_1": [0.5, 0.0]}
+    expected = env.get_state()["tick"]
+    for other in (copy.deepcopy(env), copy.copy(env), pickle.loads(pickle.dumps(env))):
+        np.testing.assert_array_equal(other.get_state()["tick"], expected)
+    ahead = copy.deepcopy(env)
+    np.testing.assert_array_equal(ahead.step(action)[0]["vehicle_1"], env.step(action)[0]["vehicle_1"])
+    env.close()
+    env.close()
+    env.reset(seed=3)
+
+
+def test_wrappers_and_registries() -> None:
+    turned = aec_to_parallel(parallel_to_aec(BaseParallelWrapper(coopenv.parallel_env(ENV))))
+    assert turned.reset(seed=1)[0].keys() == {"vehicle_1"}
+    assert (
+        pettingzoo.make("parallel", "coopenv/Facade-v0", overrides={"horizon": 1.0}).unwrapped.scenario.horizon == 1.0
+    )
+    view: Any = gymnasium.make("coopenv/Facade-v0", max_episode_steps=2, render_mode="rgb_array")
+    for wrapper in (gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.RecordEpisodeStatistics):
+        view = wrapper(view)
+    view.reset(seed=2)
+    assert view.render().shape[-1] == 3
+    assert [view.step(view.action_space.sample())[3] for _ in range(2)] == [False, True]
+    assert len(view.return_queue) == 1
+
+
+def test_infos_have_the_entries_that_their_type_names() -> None:
+    env = coopenv.parallel_env("urban_crossing")
+    _, infos = env.reset(seed=0)
+    hints = get_type_hints(Info)
+    for info in infos.values():
+        assert info.keys() == hints.keys() - {"car"}
+        assert type(info["position_error"]) is float and type(info["visible"]) is tuple
+        assert info["estimate"].keys() == get_type_hints(hints["estimate"]).keys()
+
+
+def test_types_of_numpy_are_precisions() -> None:
+    assert coopenv.parallel_env(ENV, dtype=np.float64).engine.world.precision.name == "float64"  # type: ignore[arg-type]
+    with pytest.raises(coopenv.DeviceError, match=r"^unknown dtype 'float16' \(did you mean 'float\d\d'\?\)"):
+        coopenv.make_vec(ENV, num_worlds=1, dtype="float16")
+
+
+def test_one_vehicle_of_a_trajectory(scenario: Scenario) -> None:
+    whole = rollout(FOUR_WAY, steps=2)
+    np.testing.assert_array_equal(whole["vehicle_3"].position[:, 0], whole.position[:, 2])
+    with pytest.raises(coopenv.CoopenvError, match="unknown vehicle 'f3'"):
+        whole["f3"]
+
+
+MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+    "an id": (lambda: coopenv.parallel_env("coopenv/Facade-v0"), r"an id, for gymnasium\.make; .* is 'facade'"),
+    "a title": (lambda: coopenv.parallel_env("Facade"), r"did you mean 'facade'\?"),
+    "a dash": (lambda: coopenv.make_vec("urban-crossing", num_worlds=1), r"did you mean 'urban_crossing'\?"),
+    "None": (lambda: coopenv.parallel_env(None), "^environment: expected a name.*got NoneType"),  # type: ignore[arg-type]
+    "a list": (lambda: coopenv.compare(["riccati"], [ENV]), "^environment: .* got list"),  # type: ignore[arg-type]
+    "a set attribute": (
+        lambda: setattr(coopenv.load_scenario(ENV), "horizon", 3.0),
+        r"^Scenario\.horizon: is frozen; load_scenario\(scenario, \{'key': value\}\) returns a changed scenario",
+    ),
+    "a nested one": (
+        lambda: setattr(coopenv.load_scenario(ENV).noise, "enabled", False),
+        r"^Noise\.enabled: is frozen",
+    ),
+    "a seed as text": (lambda: coopenv.parallel_env(ENV).reset(seed="3"), "^seed must be a whole number, got '3'"),  # type: ignore[arg-type]
+    "a range of seeds": (lambda: coopenv.run(ENV, seed=range(3)), "^seed must be a whole number"),  # type: ignore[arg-type]
+    "a render mode": (
+        lambda: coopenv.parallel_env(ENV, render_mode="ansi"),
+        "^unknown render_mode 'ansi'; known: None",
+    ),
+    "an agent's number": (lambda: coopenv.parallel_env(ENV).observation_space(0), "^unknown agent 0; known"),  # type: ignore[arg-type]
+    "an observer": (lambda: coopenv.run(ENV, observer="Robst"), r"did you mean 'robust'\?"),
+    "a policy": (lambda: coopenv.run(ENV, policy="PEEK"), r"^unknown policy 'PEEK' \(did you mean 'peek'\?\)"),
+    "observers as text": (lambda: coopenv.compare("riccati", ENV), r"^observers: expected a list such as"),
+    "worlds": (lambda: coopenv.make_vec(ENV, num_worlds=2.0), "^num_worlds must be at least 1, whole"),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line(mistake: str) -> None:
+    attempt, words = MISTAKES[mistake]
+    with pytest.raises(coopenv.CoopenvError, match=words) as caught:
+        attempt()
+    assert "\n" not in str(caught.value)
+
+
+def test_names_that_do_not_exist() -> None:
+    with pytest.raises(AttributeError, match=r"has no attribute 'paralel_env' \(did you mean 'parallel_env'\?\)"):
+        coopenv.paralel_env  # noqa: B018
+    assert "no such command: 'facade'; known: list, describe" in refused("facade")
+    assert "no such command: 'observer' (did you mean 'observers'?); known: seeds" in refused("bench", "observer")
+
+
+def test_the_shell_compares_under_the_name_of_python(capsys: pytest.CaptureFixture[str]) -> None:
+    short = ["--override", "horizon=0.3", "--seeds", "1", "--jobs", "1", "--json"]
+    assert main(["compare", ENV, "--observers", "dead_reckoning", *short]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["observer"] == "dead_reckoning"
