@@ -57,16 +57,17 @@ class Ekf:
         return Message(position=self.p + arm, covariance=J @ self.P @ J.T)
 
 
-register("my_ekf", Ekf)
-recording = record(load_scenario("busy_intersection_tracking"), seed=0)
-print(f"{'observer':16}  position error of the five vehicles at the end [m]      bytes/s")
-for name in ("my_ekf", "riccati", "dead_reckoning"):
-    result = run(name, recording)
-    errors = "  ".join(f"{e:8.3f}" for e in result.position_error[-1])
-    print(f"{name:16} {errors}   {result.bytes_per_second[0]:8.0f}   {result.failure}")
+if __name__ == "__main__":
+    register("my_ekf", Ekf)
+    recording = record(load_scenario("busy_intersection_tracking"), seed=0)
+    print(f"{'observer':16}  position error of the five vehicles at the end [m]      bytes/s")
+    for name in ("my_ekf", "riccati", "dead_reckoning"):
+        result = run(name, recording)
+        errors = "  ".join(f"{e:8.3f}" for e in result.position_error[-1])
+        print(f"{name:16} {errors}   {result.bytes_per_second[0]:8.0f}   {result.failure}")
 
-env = parallel_env("busy_intersection", observer="my_ekf")  # the same class in the environment
-_, infos = env.reset(seed=0)
-while env.agents:
-    _, _, _, _, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-print(f"{'in the environment':18}", *(f"{info['position_error']:8.3f}" for info in infos.values()))
+    env = parallel_env("busy_intersection", observer="my_ekf")  # the same class in the environment
+    _, infos = env.reset(seed=0)
+    while env.agents:
+        _, _, _, _, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+    print(f"{'in the environment':18}", *(f"{info['position_error']:8.3f}" for info in infos.values()))

@@ -1,23 +1,18 @@
 """Where the work is done: in processes of this machine, or on an existing Ray cluster.
 
 An executor maps one function over tasks. What comes out depends on neither the executor nor its number of workers.
-Processes are of the standard library, not of joblib: they end within two seconds of a signal, or with their parent.
 """
 
-import multiprocessing
 import os
 import socket
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.installation import ONE_THREAD, available_cores, environment, install_command, needing
-from coopenv.base.interrupts import end_with_parent, held
-from coopenv.bench.watched import Limits, check_sendable, deaf_children
+from coopenv.base.installation import ONE_THREAD, available_cores, install_command, needing
+from coopenv.bench.watched import Limits, Pool
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -37,32 +32,27 @@ class Local:
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task."""
-        results: dict[int, R] = {}
-        jobs = min(self.jobs, len(tasks))
-        if jobs <= 1:
-            for n, task in enumerate(tasks):
-                results[n] = function(task)
-                on_done(n + 1)
-        else:
-            check_sendable(tasks[0])
-            others = multiprocessing.active_children()
-            with (
-                environment(ONE_THREAD),  # matrices here are small: threads would only get in the way
-                ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), end_with_parent) as pool,
-            ):
-                try:
-                    with held(), deaf_children():
-                        work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
-                    for done in as_completed(work):
-                        results[work[done]] = done.result()
-                        on_done(len(results))
-                except BrokenProcessPool:
-                    raise CoopenvError("a process died: out of memory, or killed, or an observer ended it") from None
-                except BaseException:
-                    for worker in set(multiprocessing.active_children()).difference(others):
-                        worker.kill()
-                    raise
-        return [results[n] for n in range(len(tasks))]
+        if min(self.jobs, len(tasks)) > 1:
+            return [
+                result for [result] in Pool([_Whole(function, task) for task in tasks], self.jobs, None).run(on_done)
+            ]
+        results = []
+        for task in tasks:
+            results.append(function(task))
+            on_done(len(results))
+        return results
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """A task in one part."""
+
+    function: Callable[[Any], Any]
+    task: Any
+
+    def parts(self) -> Iterator[Any]:
+        yield None
+        yield self.function(self.task)
 
 
 @dataclass(frozen=True)

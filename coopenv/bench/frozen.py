@@ -14,7 +14,7 @@ from functools import cached_property
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -24,6 +24,7 @@ from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.base.installation import data_directory, is_reference, versions
 from coopenv.bench.executors import Local
 from coopenv.bench.observers.comparison import Comparison, Plan
+from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import judge_all
 from coopenv.bench.observers.rows import spread
 from coopenv.bench.observers.sources import SimulatedRecords, find_source
@@ -40,26 +41,14 @@ SHOWN = ("robust", "split_covariance_intersection")
 """Observers of the zoo beside the new one in the table of scenes."""
 
 
-@dataclass(frozen=True)
-class FrozenScene:
+class FrozenScene(NamedTuple):
     """One scene of a benchmark."""
 
     name: str
     source: SimulatedRecords
     variant: str
     hash: str
-    """Of its scenario, policy, fault and seeds."""
-
-    @classmethod
-    def of(cls, about: Mapping[str, Any], seeds: range) -> Self:
-        """Return the scene of an entry of the definition."""
-        fault, policy = about.get("fault", ""), about.get("policy")
-        source = find_source(about["environment"], about.get("set"), faults=[fault] * bool(fault), policy=policy)
-        assert isinstance(source, SimulatedRecords)
-        variant = source.added[0] if fault else source.fault("nominal")
-        world = (variant.scenario or source.scenario).model_dump(mode="json")
-        text = json.dumps([world, policy, fault, [*seeds]], sort_keys=True)
-        return cls(about["name"], source, variant.name, sha256(text.encode()).hexdigest())
+    """Of its scenario, fault, policy and seeds."""
 
 
 @dataclass(frozen=True)
@@ -94,65 +83,67 @@ class Frozen:
         """Of every observer."""
         return Limits(self.definition["seconds"], self.definition["memory"])
 
-    def scenes(self, names: Sequence[str] | None = None) -> list[FrozenScene]:
-        """Return scenes by name; None: all. Raises CoopenvError: there is none of a name."""
-        known = [about["name"] for about in self.definition["scenes"]]
-        for name in names or ():
-            check_one_of("unknown scene", name, known)
-        return [
-            FrozenScene.of(about, self.seeds)
-            for about in self.definition["scenes"]
-            if about["name"] in (names or known)
-        ]
+    def scenes(self, names: Sequence[str] = ()) -> list[FrozenScene]:
+        """Return scenes by name, without names all of them. Raises CoopenvError: there is none of a name."""
+        defined = {about["name"]: about for about in self.definition["scenes"]}
+        for name in names:
+            check_one_of("unknown scene", name, defined)
+        return [self._scene(about) for name, about in defined.items() if not names or name in names]
+
+    def _scene(self, about: Mapping[str, Any]) -> FrozenScene:
+        fault, policy = about.get("fault", ""), about.get("policy")
+        source = find_source(about["environment"], about.get("set"), faults=[fault] * bool(fault), policy=policy)
+        assert isinstance(source, SimulatedRecords)
+        variant = source.added[0] if fault else source.fault(NOMINAL)
+        words = {"title", "description", "source"}
+        world = (variant.scenario or source.scenario).model_dump(mode="json", exclude_unset=True, exclude=words)
+        text = json.dumps([world, policy, fault, [*self.seeds]], sort_keys=True)
+        return FrozenScene(about["name"], source, variant.name, sha256(text.encode()).hexdigest())
 
     def run(
         self,
         observers: Sequence[str],
-        names: Sequence[str] | None,
+        names: Sequence[str],
         jobs: int,
         limits: Limits,
-        command: str,
         on_progress: Callable[[float], None],
     ) -> dict[str, Any]:
-        """Return the content of the result file of observers."""
+        """Return the content of the result file of observers in some scenes, all without names."""
         scenes, share = self.scenes(names), self.definition["steady_from"]
         plans = [
             Plan.of(observers, s.source, self.seeds, [s.variant], share * s.source.scenario.horizon, ()) for s in scenes
         ]
         tasks = [task for plan in plans for task in plan.tasks]
         judged = iter(judge_all(Local(jobs, limits), tasks, lambda done: on_progress(done / len(tasks))))
-        boards = {
-            scene.name: plan.compared(islice(judged, len(self.seeds)))
-            for scene, plan in zip(scenes, plans, strict=True)
-        }
-        found = {scene.name: {"hash": scene.hash, "records": _figures(boards[scene.name])} for scene in scenes}
-        definition = sha256(self._text.encode()).hexdigest()
-        remarks = self._remarks(definition, found, limits)
+        boards = {s.name: p.compared(islice(judged, len(self.seeds))) for s, p in zip(scenes, plans, strict=True)}
+        found = {s.name: {"hash": s.hash, "records": _figures(boards[s.name])} for s in scenes}
         rows = [row_of(name, board, observer) for name, board in boards.items() for observer in board.observers]
-        code = {name: _code_of(name) for name in observers}
-        return dict(
-            jsonable(
-                {
-                    "benchmark": self.version,
-                    "definition": definition,
-                    "comparable": not remarks,
-                    "remarks": remarks,
-                    "command": command,
-                    "versions": versions("coopenv", "numpy", "scipy", "warp-lang", "numba"),
-                    "code": {"package": package_hash(), **{named(name): h for name, h in code.items() if h}},
-                    "limits": {"seconds": limits.seconds, "memory": limits.mebibytes},
-                    "seeds": [*self.seeds],
-                    "scenes": found,
-                    "rows": rows,
-                    "totals": totals_of(rows),
-                }
-            )
-        )
+        files = {named(name): _digest_of(name) for name in observers if is_reference(name)}
+        remarks = self._remarks(found, limits)
+        result = {
+            "benchmark": self.version,
+            "definition": self.digest,
+            "comparable": not remarks,
+            "remarks": remarks,
+            "versions": versions("coopenv", "numpy", "scipy", "warp-lang", "numba"),
+            "code": {"package": package_digest(), **files},
+            "limits": {"seconds": limits.seconds, "memory": limits.mebibytes},
+            "seeds": [*self.seeds],
+            "scenes": found,
+            "rows": rows,
+            "totals": totals_of(rows),
+        }
+        return dict(jsonable(result))
 
-    def _remarks(self, definition: str, found: Mapping[str, Any], limits: Limits) -> list[str]:
+    @property
+    def digest(self) -> str:
+        """Of the definition."""
+        return sha256(self._text.encode()).hexdigest()
+
+    def _remarks(self, found: Mapping[str, Any], limits: Limits) -> list[str]:
         """Return why a result is not comparable with that of the zoo; empty where it is."""
         remarks, frozen = [], self.zoo["scenes"]
-        if definition != self.zoo.get("definition"):
+        if self.digest != self.zoo.get("definition"):
             remarks.append(f"{self.version}.toml is not that of the shipped rows")
         if missing := len(self.definition["scenes"]) - len(found):
             remarks.append(f"{missing} scenes were left out")
@@ -213,7 +204,7 @@ def totals_of(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "observer": observer,
                 **means,
                 "rmse_se_m": means["rmse_m"] * float(np.sqrt(np.square(spreads).sum())) / len(own),
-                "limited": int((error["rmse_m"] >= DIVERGED_POSITION).sum()),
+                "above": sum(1 for row in whole if _limited(row["rmse_m"]) == DIVERGED_POSITION),
                 "failed": len(own) - len(whole),
                 **{key: _median(whole, key) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")},
             }
@@ -238,7 +229,7 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
     totals = number_table([f"bench {benchmark.version}"], [*numbers, "sent\nB/s", "\nus"])
     for total in totals_of([*result["rows"], *zoo]):
         figures = [number(total[key], 3) for key in ("median_m", "worst_m")]
-        counts = [str(total[key]) for key in ("limited", "failed")]
+        counts = [str(total[key]) for key in ("above", "failed")]
         costs = [number(total[key], 2) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")]
         mark = "* " if total["observer"] in own else ""
         error = in_parentheses(total["rmse_m"], total["rmse_se_m"])
@@ -261,21 +252,18 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
         yield f"Not comparable with the zoo's rows: {listed(result['remarks'], 4)}"
 
 
-def package_hash() -> str:
-    """Return a digest of the code and data of the package that is running."""
-    digest, package = sha256(), Path(__file__).resolve().parents[1]
-    for folder in (package, data_directory("envs"), data_directory("agents")):
-        for path in sorted(folder.rglob("*")):
-            if path.suffix in (".py", ".toml", ".safetensors") and path.is_file():
-                digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+def package_digest() -> str:
+    """Return a digest of the code and the data of the package that is running."""
+    digest = sha256()
+    for folder in (Path(__file__).parents[1], data_directory("envs"), data_directory("agents")):
+        for path in sorted(path for kind in ("py", "toml", "safetensors") for path in folder.rglob(f"*.{kind}")):
+            digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
 
 
-def _code_of(observer: str) -> str:
-    """Return the digest of the file of a user's observer; empty: it is of the package."""
-    if not is_reference(observer):
-        return ""
+def _digest_of(reference: str) -> str:
+    """Return the digest of the file of an observer."""
     try:
-        return sha256(Path(inspect.getsourcefile(find(observer)) or "").read_bytes()).hexdigest()
+        return sha256(Path(inspect.getsourcefile(find(reference)) or "").read_bytes()).hexdigest()
     except (OSError, TypeError) as error:
-        raise CoopenvError(f"observer '{observer}': its source cannot be read ({error})") from None
+        raise CoopenvError(f"observer '{reference}': its source cannot be read ({error})") from None

@@ -1,6 +1,7 @@
-"""Processes in which observers run and are ended, one by one, when they use more time or memory than they may.
+"""Tasks in processes of this machine, whose parts are ended one by one when they use more time or memory than they may.
 
-The parent measures them: a limit of the system on address space would end numerical libraries as well.
+The parent measures: a limit of the system on the address space would end numerical libraries as well. Processes end
+within two seconds of a signal, or with their parent.
 """
 
 import multiprocessing
@@ -9,10 +10,10 @@ import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from time import monotonic
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self
 
 import psutil
 
@@ -48,11 +49,8 @@ class Divided(Protocol):
         """Return the task, in which what has ended in a part of another one is not started, but fails as well."""
 
 
-D = TypeVar("D", bound=Divided)
-
-
 @contextmanager
-def deaf_children() -> Iterator[None]:
+def _deaf_children() -> Iterator[None]:
     """Let processes that are started meanwhile not hear Ctrl-C, which a terminal sends to all: the parent decides."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -62,17 +60,6 @@ def deaf_children() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def check_sendable(task: object) -> None:
-    """Refuse what cannot be sent to another process, most likely an observer that is defined within a function."""
-    try:
-        pickle.dumps(task)
-    except Exception as error:
-        raise CoopenvError(
-            f"cannot be sent to another process: {error} (define observers at the top level of a module, or use "
-            "--jobs 1)"
-        ) from None
 
 
 def _work(pipe: Connection) -> None:
@@ -85,25 +72,29 @@ def _work(pipe: Connection) -> None:
                 pipe.send((part,))
             pipe.send(())
         except BaseException as error:
-            pipe.send(error if isinstance(error, CoopenvError) else CoopenvError(error_text(error)))
+            try:
+                pipe.send(error)
+            except Exception:  # of a class that cannot be sent
+                pipe.send(CoopenvError(error_text(error)))
 
 
-@dataclass
 class _Worker:
     """A process, and how far it is with a task."""
 
-    pipe: Connection
-    process: Any
-    usage: psutil.Process
-    number: int = -1
-    """Of its task; negative: it is idle."""
-    started: bool = False
-    """Whether the parts have begun."""
-    before: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))
-    """Processor time and clock, s, and memory, MiB, when the present part began."""
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process = context.Process(target=_work, args=(other,))
+        with held(), _deaf_children():
+            self.process.start()
+        other.close()
+        self.usage = psutil.Process(self.process.pid)
+        self.number = -1  # of its task; negative: it is idle
+        self.started = False  # whether the parts have begun
+        self.before = (0.0, 0.0, 0.0)  # as `measured`, when the present part began
 
     def measured(self) -> tuple[float, float, float]:
-        """Return its processor time and the clock, s, and its memory, MiB, with those of its own processes."""
+        """Return the processor time and the clock, s, and the memory, MiB, its own processes included."""
         family = [self.usage, *self.usage.children(recursive=True)]
         times = [member.cpu_times() for member in family]
         memory = sum(member.memory_info().rss for member in family) / 2**20
@@ -119,119 +110,109 @@ class _Worker:
                 return f"more than {limits.mebibytes:g} MiB of memory (--memory)"
         return ""
 
-    def end(self) -> int:
-        """Kill it and the processes that it has started, and return its exit status."""
+    def end(self) -> str:
+        """Kill it and the processes that it has started, and return how it ended."""
         with suppress(psutil.Error):
             for child in self.usage.children(recursive=True):
                 child.kill()
         self.process.kill()
         self.process.join()
         self.pipe.close()
-        return int(self.process.exitcode)
+        status = int(self.process.exitcode or 0)
+        return f"its process ended with {signal.Signals(-status).name if status < 0 else f'status {status}'}"
 
 
-def _new_worker() -> _Worker:
-    context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
-    process = context.Process(target=_work, args=(other,), daemon=False)
-    with held(), deaf_children():
-        process.start()
-    other.close()
-    return _Worker(pipe, process, psutil.Process(process.pid))
-
-
-def watched(
-    tasks: Sequence[D], jobs: int, limits: Limits, on_done: Callable[[int], None] = lambda done: None
-) -> list[list[Any]]:
-    """Return the results of all parts of every task.
-
-    Raises:
-        CoopenvError: a task could not be made ready, or its process died meanwhile.
-    """
-    check_sendable(tasks[0])
-    pool = _Pool([*tasks], limits)
-    try:
-        with environment(ONE_THREAD):  # matrices here are small: threads would only get in the way
-            while pool.waiting or pool.busy:
-                pool.assign(jobs)
-                if pool.look():
-                    on_done(len(tasks) - len(pool.waiting) - len(pool.busy))
-    finally:
-        for worker in pool.workers:
-            worker.end()
-    return pool.results
-
-
-class _Pool:
+class Pool:
     """Workers, and the tasks that wait for one."""
 
-    def __init__(self, tasks: list[Any], limits: Limits) -> None:
-        self.tasks, self.limits = tasks, limits
+    def __init__(self, tasks: Sequence[Any], jobs: int, limits: Limits | None) -> None:
+        """Take tasks, `Divided`; without limits whatever a part raises ends all."""
+        self.tasks, self.jobs, self.limits = [*tasks], jobs, limits
         self.waiting = deque(range(len(tasks)))
         self.results: list[list[Any]] = [[] for _ in tasks]
-        self.done = [0] * len(tasks)
-        """Parts of the present rest of each task that have come."""
+        self.done = [0] * len(tasks)  # parts of the present rest of each task that have come
         self.workers: list[_Worker] = []
 
     @property
-    def busy(self) -> list[_Worker]:
+    def _busy(self) -> list[_Worker]:
         return [worker for worker in self.workers if worker.number >= 0]
 
-    def assign(self, jobs: int) -> None:
-        """Give idle and new workers the tasks that wait."""
-        idle = [worker for worker in self.workers if worker.number < 0]
-        while self.waiting and (idle or len(self.workers) < jobs):
-            if not idle:
-                idle.append(_new_worker())
-                self.workers.append(idle[-1])
-            worker = idle.pop()
-            worker.number, worker.started = self.waiting.popleft(), False
-            worker.pipe.send(self.tasks[worker.number])
+    def run(self, on_done: Callable[[int], None]) -> list[list[Any]]:
+        """Return the results of all parts of every task.
 
-    def look(self) -> bool:
-        """Take what the workers send, and end those above a limit; return whether a task has been finished."""
-        finished = False
-        ready = wait([worker.pipe for worker in self.busy], POLL)
-        for worker in self.busy:
+        Raises:
+            CoopenvError: a task cannot be sent or made ready, or its process died.
+        """
+        try:
+            pickle.dumps(self.tasks[:1])
+        except Exception as error:
+            raise CoopenvError(
+                f"cannot be sent to another process: {error} (define observers at the top level of a module, or use "
+                "--jobs 1)"
+            ) from None
+        try:
+            with environment(ONE_THREAD):  # matrices here are small: threads would only get in the way
+                while self.waiting or self._busy:
+                    self._assign()
+                    if self._look():
+                        on_done(len(self.tasks) - len(self.waiting) - len(self._busy))
+        finally:
+            for worker in self.workers:
+                worker.end()
+        return self.results
+
+    def _assign(self) -> None:
+        """Give idle and new workers the tasks that wait."""
+        while self.waiting:
+            idle = [worker for worker in self.workers if worker.number < 0]
+            if not idle and len(self.workers) == self.jobs:
+                return
+            if not idle:
+                idle.append(_Worker())
+                self.workers.append(idle[0])
+            idle[0].number, idle[0].started = self.waiting.popleft(), False
+            idle[0].pipe.send(self.tasks[idle[0].number])
+
+    def _look(self) -> bool:
+        """Take what the workers send, and end those above a limit; return whether a task is finished."""
+        finished, ready = False, wait([worker.pipe for worker in self._busy], POLL)
+        for worker in self._busy:
             if worker.pipe in ready:
                 try:
-                    finished = self._take(worker, worker.pipe.recv()) or finished
+                    message = worker.pipe.recv()
                 except (EOFError, OSError):
                     self._fail(worker, "")
-            elif worker.started and (reason := worker.excess(self.limits)):
+                else:
+                    finished = self._take(worker, message) or finished
+            elif worker.started and self.limits is not None and (reason := worker.excess(self.limits)):
                 self._fail(worker, reason)
         return finished
 
     def _take(self, worker: _Worker, message: Any) -> bool:
         """Take a message of a worker; return whether its task is finished."""
-        if isinstance(message, CoopenvError):
-            if not worker.started:
+        if isinstance(message, BaseException):
+            if not worker.started or self.limits is None:
                 raise message
-            self._fail(worker, str(message))
-            return False
-        if message:
+            self._fail(worker, str(message) if isinstance(message, CoopenvError) else error_text(message))
+        elif message:
             with suppress(psutil.Error):
                 worker.before = worker.measured()
             if worker.started:
                 self.results[worker.number] += message
                 self.done[worker.number] += 1
             worker.started = True
-            return False
-        worker.number = -1
-        return True
+        else:
+            worker.number = -1
+        return worker.number < 0
 
     def _fail(self, worker: _Worker, reason: str) -> None:
         """End a worker; what remains of its task waits for another one."""
-        number, status = worker.number, worker.end()
+        number, ended = worker.number, worker.end()
         self.workers.remove(worker)
-        if not reason:
-            ended = signal.Signals(-status).name if status < 0 else f"status {status}"
-            reason = f"its process ended with {ended}"
-        if not worker.started:
-            raise CoopenvError(f"a process died while it made a record: out of memory, or killed ({reason})")
-        task, part = self.tasks[number], self.done[number]
-        self.tasks[number] = task.ending(task, part, reason).rest(part)
-        self.done[number] = 0
-        for other in self.waiting:
+        if not worker.started or self.limits is None:
+            raise CoopenvError(f"a process died: out of memory, or killed, or an observer ended it ({ended})")
+        task, part, reason = self.tasks[number], self.done[number], reason or ended
+        for other in (number, *self.waiting):
             self.tasks[other] = self.tasks[other].ending(task, part, reason)
+        self.tasks[number], self.done[number] = self.tasks[number].rest(part), 0
         self.waiting.appendleft(number)

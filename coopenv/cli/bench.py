@@ -201,12 +201,9 @@ def bench_v1(
     benchmark, log = frozen.Frozen("v1"), options.console(stderr=True)
     usual = benchmark.limits
     limits = Limits(seconds or usual.seconds, memory or usual.mebibytes)
-    names = options.words(observers) or []
-    command = f"coopenv bench v1 {observers}"
     with Progress(log, "bench v1", total=1.0) as progress:
-        result = benchmark.run(
-            names, options.words(scenes), jobs or available_cores(), limits, command, progress.update
-        )
+        names, some = options.words(observers), options.words(scenes)
+        result = benchmark.run(names, some, jobs or available_cores(), limits, progress.update)
     replace_text(out, json_text(result))
     if as_json:
         options.print_json(result)

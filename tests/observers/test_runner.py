@@ -327,7 +327,7 @@ def test_the_example_is_better_than_odometry(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(registry, "_registered", {})
-    runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_observer.py"))
+    runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_observer.py"), run_name="__main__")
     rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]}
     own, odometry = (np.array(rows[name][:5], float) for name in ("my_ekf", "dead_reckoning"))
     assert (own < 0.1).all() and (own < 0.1 * odometry).all()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers.sources import RecordSource
-from coopenv.bench.watched import watched
+from coopenv.bench.watched import Pool
 from coopenv.estimation.metrics import (
     CONVERGED,
     SETTLED,
@@ -252,7 +252,7 @@ def judge_all(executor: Executor, tasks: Sequence[Task], on_done: Callable[[int]
     An observer that was ended is not started again in the same variant.
     """
     if isinstance(executor, Local) and executor.limits is not None:
-        return watched(tasks, executor.jobs, executor.limits, on_done)
+        return Pool(tasks, executor.jobs, executor.limits).run(on_done)
     return executor.map(judge, tasks, on_done)
 
 

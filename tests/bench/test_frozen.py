@@ -1,0 +1,103 @@
+"""The frozen benchmark: shipped rows are of the shipped scenes, and what differs is named in a result."""
+
+from __future__ import annotations
+
+import json
+import math
+from hashlib import sha256
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+import pytest
+
+from coopenv.bench import frozen
+from coopenv.bench.frozen import Frozen, totals_of
+from coopenv.cli import main
+from tests.helpers.commands import refused
+
+MINE = Path(__file__).parents[2] / "examples" / "own_observer.py"
+
+
+def test_the_shipped_rows_are_of_the_shipped_scenes() -> None:
+    v1 = Frozen("v1")
+    scenes = v1.scenes()
+    assert len(scenes) == 30 and len([s for s in scenes if not s.source.policy.startswith("peek")]) == 20
+    assert v1.zoo["comparable"] and v1.zoo["remarks"] == []
+    assert {s.name: s.hash for s in scenes} == {name: scene["hash"] for name, scene in v1.zoo["scenes"].items()}
+    observers = {"robust", "split_covariance_intersection", "mekf_covariance", "riccati", "dead_reckoning"}
+    assert {(row["scene"], row["observer"]) for row in v1.zoo["rows"]} == {
+        (s.name, o) for s in scenes for o in observers
+    }
+    assert not [row["failure"] for row in v1.zoo["rows"] if row["failure"]]
+
+
+def test_an_own_observer_has_its_row_beside_the_zoo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The row of `dead_reckoning` is computed again: it is the shipped one."""
+    copyfile(MINE, tmp_path / "mine.py")
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "v1", "mine.py:Ekf,dead_reckoning", "--scenes", "facade,road_slow", "--jobs", "1"]) == 0
+    table = capsys.readouterr().out
+    result = json.loads((tmp_path / "bench_v1.json").read_text())
+    assert result["remarks"] == ["28 scenes were left out"] and not result["comparable"]
+    assert "Not comparable with the zoo's rows: 28 scenes were left out" in table
+    assert "* Ekf" in table and "\nrobust" in table
+    assert result["code"]["Ekf"] == sha256(MINE.read_bytes()).hexdigest() and "dead_reckoning" not in result["code"]
+    rows = {(row["scene"], row["observer"]): row for row in result["rows"]}
+    for row in rows.values():
+        assert row["bytes_per_s"] >= 0.0 < row["us_per_update"] and row["worst_m"] >= row["median_m"] > 0.0
+        assert row["rmse_se_m"] > 0.0 and not row["failure"]
+    for shipped in Frozen("v1").zoo["rows"]:
+        if (again := rows.get((shipped["scene"], shipped["observer"]))) is not None:
+            for key in ("rmse_m", "rmse_se_m", "worst_m", "anees_worst", "bound_m", "bytes_per_s"):
+                assert again[key] == pytest.approx(shipped[key], rel=1e-3), key
+    assert rows["road_slow", "Ekf"]["rmse_m"] < 0.5 * rows["road_slow", "dead_reckoning"]["rmse_m"]
+
+
+def test_differences_from_the_shipped_result_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (
+        (frozen.FOLDER / "v1.toml")
+        .read_text()
+        .replace('environment = "road:6,speed=15"', 'environment = "road:5,speed=15"')
+    )
+    zoo = json.loads((frozen.FOLDER / "v1.json").read_text())
+    zoo["scenes"]["facade"]["records"][0] *= 1.01
+    (tmp_path / "v1.toml").write_text(text)
+    (tmp_path / "v1.json").write_text(json.dumps(zoo))
+    monkeypatch.setattr(frozen, "FOLDER", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    more = ["--jobs", "1", "--seconds", "99", "--json"]
+    assert main(["bench", "v1", "dead_reckoning", "--scenes", "facade,road_slow", *more]) == 0
+    assert json.loads((tmp_path / "bench_v1.json").read_text())["remarks"] == [
+        "v1.toml is not that of the shipped rows",
+        "28 scenes were left out",
+        "limits 99 s and 2048 MiB",
+        "scene road_slow: its scenario is not the frozen one",
+        "scene facade: its records are not the frozen ones",
+    ]
+
+
+def test_mistakes_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "unknown scene 'facad' (did you mean 'facade'?)" in refused("bench", "v1", "robust", "--scenes", "facad")
+    assert "unknown observer 'robus'" in refused("bench", "v1", "robus")
+    assert "no such file" in refused("bench", "v1", "none.py:Mine")
+    assert "cannot write to no/file.json" in refused("bench", "v1", "robust", "--out", "no/file.json")
+
+
+def row(scene: str, value: float | None, **more: Any) -> dict[str, Any]:
+    numbers = {"rmse_m": value, "median_m": value, "worst_m": value, "rmse_se_m": value and 0.1 * value}
+    costs = dict.fromkeys(("anees_median", "anees_worst", "bytes_per_s", "us_per_update"), 1.0)
+    return {"scene": scene, "observer": "mine", **numbers, **costs, "failure": "", **more}
+
+
+def test_totals_are_geometric_means_with_a_limit() -> None:
+    """Of 0.1 m, 20 m that counts as 5 m, and a failure that counts likewise."""
+    [total] = totals_of([row("a", 0.1), row("b", 20.0), row("c", None, failure="at 1 s")])
+    assert total["rmse_m"] == pytest.approx((0.1 * 5.0 * 5.0) ** (1 / 3))
+    assert total["rmse_se_m"] == pytest.approx(total["rmse_m"] * 0.1 / 3)
+    assert (total["above"], total["failed"]) == (1, 1)
+    [two] = totals_of([row("a", 0.1), row("b", 0.4)])
+    assert two["rmse_m"] == pytest.approx(0.2) and two["rmse_se_m"] == pytest.approx(0.2 * 0.1 * math.sqrt(2) / 2)
