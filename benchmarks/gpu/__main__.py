@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from benchmarks.gpu.plan import SIZES, plan
+from benchmarks.gpu.plan import SIZES, Stage, plan
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import put, section
 from coopenv.base.errors import CoopenvError
@@ -38,8 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             asked.out.parent.mkdir(parents=True, exist_ok=True)
         check_file(asked.out)
         head = {"command": shlex.join(["python", "-m", "benchmarks.gpu", *words]), "coopenv": version()}
-        stages = plan(device, tuple(asked.worlds), asked.quick)
-        document = run(stages, {**head, "device": device}, asked.out, 60.0 * asked.minutes, _tell)
+        stages = [s for s in plan(device, tuple(asked.worlds), asked.quick) if s.name.startswith(asked.only)]
+        if not stages:
+            raise CoopenvError(f"--only: no stage begins with '{asked.only}'")
+        if asked.code.is_dir():
+            os.environ["WARP_CACHE_PATH"] = str(asked.code.resolve())
+        head["device"] = device
+        earlier = _earlier(asked.out, head, stages) if asked.only else []
+        document = run(stages, head, asked.out, 60.0 * asked.minutes, _tell, earlier)
     except (CoopenvError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -47,6 +55,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if bad := failures(document):
         print(f"not as it has to be: {', '.join(bad)}", file=sys.stderr)
     return 1 if bad else 0
+
+
+def _earlier(out: Path, head: dict[str, Any], stages: Sequence[Stage]) -> list[dict[str, Any]]:
+    """Return the results that a file keeps of stages besides these, of the same device and version."""
+    document = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
+    if any(document.get(key) != head[key] for key in ("coopenv", "device")):
+        return []
+    return [row for row in document["stages"] if row["name"] not in {stage.name for stage in stages}]
 
 
 def _tell(line: str) -> None:
@@ -59,6 +75,8 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--device", default="cuda:0", help="cuda:0, ...; cpu tries the run itself (default: cuda:0)")
     found.add_argument("--worlds", type=int, nargs="+", default=list(SIZES), help="whose throughput is measured")
     found.add_argument("--minutes", type=float, default=MINUTES, help=f"for everything (default: {MINUTES:g})")
+    found.add_argument("--only", default="", metavar="START", help="stages whose names begin so, such as throughput")
+    found.add_argument("--code", type=Path, default=Path("out", "cuda"), help="of make cuda-check (default: out/cuda)")
     found.add_argument("--quick", action="store_true", help="as little as possible of everything")
     found.add_argument("--out", type=Path, default=Path("out", "gpu.json"), help="JSON file (default: out/gpu.json)")
     found.add_argument("--table", type=Path, metavar="FILE", help="run nothing; put the figures of FILE into the page")

@@ -32,22 +32,24 @@ def plan(device: str, sizes: tuple[int, ...] = SIZES, quick: bool = False) -> li
         quick: as little as possible of everything.
     """
     stages = [Stage("machine", "machine", 30.0, {"device": device})]
-    for observer, compiling in zip(OBSERVERS, (180.0, 900.0), strict=True):
+    alike = {"worlds": 2, "decisions": 3} if quick else {"worlds": 64, "decisions": 30}
+    pace = {"seconds": 0.1, "rounds": 2} if quick else {"seconds": 1.0, "rounds": 5}
+    for observer, compiling in zip(OBSERVERS, (60.0, 180.0), strict=True):
         world = {"device": device, "environment": ENVIRONMENT, "overrides": {**SENSED, "observer.name": observer}}
-        stages.append(Stage(f"compile, {observer}", "compile_kernels", compiling, world))
-        alike = {"worlds": 2, "decisions": 3} if quick else {"worlds": 64, "decisions": 30}
-        stages.append(Stage(f"agreement, {observer}", "agreement", 900.0, {**world, **alike}))
-        pace = {"seconds": 0.1, "rounds": 2} if quick else {"seconds": 1.0, "rounds": 5}
+        stages.append(
+            Stage(f"compile, {observer}, float32", "compile_kernels", compiling, {**world, "dtype": "float32"})
+        )
         for size in sizes:
-            stages.append(
-                Stage(f"throughput, {observer}, {size}", "throughput", 120.0, {**world, **pace, "worlds": size})
-            )
+            name = f"throughput, {observer}, {size}"
+            stages.append(Stage(name, "throughput", 60.0, {**world, **pace, "worlds": size}))
         drawn = {**world, **pace, "environment": LEARNING, "overrides": {"observer.name": observer}}
         name = f"throughput, {observer} in {LEARNING}, {sizes[0]}"
-        stages.append(Stage(name, "throughput", 120.0, {**drawn, "worlds": sizes[0]}))
-        if observer == OBSERVERS[0]:
-            stages += [Stage("training", "training", 120.0, _training(device, quick)), _tests(device, quick)]
-    return stages
+        stages.append(Stage(name, "throughput", 60.0, {**drawn, "worlds": sizes[0]}))
+        stages.append(
+            Stage(f"compile, {observer}, float64", "compile_kernels", compiling, {**world, "dtype": "float64"})
+        )
+        stages.append(Stage(f"agreement, {observer}", "agreement", 60.0, {**world, **alike}))
+    return [*stages, Stage("training", "training", 90.0, _training(device, quick)), _tests(device, quick)]
 
 
 def _training(device: str, quick: bool) -> dict[str, Any]:

@@ -27,6 +27,7 @@ def run(
     out: Path,
     seconds: float,
     tell: Callable[[str], None] = lambda line: None,
+    earlier: Sequence[dict[str, Any]] = (),
 ) -> dict[str, Any]:
     """Run stages and write the document anew after each.
 
@@ -36,8 +37,9 @@ def run(
         out: JSON file.
         seconds: for all of them together; what does not begin in time is left out, with a line.
         tell: called with a line per stage that has ended.
+        earlier: results of other stages, which the document keeps.
     """
-    document: dict[str, Any] = {**head, "stages": []}
+    document: dict[str, Any] = {**head, "stages": [*earlier]}
     end = time.monotonic() + seconds
     for stage in stages:
         left = end - time.monotonic()

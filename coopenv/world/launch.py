@@ -136,6 +136,7 @@ def start_warp() -> None:
         KernelCacheError: the folder cannot be made.
     """
     wp.config.log_level = wp.LOG_ERROR
+    wp.config.cuda_output = wp.config.cuda_output or "cubin"  # code of the device itself, which `make cuda-check` makes
     saved = None
     with suppress(OSError):  # no standard error: nothing to mute
         saved = os.dup(2)

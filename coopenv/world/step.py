@@ -23,7 +23,7 @@ from coopenv.world.quality import sample_gramian
 from coopenv.world.state import state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
 from coopenv.world.v2x import count_bytes, deliver, forget_everything
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, host_only
 
 Kernels = dict[str, wp.Kernel]
 """By name."""
@@ -179,10 +179,12 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
                     forget_everything(model, state, world, vehicle)
                     start_vehicle(model, state, memory, world, vehicle)
 
+    @host_only
     def start_one(model: Model, state: State, memory: Memory, vehicle: int):
         """Start one vehicle's observer. One thread per world."""
         start_vehicle(model, state, memory, wp.tid(), vehicle)
 
+    @host_only
     def estimate_one(
         model: Model,
         state: State,
@@ -200,6 +202,7 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
         now.due = due[world] != 0
         estimate_pose(model, state, memory, world, vehicle, now)
 
+    @host_only
     def send_one(model: Model, state: State, memory: Memory, vehicle: int, tick: wp.array(dtype=wp.int32)):
         """Let one vehicle send. One thread per world."""
         world = wp.tid()

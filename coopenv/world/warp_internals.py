@@ -3,10 +3,11 @@
 | function | private names | reason |
 |---|---|---|
 | `replay_of` | `context._build_cpu_args_structs`, `command.hooks.forward` | launch in a microsecond |
-| `device_function` | `Function.__class__`, `get_overload`, `overload.adj` | records by reference, uncopied |
+| `device_function`, `subroutine` | `Function.__class__`, `inline_hint`, `overload.adj` | records by reference |
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record by its instance |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
+| `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | CUDA: no copies of records, no kernels of the host |
 """
 
 import ctypes
@@ -15,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import warp as wp
-from warp._src import context
+from warp._src import codegen, context
 
 
 def replay_of(command: Any) -> Callable[[], Any]:
@@ -58,6 +59,37 @@ def _has_arrays(kind: Any) -> bool:
     return any(isinstance(field.type, wp.array) or _has_arrays(field.type) for field in fields)
 
 
+_generate = codegen.codegen_kernel
+
+
+def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
+    """Return the source of a kernel; on CUDA, records of arrays are read from where the launch puts them.
+
+    They are handed to functions by reference. A parameter whose address is taken is copied into the local memory of
+    every thread, 10 kB for the records of a world, unless it is a `__grid_constant__`. No kernel writes to one.
+    Source: CUDA C++ Programming Guide, `__grid_constant__`.
+    """
+    if device == "cuda" and getattr(kernel.func, "host_only", False):
+        return ""
+    source: str = _generate(kernel, device, options)
+    if device != "cuda" or options["enable_backward"] or not kernel.module.name.startswith("coopenv."):
+        return source
+    head, brace, body = source.partition("\n{\n")
+    for kind, name in ((arg.ctype(), f"var_{arg.label}") for arg in kernel.adj.args if _has_arrays(arg.type)):
+        head = head.replace(f"{kind} {name}", f"const __grid_constant__ {kind} constant_{name}")
+        body = f"    {kind}& {name} = const_cast<{kind}&>(constant_{name});\n{body}"
+    return head + brace + body
+
+
+codegen.codegen_kernel = _kernel_source
+
+
+def host_only(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Leave the kernel of a function out of the modules of CUDA devices."""
+    function.host_only = True  # type: ignore[attr-defined]
+    return function
+
+
 def device_function(function: Callable[..., Any]) -> Any:
     """Return what `wp.func` makes of a function, with structs of arrays by reference.
 
@@ -71,6 +103,17 @@ def device_function(function: Callable[..., Any]) -> Any:
     """
     made = wp.func(function)
     made.__class__ = _ByReference
+    return made
+
+
+def subroutine(function: Callable[..., Any]) -> Any:
+    """Return a `device_function` that is never inlined.
+
+    For large functions with several callers: ptxas takes minutes for code that contains them several times. They should
+    return no matrices, which a call passes through memory.
+    """
+    made = device_function(function)
+    made.inline_hint = "noinline"
     return made
 
 

@@ -57,6 +57,22 @@ def test_what_is_there_is_kept_when_a_stage_fails_or_takes_too_long(tmp_path: Pa
     assert [row["skipped"] for row in late["stages"]] == ["no time was left"] * 2 and not failures(late)
 
 
+def test_parts_that_run_one_by_one_fill_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A part replaces its own rows of the same device and version, and no others."""
+    out = tmp_path / "gpu.json"
+    part = ["--device", "cpu", "--quick", "--worlds", "2", "--out", str(out), "--only"]
+    assert main([*part, "machine"]) == 0
+    document = json.loads(out.read_text())
+    document["stages"] = [{"name": "machine", "problem": "old"}, {"name": "tests", "skipped": "kept"}]
+    out.write_text(json.dumps(document))
+    assert main([*part, "machine"]) == 0
+    kept, new = json.loads(out.read_text())["stages"]
+    assert kept == {"name": "tests", "skipped": "kept"} and "result" in new
+    out.write_text(json.dumps({**document, "coopenv": "0.0.1"}))
+    assert main([*part, "machine"]) == 0 and len(json.loads(out.read_text())["stages"]) == 1
+    assert main([*part, "dance"]) == 2 and "no stage begins with 'dance'" in capsys.readouterr().err
+
+
 def test_worlds_that_do_not_fit_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """1,000 worlds of over 10 KiB each are more than 80 % of 10 MiB."""
     monkeypatch.setattr(work, "free_memory", lambda device: 10 * 2**20)

@@ -24,7 +24,7 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Pose, PoseEstimate, mat66d
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import agent_of, entry_at, entry_count
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 MAX_UNSEEN_TIME = constants.MEAN_TIME + constants.SAME_TIME
 
@@ -75,7 +75,7 @@ def estimate_with_faults(memory: Any, world: int, i: int):
     return PoseEstimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0] + memory.fault_mixture[world, i])
 
 
-@device_function
+@subroutine
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Propagate a member by an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
@@ -111,7 +111,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
     memory.scratch[world, i, k].recentring = G
 
 
-@device_function
+@subroutine
 def apply_corrections(memory: Any, world: int, i: int):
     """Apply the corrections of all estimated members, and recentre the covariance about the new poses."""
     for k in range(memory.belief[world, i].members):

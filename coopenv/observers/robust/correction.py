@@ -9,7 +9,7 @@ from coopenv.observers.robust.algebra import by_rows, displaced, recentring, tra
 from coopenv.observers.robust.belief import apply_corrections, is_estimated, subtract_block
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
@@ -60,7 +60,7 @@ def set_projection(memory: Any, world: int, i: int, n: int):
     )
 
 
-@device_function
+@subroutine
 def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool, projecting: bool):
     """Find the correction by all bearings that fit, without a change of the covariance.
 
@@ -100,7 +100,7 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
             memory.scratch[world, i, k].correction = vec6d()
 
 
-@device_function
+@subroutine
 def update_covariance(memory: Any, world: int, i: int, bearings: int):
     """Update the covariance by the bearings that fit; that of considered errors stays."""
     for k in range(memory.belief[world, i].members):
@@ -147,7 +147,7 @@ def next_share(memory: Any, world: int, i: int, bearings: int, first: bool):
     return share
 
 
-@device_function
+@subroutine
 def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     """Correct by the bearings that fit, linearised at half of a small correction, or after all of a large one.
 

@@ -26,7 +26,7 @@ from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
@@ -65,7 +65,7 @@ def set_row(memory: Any, world: int, i: int, n: int):
         set_block(memory, world, i, n, k, memory.scratch[world, i, k].row)
 
 
-@device_function
+@subroutine
 def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     """Set a member to the pose and covariance of its report, without its earlier estimate."""
     report = memory.member[world, i, n].report
@@ -75,7 +75,7 @@ def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     set_row(memory, world, i, n)
 
 
-@device_function
+@subroutine
 def add_member(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Add a sender that is new to the belief, if there is room."""
     if make_room(model, memory, world, i, tick):
@@ -97,7 +97,7 @@ def add_member(model: Any, state: Any, memory: Any, world: int, i: int, sender: 
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
-@device_function
+@subroutine
 def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     """Correct the own pose by a sender's increment d (covariance N); `scratch.column` holds cov(d, y) for errors y."""
     members = memory.belief[world, i].members
@@ -125,7 +125,7 @@ def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, known: An
     add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
 
 
-@device_function
+@subroutine
 def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, unknown: Any):
     """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
     report = memory.member[world, i, n].report
@@ -301,7 +301,7 @@ def next_new_sender(model: Any, state: Any, memory: Any, world: int, i: int, las
     return best
 
 
-@device_function
+@subroutine
 def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Fuse the members' reports that carry correlations, then add new senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)

@@ -34,7 +34,7 @@ from coopenv.observers.robust.messages import dependents, depends_on_own, marker
 from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 REPORT_BYTES = wp.constant(172)
 CORRELATION_BYTES = wp.constant(42)
@@ -71,7 +71,7 @@ def next_broadcast(model: Any, memory: Any, world: int, i: int, last: int) -> in
     return found
 
 
-@device_function
+@subroutine
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
     P = memory.P[world, i, 0, 0] + memory.fault_mixture[world, i]
@@ -123,7 +123,7 @@ def broadcast_correlations(model: Any, memory: Any, world: int, i: int, slot: in
         memory.outbox_correlation[world, i, slot, c] = broadcast
 
 
-@device_function
+@subroutine
 def send_broadcast(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due; the first of an interval of `NEWS_TIME` carries correlations."""
     if tick % model.radio.period == 0:
@@ -167,7 +167,7 @@ def clear_box_of_another(model: Any, memory: Any, world: int, i: int, box: int, 
         fill(memory.correlation[world, i, box], no_correlation())
 
 
-@device_function
+@subroutine
 def receive_broadcast(model: Any, state: Any, memory: Any, world: int, i: int):
     """Receive the messages that the radio delivers at this tick."""
     kept = model.kept
@@ -258,7 +258,7 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     return most >= wp.float64(0.0), False, shared
 
 
-@device_function
+@subroutine
 def note_correlations(
     model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool, count: int, broadcast: bool
 ):
@@ -325,7 +325,7 @@ def dependence_inflation(memory: Any, world: int, i: int, n: int):
     return wp.float64(dependents(memory, world, i))
 
 
-@device_function
+@subroutine
 def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
     """Set the regression coefficients L; return the residual covariance.
 
@@ -358,7 +358,7 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
     return left
 
 
-@device_function
+@subroutine
 def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return the inflation of `after`.
 

@@ -38,7 +38,7 @@ from coopenv.observers.robust.sources import (
     is_sender,
     member_of,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
@@ -54,7 +54,7 @@ def spread_of(memory: Any, world: int, i: int, q: int):
     return spread
 
 
-@device_function
+@subroutine
 def inflate_by_fault(memory: Any, world: int, i: int, q: int):
     """Add to the covariance what the solution without a source differs by, and what it is less certain.
 
@@ -92,7 +92,7 @@ def forget_faults(memory: Any, world: int, i: int):
                 restart_gyro(memory, world, i)
 
 
-@device_function
+@subroutine
 def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; the own odometry is used on, with an uncertain scale or bias."""
     memory.source[world, i, q].exclusions += 1
@@ -165,7 +165,7 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
     memory.fault_mixture[world, i] = symmetric_part(mixture)
 
 
-@device_function
+@subroutine
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain.
 

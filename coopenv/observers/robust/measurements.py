@@ -26,7 +26,7 @@ from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
 from coopenv.world.camera import VISIBLE, body_bearing, mapped_position
 from coopenv.world.nearby import agent_of, box_of_entry, entry_at, entry_count
 from coopenv.world.v2x import fresh
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 HALF_ACCELERATION = 0.5 * constants.MAX_ACCELERATION
 UNIFORM_VARIANCE = constants.THIRD
@@ -186,7 +186,7 @@ def set_measurement_of_target(
     return usable
 
 
-@device_function
+@subroutine
 def set_bearing_measurements(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, purpose: int):
     """Set the usable bearings to landmarks and vehicles as measurements, and return their frame.
 
@@ -240,7 +240,7 @@ def linearisation_variance(memory: Any, world: int, i: int, member: int, turn: A
     return frames_in(time, period) * along * across / (square * square)
 
 
-@device_function
+@subroutine
 def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
     member = memory.measurement[world, i, n].member
@@ -330,7 +330,7 @@ def innovation_with(memory: Any, world: int, i: int, n: int, noise: Any):
     return wp.dot(residual, innovation_weight(memory, world, i, n, noise) * residual)
 
 
-@device_function
+@subroutine
 def innovation_squared(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Linearise a bearing and return its normalised innovation squared, infinite for a target behind the camera.
 

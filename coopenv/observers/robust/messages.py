@@ -25,7 +25,7 @@ from coopenv.observers.robust.constants import MAX_CORRELATIONS, MIN_VARIANCE, S
 from coopenv.observers.robust.memory import Pose, SenderReport, mat66f, vec3d
 from coopenv.world.embedded import Messages
 from coopenv.world.v2x import as_broadcast, claimed_std, odometry_as_broadcast
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @wp.func
@@ -47,7 +47,7 @@ def marker_jacobian(marker: Any):
     return algebra.lower_blocks(one, -skew(marker), one)
 
 
-@device_function
+@subroutine
 def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Return the report that a vehicle broadcasts: empty while its pose is not known.
 

@@ -82,14 +82,14 @@ from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
 from coopenv.world.nearby import is_target
 from coopenv.world.v2x import start_covariance
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 ANCHOR_ANGLE_VARIANCE = (0.25 * constants.KNOWN_ANGLE) ** 2
 ANCHOR_POSITION_VARIANCE = (0.25 * constants.KNOWN_POSITION) ** 2
 """rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost."""
 
 
-@device_function
+@subroutine
 def gate(frame: BearingFrame, memory: Any, world: int, i: int):
     """Linearise the bearings and gate them; return the share of rejected ones, the number of used ones, and their NIS.
 
@@ -131,7 +131,7 @@ def is_valid(estimate: PoseEstimate):
     return wp.isfinite(wp.trace(factor) + wp.length(estimate.pose.p) + wp.trace(estimate.pose.R))
 
 
-@device_function
+@subroutine
 def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
     """Begin a search whose prior is the anchor, propagated by odometry."""
     anchor = memory.anchor[world, i]
@@ -191,7 +191,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
         note_rejections(model, memory, world, i, share, now)
 
 
-@device_function
+@subroutine
 def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, inverse: Any):
     """Set the own covariance to that of the resection, members' errors included."""
     members = memory.belief[world, i].members
@@ -214,7 +214,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, bearings: int, in
     memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
 
 
-@device_function
+@subroutine
 def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
     """Resect the own pose from a frame by least squares; return whether in all steps three bearings determine it."""
     bearings = frame.bearings
@@ -249,7 +249,7 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
 ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # status of the own pose; found: by the search, at this tick
 
 
-@device_function
+@subroutine
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
     begin_belief(memory, world, i, estimate)
@@ -267,7 +267,7 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     memory.belief[world, i].depends_on = bits
 
 
-@device_function
+@subroutine
 def write(state: Any, memory: Any, world: int, i: int):
     """Write the own estimate to the state; during a search, that of the best hypothesis.
 
@@ -327,7 +327,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
     return wp.where(confirmed, ESTIMATING, FOUND)
 
 
-@device_function
+@subroutine
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
     purpose = wp.where(standing == ESTIMATING, TRACKING, RESECTION)

@@ -21,7 +21,7 @@ from coopenv.observers.robust.memory import (
     vec6d,
 )
 from coopenv.observers.robust.sources import propagate_sources
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
@@ -128,7 +128,7 @@ def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
     return G
 
 
-@device_function
+@subroutine
 def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: Any):
     """Propagate the own pose by a corrected increment over dt, with noise and the remaining calibration errors."""
     propagate(memory, world, i, 0, step, noise)
@@ -175,7 +175,7 @@ def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
     return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
 
 
-@device_function
+@subroutine
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; propagate the dead reckoning.
 

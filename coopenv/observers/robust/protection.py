@@ -17,7 +17,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE
 from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d, vec6d
 from coopenv.observers.robust.sources import GYRO, is_active
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import subroutine
 
 QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along its most uncertain axis
 
@@ -64,7 +64,7 @@ def levels(up: Any, variances: Any, mean: Any):
     )
 
 
-@device_function
+@subroutine
 def protection_level(memory: Any, world: int, i: int):
     """Return (2,) the horizontal, m, and the angular, rad, protection level; infinite: unknown."""
     up = wp.transpose(memory.member[world, i, 0].pose.R) * vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))

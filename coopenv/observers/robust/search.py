@@ -28,7 +28,7 @@ from coopenv.observers.robust.measurements import (
 )
 from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, PoseEstimate, Search, mat33d, mat66d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 PROBLEMS = 1 + 3 * 2 * 5
 """Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
@@ -124,7 +124,7 @@ def problem(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, n
     return exists, b, z
 
 
-@device_function
+@subroutine
 def solve_triple(
     frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, require_determined: bool, tracking: bool
 ) -> bool:
@@ -310,7 +310,7 @@ def solve_chosen(
     return tracking
 
 
-@device_function
+@subroutine
 def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, period: Any):
     """Begin with a known prior in the first attempt, then with solutions, too; each attempt uses other bearings.
 
@@ -341,7 +341,7 @@ def postpone_acceptance(memory: Any, world: int, i: int):
     memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
 
 
-@device_function
+@subroutine
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Update the hypotheses by a frame; return whether a single one is left after some frames."""
     frame = set_bearing_measurements(model, state, memory, world, i, now, SEARCH)

@@ -44,7 +44,7 @@ from coopenv.observers.robust.sources import (
     is_rejected,
     is_sender,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 
 @wp.func
@@ -147,7 +147,7 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
         memory.source[world, i, q].drift_information = kept * V
 
 
-@device_function
+@subroutine
 def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     """Add the innovations of a correction to the information on all faults, and correct the sensitivities."""
     weight = wp.min(frame.period / wp.float64(constants.MEAN_TIME), wp.float64(1.0))
@@ -254,7 +254,7 @@ def restart_gyro(memory: Any, world: int, i: int):
     memory.source[world, i, GYRO].offset = vec3d()
 
 
-@device_function
+@subroutine
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 

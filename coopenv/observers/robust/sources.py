@@ -19,7 +19,7 @@ from coopenv.observers.robust.memory import (
     vec3d,
     vec6d,
 )
-from coopenv.world.warp_internals import device_function
+from coopenv.world.warp_internals import device_function, subroutine
 
 VELOCITY, GYRO = 0, SOURCES - 1
 """The slots of the own velocity and angular velocity; between them are those of senders, then those of landmarks."""
@@ -48,7 +48,7 @@ def clear_drift(memory: Any, world: int, i: int, q: int):
     fill(memory.drift_effect[world, i, q - 1], vec6d())
 
 
-@device_function
+@subroutine
 def clear_source(memory: Any, world: int, i: int, q: int):
     """Clear the information about a source."""
     memory.source[world, i, q].rejected = wp.float64(0.0)
