@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3210, 12),
     "training": (1380, 5),
     "viz": (4485, 17),
-    "world": (5180, 19),
+    "world": (5185, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 
