@@ -89,6 +89,11 @@ def test_containers_are_of_files_that_exist() -> None:
             assert set(names.split(",")) <= extras
 
 
+def test_a_clone_has_small_samples() -> None:
+    sizes = {p: p.stat().st_size for p in (ROOT / "examples").rglob("*") if p.is_file() and p.suffix != ".pyc"}
+    assert any(path.suffix == ".mcap" for path in sizes) and sum(sizes.values()) < 3_000_000
+
+
 def test_links_of_the_pages_at_the_top_lead_somewhere() -> None:
     for path in [*ROOT.glob("*.md"), *ROOT.glob("agents/*.md")]:
         home = path.relative_to(ROOT).as_posix()
