@@ -91,15 +91,15 @@ LINES_AND_FILES = {
     "base": (1400, 8),
     "bench": (5300, 20),
     "cars": (10525, 47),
-    "cli": (2405, 8),
+    "cli": (2505, 8),
     "estimation": (1765, 8),
     "evaluation": (495, 3),
     "observers": (11810, 47),
     "policies": (1725, 10),
-    "runs": (3120, 12),
+    "runs": (3220, 13),
     "scenario": (3175, 12),
     "training": (1380, 5),
-    "viz": (4485, 17),
+    "viz": (4800, 19),
     "world": (5135, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -21,7 +21,8 @@ from coopenv.evaluation.episodes import Episodes, play
 from coopenv.evaluation.metrics import Quantile, interval, resamples
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
-from coopenv.runs.scenes import frame_stride, scene_of, video_path, write_page, write_pictures
+from coopenv.runs.films import video_path, write_pictures
+from coopenv.runs.scenes import frame_stride, scene_of, write_page
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle
 from coopenv.viz.scene import Origin

@@ -7,11 +7,11 @@ import numpy as np
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.viz import meshes
 from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Box, Stage, entries
-from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
-from coopenv.viz.web import ground
 from coopenv.viz.web.ground import (
     NOTHING,
     ROOT,
@@ -23,7 +23,6 @@ from coopenv.viz.web.ground import (
     dashes,
     fine,
     placed,
-    rgb,
     update,
 )
 
@@ -41,19 +40,19 @@ class Actors:
     def __init__(self, scene: Any, stage: Stage, source: Origin, floor: Ground, colours: np.ndarray) -> None:
         """Add the nodes."""
         self._scene, self._stage, self._floor = scene, stage, floor
-        self._size, self._center = stage.bodies
+        self._size, self._center = stage.bodies()
         white = np.full((stage.vehicles, 3), 255, np.uint8)
-        self.cars = Batch(scene, f"{ROOT}/cars/true", ground.car(), colours, flat_shading=True)
-        self._arrows = Batch(scene, f"{ROOT}/cars/front", ground.arrow(), white, side="double")
-        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", ground.car(), colours, opacity=0.32, flat_shading=True)
-        self._frames = Batch(scene, f"{ROOT}/estimates/edges", ground.box(), colours, wireframe=True, opacity=0.5)
-        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", ground.sphere(), colours, opacity=_HONEST)
+        self.cars = Batch(scene, f"{ROOT}/cars/true", meshes.car(), colours, flat_shading=True)
+        self._arrows = Batch(scene, f"{ROOT}/cars/front", meshes.arrow(), white, side="double")
+        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", meshes.car(), colours, opacity=0.32, flat_shading=True)
+        self._frames = Batch(scene, f"{ROOT}/estimates/edges", meshes.box(), colours, wireframe=True, opacity=0.5)
+        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", meshes.sphere(), colours, opacity=_HONEST)
         self.set_source(source)
         dark = np.tile(rgb(DARK_BLUE), (stage.landmarks, 1))
-        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", ground.sphere(6), dark)
-        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", ground.pole(), dark)
+        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", meshes.sphere(6), dark)
+        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", meshes.pole(), dark)
         bodies = sum(landmark.body is not None for landmark in stage.scenario.landmarks)
-        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", ground.box(), dark[:bodies])
+        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", meshes.box(), dark[:bodies])
         self._marks = np.zeros((0, 3))
         self._traffic: Batch | None = None
 
@@ -81,7 +80,7 @@ class Actors:
         if len(frame.traffic_half):
             if self._traffic is None:
                 grey = np.tile(rgb(TRAFFIC), (len(frame.traffic_half), 1))
-                self._traffic = Batch(self._scene, f"{ROOT}/traffic", ground.car(), grey, flat_shading=True)
+                self._traffic = Batch(self._scene, f"{ROOT}/traffic", meshes.car(), grey, flat_shading=True)
             size = np.where(frame.traffic_half[:, :1] > 0.0, 2.0 * frame.traffic_half, np.nan)
             self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
 
@@ -210,7 +209,7 @@ class MessageBeads:
         n = stage.vehicles
         self._stage, self._step = stage, floor.step
         self._receiver, self._sender = (part.ravel() for part in np.indices((n, n)))
-        self._batch = Batch(scene, f"{ROOT}/messages", ground.sphere(5), colours[self._sender])
+        self._batch = Batch(scene, f"{ROOT}/messages", meshes.sphere(5), colours[self._sender])
         self._began = np.full(n * n, -np.inf)
         self._last = np.full(n * n, -1)
         self._time = -np.inf
@@ -252,7 +251,7 @@ class Labels:
         """Add them."""
         self._stage, self._said = stage, -np.inf
         self._marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
-        self._above = stage.bodies[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.012 * stage.side]
+        self._above = stage.bodies()[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.012 * stage.side]
 
         def label(name: str, text: str, **look: Any) -> Any:
             return scene.add_label(f"{ROOT}/names/{name}", text, anchor="bottom-center", depth_test=False, **look)
