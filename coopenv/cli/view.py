@@ -242,6 +242,12 @@ class ViewOptions(SceneOptions):
         watching = {} if self.observer is None else {"observer.name": self.observer}
         return open_svea(self.deployment, None, {**self.changes, **watching, **(more or {})}, connect=self.connect)
 
+    def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
+        """Return who drives, as of other commands; where none is asked for, one that keeps landmarks in view."""
+        from coopenv.runs.scenes import LOOKING, driver_of
+
+        return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
+
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.
 

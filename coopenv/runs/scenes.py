@@ -29,6 +29,8 @@ from coopenv.scenario import Scenario
 from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"
+LOOKING = ("look_ahead", "peek")
+"""Drivers that keep landmarks in view."""
 MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
 MAX_FPS = 20.0
 
@@ -133,17 +135,23 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
     return None
 
 
-def driver_of(name: str | None, scenario: Scenario, environment: str, seed: int) -> tuple[Policy | None, str]:
+def driver_of(
+    name: str | None, scenario: Scenario, environment: str, seed: int, preferred: tuple[str, ...] = ()
+) -> tuple[Policy | None, str]:
     """Return the driver and its name: the given one, else the baseline if it can drive, else none.
+
+    The first of the `preferred` agents that was made for the environment comes before the baseline.
 
     Raises:
         CoopenvError: there is no such agent, or it cannot drive here.
     """
     if not scenario.driven:
         return None, ""
+    made = agents_for(Path(environment).stem)
+    name = name or next((agent for agent in preferred if agent in made), None)
     if name is None:
         name = BASELINE
-        if BASELINE not in agents_for(Path(environment).stem):
+        if BASELINE not in made:
             try:
                 find_agent(BASELINE).policy(scenario)
             except CoopenvError:

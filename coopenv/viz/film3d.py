@@ -12,24 +12,13 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz import meshes, stage
-from coopenv.viz.meshes import Mesh
+from coopenv.viz.meshes import ASPHALT, DARK, GRASS, GRID, HORIZON, MARKS, SKY, SUN, WALL, Mesh
 from coopenv.viz.scene import Frame, semi_axes
 from coopenv.viz.stage import Stage
 from coopenv.viz.style import DARK_BLUE, GREY, rgb, vehicle_colour
 
 CAMERAS = ("overview", "follow", "driver")
 """From above the scene; behind a vehicle; through a vehicle's camera."""
-SKY, HORIZON, GRASS, GRID, ASPHALT, MARKS, WALL, DARK = (
-    "#6FA8DC",
-    "#DCEBF7",
-    "#8DAA74",
-    "#9CB785",
-    "#54585D",
-    "#F2F2F2",
-    "#D8C9AE",
-    "#1B2026",
-)
-_SUN = np.array([-0.45, -0.6, 0.85])  # direction to it
 _SOUTH = np.array([0.0, -0.6, 0.8])  # direction from the middle to the camera that sees everything
 _ANGLE, _AWAY = 40.0, 1.35  # its vertical field of view, deg, and its distance in the scene's sides
 _SHORTEST = 0.07  # of the scene's side, length of a vehicle in its picture
@@ -86,9 +75,10 @@ class View3d:
             self._look_over()
 
     def paint(self, frame: Frame) -> np.ndarray:
-        """Return an (H, W, 3) uint8 picture of a frame."""
+        """Return an (H, W, 3) uint8 picture of a frame; estimates below their vehicles are drawn at their height."""
         R, R_hat = frame.vehicle_rotation @ self._turn, frame.estimate_rotation @ self._turn
         estimate = self._stage.nearer(frame.estimate_position, _FAR)
+        estimate[:, 2] = np.maximum(estimate[:, 2], frame.vehicle_position[:, 2])
         cars = self._boxes(R, frame.vehicle_position), self._boxes(R_hat, estimate)
         for parts, places in zip((self._cars, self._ghosts), cars, strict=True):
             for actors, place, shown in zip(parts, places, self._shown, strict=True):
@@ -154,7 +144,7 @@ class View3d:
 
     def _add_light(self) -> None:
         light = self._pv.Light
-        self._plot.add_light(light(position=_SUN, light_type="scene light", intensity=0.85, color="#FFF4E0"))
+        self._plot.add_light(light(position=SUN, light_type="scene light", intensity=0.85, color="#FFF4E0"))
         self._plot.add_light(light(light_type="headlight", intensity=0.25, color="#DDE8FF"))
 
     def _draw_shadows(self, frame: Frame, cars: np.ndarray) -> None:
@@ -168,7 +158,7 @@ class View3d:
             corners.append(np.vstack([_DOT * here.side * ball + place, foot]).T)
         outlines = []
         for points in (points for points in corners if np.isfinite(points).all()):
-            flat = (points[:2] - _SUN[:2, None] / _SUN[2] * (points[2] - here.floor)).T
+            flat = (points[:2] - SUN[:2, None] / SUN[2] * (points[2] - here.floor)).T
             outlines.append(flat[ConvexHull(flat).vertices])
         count = [len(outline) for outline in outlines]
         z = here.floor + 1e-3 * here.side * np.ones((sum(count), 1))

@@ -1,7 +1,11 @@
-"""Meshes that the views in space share: cars, landmarks, ellipsoids, and what lies flat on the ground."""
+"""Meshes and colours that the views in space share: cars, landmarks, ellipsoids, and what lies flat on the ground."""
 
 import numpy as np
 
+SKY, HORIZON, GRASS, GRID = "#6FA8DC", "#DCEBF7", "#8DAA74", "#9CB785"
+ASPHALT, MARKS, WALL, DARK = "#54585D", "#F2F2F2", "#D8C9AE", "#1B2026"
+SUN = np.array([-0.45, -0.6, 0.85])
+"""Direction to the sun, map."""
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (V, 3) and triangles (F, 3)."""
 

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coopenv.viz import meshes
 from coopenv.viz.meshes import Mesh, quad
 from coopenv.viz.stage import CORNERS, Stage, roads
 from coopenv.viz.style import linear_light, rgb
-from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
 
 
 @dataclass
@@ -155,8 +155,7 @@ def dashes(start: np.ndarray, end: np.ndarray, count: int, share: float) -> np.n
 
 ROOT = "/world"
 """The node that everything hangs on; moving it moves the world."""
-_SOLID, _FADED = 0.8, 0.15  # opacity of buildings, and of those in front of the picked vehicle
-_GRID = "#DEDBD1"
+_SOLID, _FADED = 1.0, 0.15  # opacity of buildings, and of those in front of the picked vehicle
 _FLAT = {"cast_shadow": False, "receive_shadow": False}
 
 
@@ -177,22 +176,23 @@ class Ground:
         """Of positions, m."""
         self.root = scene.add_frame(ROOT, show_axes=False)
         """viser's handle of the node that everything hangs on."""
-        scene.configure_environment_map(None)  # light is even, so that colours are those of the figures
+        scene.configure_environment_map(None)
         scene.configure_default_lights(False, False)
-        scene.add_light_ambient("/light/everywhere", intensity=3.0)
-        sun = tuple(stage.side * np.array([-0.5, -0.9, 1.6]))
-        scene.add_light_directional("/light/sun", intensity=0.9, position=sun)
+        scene.add_light_ambient("/light/everywhere", intensity=1.7)
+        sun = tuple(stage.side * meshes.SUN)
+        scene.add_light_directional("/light/sun", intensity=2.2, position=sun, cast_shadow=True)
+        shade = np.linspace(rgb(meshes.SKY), rgb(meshes.HORIZON), 64)
+        scene.set_background_image(shade[:, None].repeat(2, axis=1).astype(np.uint8), "png")
         self._add_floor()
         self._add_roads()
         self._buildings = [
             scene.add_box(
                 f"{ROOT}/buildings/{i}",
                 dimensions=tuple(building.size),
-                color=rgb(ROOF),
+                color=rgb(meshes.WALL),
                 opacity=_SOLID,
                 position=tuple(building.center),
                 wxyz=tuple(Rotation.from_matrix(building.rotation).as_quat(scalar_first=True)),
-                cast_shadow=False,
             )
             for i, building in enumerate(stage.buildings)
         ]
@@ -205,15 +205,15 @@ class Ground:
     def _add_floor(self) -> None:
         side, spacing = self._stage.side, spacing_of(self._stage.side)
         middle = self._stage.middle[:2]
-        corners = middle + 0.75 * side * CORNERS
+        corners = middle + 8.0 * side * CORNERS
         floor = quad(corners, self.z - 0.004 * side)
-        self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **_FLAT)
+        self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(meshes.GRASS), cast_shadow=False)
         count = int(np.ceil(0.7 * side / spacing))
         at, reach = spacing * np.arange(-count, count + 1), spacing * count
         lines = [np.array([(x, -reach, 0.0), (x, reach, 0.0)]) for x in at]
         lines += [line[:, [1, 0, 2]] for line in lines]
         place = (*(np.round(middle / spacing) * spacing), self.z - 0.003 * side)
-        add_lines(self._scene, f"{ROOT}/grid", np.array(lines), linear(rgb(_GRID)), 1.0, position=place)
+        add_lines(self._scene, f"{ROOT}/grid", np.array(lines), rgb(meshes.GRID), 1.0, position=place)
         edge = (float(middle[0]), float(self._stage.low[1] + 0.02 * side), self.z)
         unit = f"grid {spacing:g} m" if spacing >= 1 else f"grid {100 * spacing:g} cm"
         self._scene.add_label(f"{ROOT}/scale", unit, position=edge, font_screen_scale=0.85, anchor="top-center")
@@ -223,7 +223,7 @@ class Ground:
         marks = [np.zeros((0, 2, 3))]
         for i, (road, corners) in enumerate(zip(scenario.roads, roads(scenario), strict=True)):
             mesh = quad(corners, self.z - side * (2e-3 - 1e-4 * (i % 8)))
-            self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(ASPHALT), **_FLAT)
+            self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(meshes.ASPHALT), cast_shadow=False)
             if road.marked:
                 start, end = (np.array([[*(p - origin), self.z - 5e-4 * side]]) for p in (road.start, road.end))
                 count = max(1, int(np.linalg.norm(end - start) / (0.04 * side)))
