@@ -137,7 +137,7 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     figure.supylabel(f"NEES / {dof}, log" + (", mean over runs" if runs > 1 else ""), **style.TEXT)
     vehicles = [Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i])) for i in shown]
     runs_word = f"{runs} run{'s' if runs > 1 else ''}"
-    band = Patch(facecolor=SHADE, label=f"95 % of an honest one ($\\chi^2$, {runs_word}, at one instant)")
+    band = Patch(facecolor=SHADE, label=f"95 % of a consistent observer ($\\chi^2$, {runs_word}, at one instant)")
     style.legend_above(figure, [*vehicles, band])
     return figure
 
