@@ -21,10 +21,23 @@ LISTED: dict[str, Callable[[], list[dict[str, str]]]] = {
 def generated() -> Iterator[tuple[str, str]]:
     """Yield path and Markdown text of every page."""
     yield "reference/command_line.md", command_line()
+    yield "gallery.md", gallery()
     yield "files/examples.md", examples_page()
     yield from observers()
     for file, page in mirrored().items():
         yield page, relinked((ROOT / file).read_text(encoding="utf-8"), file, page)
+
+
+def gallery() -> str:
+    """Return the page with the film of every environment, or its picture, which leads to its page."""
+    cards = []
+    for name in list_envs():
+        page = ROOT / "docs/environments" / name
+        title = page.with_suffix(".md").read_text(encoding="utf-8").partition("\n")[0].strip("# ")
+        film = page.with_suffix(".webp")
+        picture = film.name if film.is_file() else f"{name}.png"
+        cards.append(f"[![{title}](environments/{picture}){{ loading=lazy }} {title}](environments/{name}.md)")
+    return "\n\n".join(["# Gallery", '<div class="gallery" markdown>', *cards, "</div>"]) + "\n"
 
 
 def mirrored() -> dict[str, str]:

@@ -91,15 +91,15 @@ LINES_AND_FILES = {
     "base": (1630, 11),
     "bench": (5290, 20),
     "cars": (10525, 47),
-    "cli": (2425, 8),
+    "cli": (2520, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
     "observers": (11820, 47),
     "policies": (1725, 10),
-    "runs": (3215, 12),
+    "runs": (3305, 13),
     "scenario": (3210, 12),
     "training": (1380, 5),
-    "viz": (4485, 17),
+    "viz": (4800, 19),
     "world": (5185, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -218,7 +218,7 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
 def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: None)
     monkeypatch.setattr("coopenv.runs.rollouts.Rollout.play", lambda self: pytest.fail("simulated"))
     (Path("there") / name).mkdir(parents=True)
     assert main(["run", "overtaking", "--out", "there", "--video"]) == 2

@@ -21,7 +21,8 @@ from coopenv.evaluation.episodes import Episodes, play
 from coopenv.evaluation.metrics import Quantile, interval, resamples
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
-from coopenv.runs.scenes import frame_stride, scene_of, video_path, write_page, write_pictures
+from coopenv.runs.films import video_path, write_pictures
+from coopenv.runs.scenes import frame_stride, scene_of, write_page
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle
 from coopenv.viz.scene import Origin
@@ -55,7 +56,7 @@ def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
     farthest = max(float(np.quantile(own.distance[-1], 0.9)) for own in evaluation.episodes.values())
     edges = np.linspace(0.0, max(farthest, 1e-3), BINS + 1)
     for ax, share, words in zip(panels, (0.5, 0.95), ("median", "95th percentile"), strict=True):
-        style.tidy(ax, x_label="distance driven [m]", y_label="position error [m]" if share == 0.5 else "")
+        style.tidy(ax, x_label="distance driven [m]", y_label="position error [m], log" if share == 0.5 else "")
         ax.set_title(words, fontsize=NORMAL, color=INK)
         ax.set_yscale("log")
         for look, episodes in zip(_looks(evaluation), evaluation.episodes.values(), strict=True):
@@ -85,7 +86,7 @@ def pareto_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
     """Draw travel time against the 95th percentile of the position error, with the intervals of both."""
     figure, _ = style.canvas(width or 5.2, 3.9, _note(evaluation, "bars: 95 % intervals over worlds"))
     ax = figure.subplots()
-    style.tidy(ax, x_label="travel time [s]", y_label="95th percentile of the position error [m]")
+    style.tidy(ax, x_label="travel time [s]", y_label="95th percentile of the position error [m], log")
     ax.set_yscale("log")
     for look, results in zip(_looks(evaluation), evaluation.results.values(), strict=True):
         known = {result.metric: result for result in results}
@@ -105,7 +106,7 @@ def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure
     """
     columns = min(style.fitting(width or style.PAGE, _PANEL * 0.8, 4), len(evaluation.episodes))
     rows = -(-len(evaluation.episodes) // columns)
-    note = _note(evaluation, f"share of time from {100 * _RAREST:g} %, logarithmic; 0: along the way, positive: left")
+    note = _note(evaluation, f"0: along the way, positive: left; shares from {100 * _RAREST:g} %")
     figure, _ = style.canvas(width, 0.5 + _PANEL * rows, note)
     edges = np.radians(np.arange(-93, 94, 6))
     rings = _RAREST * 10.0 ** np.arange(1, 4)
@@ -118,6 +119,7 @@ def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure
         bars = {"width": np.diff(edges), "align": "edge", "color": look["color"], "alpha": 0.75, "linewidth": 0}
         ax.bar(edges[:-1], _radius(_shares(episodes, edges)), **bars)
         ax.set_title(look["label"], fontsize=NORMAL, color=INK, pad=6)
+        ax.set_xlabel("share of time, log", fontsize=SMALL, color=INK, labelpad=-20)
     return figure
 
 

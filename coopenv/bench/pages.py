@@ -18,8 +18,9 @@ from coopenv.base.installation import environment_id, list_envs, version
 from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
 from coopenv.policies import agents_for
 from coopenv.runs import scenario_text
+from coopenv.runs.films import top_view_film, write_film
 from coopenv.runs.scenario_text import drawn, graded
-from coopenv.runs.scenes import driver_of, scene_of, write_film
+from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.runs.summary import cell_text, environment_rows, facts, shown_sections
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS
@@ -54,7 +55,7 @@ def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Ca
         source = Origin.of(name, scenario, policy=driver, seed=_SEED)
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
     speed = max(1.0, record.length / _LASTS)
-    write_film(record, path, FPS, speed, WIDTH, False, lambda share: on_progress(0.5 + share / 2))
+    write_film(top_view_film(record, False), path, FPS, speed, WIDTH, lambda share: on_progress(0.5 + share / 2))
 
 
 def _moves(scenario: Scenario, driver: str) -> bool:

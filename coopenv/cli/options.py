@@ -57,7 +57,7 @@ def _override_keys() -> Iterator[str]:
 
 environments = completion(lambda: [*list_envs(), *(f"{kind}:" for kind in SCENES)])  # the shell completes files itself
 agents, agent_lists = completion(list_agents), completion(list_agents, several=True)
-policies = completion(lambda: [*PLAIN, *list_agents()])
+policies, policy_lists = (completion(lambda: [*PLAIN, *list_agents()], several) for several in (False, True))
 observers = completion(_observer_names, several=True)
 override_keys = completion(_override_keys)
 
@@ -92,6 +92,13 @@ def known_policy(name: str | None) -> str | None:
     return name
 
 
+def known_policies(names: str | None) -> str | None:
+    """Return policies with commas between. Raises CoopenvError: there is no such policy."""
+    for name in words(names):
+        known_policy(name)
+    return names
+
+
 def known_agents(names: str | None) -> str | None:
     """Return agents with commas between. Raises CoopenvError: there is no such agent."""
     for name in words(names):
@@ -117,6 +124,7 @@ def words(text: str | None) -> list[str]:
 
 ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
 POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
+POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": known_policies}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
 OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
 """Completion and check of an argument or option."""

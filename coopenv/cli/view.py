@@ -1,7 +1,7 @@
 """`coopenv view`, `film`, `watch` and `play`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,8 +11,11 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from coopenv.backends.base import Backend
     from coopenv.policies import Policy
+    from coopenv.runs.films import Shot
     from coopenv.runs.live import Reel
     from coopenv.scenario import Scenario
     from coopenv.viz.scene import SceneRecord
@@ -86,33 +89,109 @@ class SceneOptions(options.SourceOptions):
 class FilmOptions(SceneOptions):
     """Options of `coopenv film`."""
 
+    agent: Annotated[
+        str | None,
+        typer.Option(
+            help="Driver, as of `coopenv view`; several with commas between: their films side by side.",
+            show_default=False,
+            **options.POLICIES,
+        ),
+    ] = None
+    observer: Annotated[
+        str | None,
+        typer.Option(
+            help="Observer (default: that of the environment); several with commas between: their films side by side.",
+            show_default=False,
+            **options.OBSERVERS,
+        ),
+    ] = None
     out: Annotated[Path, typer.Option(help="File to write: .mp4, .gif or .webp.")]
     speed: Annotated[float, typer.Option(min=0.05, max=100.0, help="Times real time.")] = 1.0
     fps: Annotated[
         float | None, typer.Option(min=1.0, max=50.0, help="Pictures a second (default: 20 for MP4, else 10).")
     ] = None
-    width: Annotated[int, typer.Option(min=64, max=896, help="Width of the pictures, pixels.")] = 896
-    map_only: Annotated[bool, typer.Option("--map-only", help="Leave out the table and the legend.")] = False
+    width: Annotated[
+        int, typer.Option(min=64, max=1920, help="Width of the pictures, pixels; a film from above has at most 896.")
+    ] = 896
+    map_only: Annotated[
+        bool, typer.Option("--map-only", help="Leave out the table and the legend of a film from above.")
+    ] = False
+    space: Annotated[bool, typer.Option("--3d", help="Film in space, lit and with shadows (extra film3d).")] = False
+    camera: Annotated[
+        str,
+        typer.Option(
+            help="With --3d: overview, follow or driver; several with commas between: one below another.",
+            autocompletion=options.completion(lambda: ("overview", "follow", "driver"), several=True),
+        ),
+    ] = "overview"
+    vehicle: Annotated[
+        str | None, typer.Option(help="With --3d: vehicle that is followed, or whose camera it is (default: f1).")
+    ] = None
+
+    def takes(self, log: "Console") -> "list[tuple[str, SceneRecord]]":
+        """Return the scenes that stand side by side, each with what it differs in.
+
+        Raises:
+            CoopenvError: one cannot be played.
+        """
+        saved = self.saved()
+        if saved is not None:
+            return [("", saved)]
+        observers: list[str | None] = [*options.words(self.observer)] or [None]
+        agents: list[str | None] = [*options.words(self.agent)] or [None]
+        pairs = [(observer, agent) for observer in observers for agent in agents]
+        takes = []
+        for observer, agent in pairs:
+            name = ", ".join(n for n, of in ((observer, observers), (agent, agents)) if n is not None and len(of) > 1)
+            takes.append((name, replace(self, observer=observer, agent=agent)._played(log)))
+        return takes
+
+    def _played(self, log: "Console") -> "SceneRecord":
+        from coopenv.runs.scenes import played_scene, title_of
+
+        backend = self.open()
+        policy, driver = (None, "") if backend.capabilities.recorded else self.driver(backend.scenario)
+        return played_scene(backend, title_of(self.environment), log, self.seed, policy, driver)
+
+    def shots(self, takes: "list[tuple[str, SceneRecord]]") -> "list[list[Shot]]":
+        """Return the parts of the picture: a column for each scene, a row for each camera.
+
+        Raises:
+            CoopenvError: no such camera or vehicle, or the extra is missing.
+        """
+        from coopenv.runs.films import Shot
+        from coopenv.runs.live import vehicle_index
+        from coopenv.viz.topview import TopView
+
+        if not self.space:
+            panel = not self.map_only and len(takes) == 1
+            return [[Shot(record, TopView(record.scenario, panel=panel), name) for name, record in takes]]
+        from coopenv.viz.film3d import View3d
+
+        cameras = options.words(self.camera)
+        each = self.width // len(takes)
+        size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
+        picked = vehicle_index(takes[0][1].scenario, self.vehicle)
+        return [
+            [Shot(record, View3d(record.scenario, size, camera, picked), "" if row else name) for name, record in takes]
+            for row, camera in enumerate(cameras)
+        ]
 
 
 @options.command
 def film(given: FilmOptions) -> None:
-    """Film an episode from above: MP4, GIF or WebP."""
+    """Film an episode, or several side by side, from above or in space: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
-    from coopenv.runs.scenes import check_film, played_scene, title_of, write_film
+    from coopenv.runs.films import check_film, write_film
 
     out, log = given.out, options.console(stderr=True)
     rate = given.fps or (20.0 if out.suffix == ".mp4" else 10.0)
     check_film(out)
     check_file(out)
-    record = given.saved()
-    if record is None:
-        backend = given.open()
-        policy, driver = (None, "") if backend.capabilities.recorded else given.driver(backend.scenario)
-        record = played_scene(backend, title_of(given.environment), log, given.seed, policy, driver)
+    shots = given.shots(given.takes(log))
     with Progress(log, f"filming {out.name}", 1.0) as progress:
-        pictures = write_film(record, out, rate, given.speed, given.width, not given.map_only, progress.update)
+        pictures = write_film(shots, out, rate, given.speed, given.width, progress.update)
     size = out.stat().st_size / 1e6
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
 
@@ -154,6 +233,12 @@ class ViewOptions(SceneOptions):
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         return open_svea(self.deployment, None, {**self.changes, **watching, **(more or {})}, connect=self.connect)
+
+    def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
+        """Return who drives, as of other commands; where none is asked for, one that keeps landmarks in view."""
+        from coopenv.runs.scenes import LOOKING, driver_of
+
+        return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.
@@ -246,7 +331,7 @@ def watch(
     from coopenv.base.files import replacing_folder
     from coopenv.runs import live
     from coopenv.runs.console import Progress
-    from coopenv.runs.scenes import VIDEO_FILES, video_path, write_pictures
+    from coopenv.runs.films import VIDEO_FILES, video_path, write_pictures
 
     policy = found.policy(scenario)
     if out is None:

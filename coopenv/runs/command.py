@@ -27,8 +27,9 @@ from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
 from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
+from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
 from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
-from coopenv.runs.scenes import VIDEO_FILES, Keeper, frame_stride, source_of, video_path, write_film, write_page
+from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
 from coopenv.viz.scene import SCENE_FILE
@@ -116,7 +117,7 @@ def execute(
             paths.append(video_path(folder))
             with Progress(log, f"filming {paths[-1].name}", 1.0) as progress:
                 fps = scenario.rates.camera / frame_stride(scenario)
-                write_film(scene, paths[-1], fps, width=None, on_progress=progress.update)
+                write_film(top_view_film(scene), paths[-1], fps, width=None, on_progress=progress.update)
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
     return replace(results, files=tuple(out / path.name for path in paths))

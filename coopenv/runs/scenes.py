@@ -1,26 +1,23 @@
-"""Scenes of episodes, kept while they run or read from what a run has left; the pages, films and logs made of them."""
+"""Scenes of episodes, kept while they run or read from what a run has left; the pages and logs made of them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from importlib.util import find_spec
-from itertools import chain
 from math import ceil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from rich.console import Console
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.mcap import write_recording
 from coopenv.backends.sources import SourceKind, kind_of, open_backend
-from coopenv.base.errors import CoopenvError, OutputError
-from coopenv.base.files import replacing_file, writing
+from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, list_envs
 from coopenv.evaluation.episodes import play
 from coopenv.observers import run
@@ -32,6 +29,8 @@ from coopenv.scenario import Scenario
 from coopenv.viz.scene import SCENE_FILE, Frame, Origin, SceneRecord
 
 BASELINE = "route_follower"
+LOOKING = ("look_ahead", "peek")
+"""Drivers that keep landmarks in view."""
 MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
 MAX_FPS = 20.0
 
@@ -136,17 +135,23 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
     return None
 
 
-def driver_of(name: str | None, scenario: Scenario, environment: str, seed: int) -> tuple[Policy | None, str]:
+def driver_of(
+    name: str | None, scenario: Scenario, environment: str, seed: int, preferred: tuple[str, ...] = ()
+) -> tuple[Policy | None, str]:
     """Return the driver and its name: the given one, else the baseline if it can drive, else none.
+
+    The first of the `preferred` agents that was made for the environment comes before the baseline.
 
     Raises:
         CoopenvError: there is no such agent, or it cannot drive here.
     """
     if not scenario.driven:
         return None, ""
+    made = agents_for(Path(environment).stem)
+    name = name or next((agent for agent in preferred if agent in made), None)
     if name is None:
         name = BASELINE
-        if BASELINE not in agents_for(Path(environment).stem):
+        if BASELINE not in made:
             try:
                 find_agent(BASELINE).policy(scenario)
             except CoopenvError:
@@ -199,140 +204,6 @@ def pages_can_be_written(path: Path, log: Console) -> bool:
             f"note: no {path.name}: pages in the browser need an extra: {install_command('view')}", soft_wrap=True
         )
     return there
-
-
-SUFFIXES = (".mp4", ".gif", ".webp")
-"""Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
-VIDEO_FILES = ("video.mp4", "video.gif")
-"""Names of a film in a folder of results, with and without the extra."""
-SMALL = 480
-"""Largest width of a GIF or WebP where none is asked for, pixels: its pictures are held in memory until the end."""
-
-
-def check_film(path: Path) -> None:
-    """Make sure that a film can have the format that its path names.
-
-    Raises:
-        OutputError: no such format.
-        CoopenvError: the format needs an extra.
-    """
-    if path.suffix not in SUFFIXES:
-        raise OutputError(f"{path}: unknown format of a film; known: {', '.join(SUFFIXES)}")
-    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise CoopenvError(f"{path}: MP4 needs an extra: {install_command('video')}; GIF and WebP do not")
-
-
-def video_path(folder: Path) -> Path:
-    """Return the path of a film in a folder of results: MP4, or GIF without the extra."""
-    return folder / VIDEO_FILES[find_spec("imageio_ffmpeg") is None]
-
-
-def write_film(
-    record: SceneRecord,
-    path: Path,
-    fps: float,
-    speed: float = 1.0,
-    width: int | None = 896,
-    panel: bool = True,
-    on_progress: Callable[[float], None] = lambda share: None,
-) -> int:
-    """Write a film of a scene; return how many pictures it has.
-
-    Args:
-        record: the scene.
-        path: of the film, which is replaced as a whole; its suffix is the format.
-        fps: pictures a second; frames of the scene are repeated where it has fewer.
-        speed: times real time.
-        width: as for `write_pictures`.
-        panel: table and legend beside the map.
-        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
-
-    Raises:
-        CoopenvError: unknown format, or it needs an extra.
-        OutputError: the file cannot be written.
-    """
-    from coopenv.viz.topview import TopView
-
-    check_film(path)
-    chosen = frames_at(record.time, fps, speed)
-
-    def pictures() -> Iterator[np.ndarray]:
-        for done, k in enumerate(chosen, start=1):
-            yield view.paint(record.frame(int(k)))
-            on_progress(done / len(chosen))
-
-    with replacing_file(path) as new, closing(TopView(record.scenario, panel=panel)) as view:
-        write_pictures(new, fps, pictures(), width)
-    return len(chosen)
-
-
-def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
-    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
-    count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
-    moments = time[0] + np.arange(count) * speed / fps
-    return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)
-
-
-def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width: int | None = None) -> None:
-    """Write pictures, (H, W, 3) uint8, as they come, as a film in the format that its path names; none: no file.
-
-    Those that are wider than `width` pixels are made smaller (None: MP4 of any width, the others of at most `SMALL`).
-
-    Raises:
-        OutputError: the film cannot be written.
-    """
-    mp4 = path.suffix == ".mp4"
-    widest = width or (None if mp4 else SMALL)
-    images = (_no_wider(Image.fromarray(picture), widest) for picture in pictures)
-    if mp4:
-        _write_mp4(path, fps, images)
-        return
-    quality: dict[str, Any] = {"quality": 55, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
-    if kept := [image if quality else image.quantize(64) for image in images]:
-        ends = np.round(np.arange(len(kept) + 1) * 100.0 / fps) * 10.0
-        duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second
-        with writing(path):
-            kept[0].save(path, save_all=True, append_images=kept[1:], duration=duration, loop=0, **quality)
-
-
-def _no_wider(image: Image.Image, width: int | None) -> Image.Image:
-    if width is None or image.width <= width:
-        return image
-    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-
-
-def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
-    """Write H.264 and read it back: ffmpeg's writer does not report a full disk."""
-    import imageio_ffmpeg
-
-    @contextmanager
-    def told() -> Iterator[None]:
-        try:
-            yield
-        except (OSError, RuntimeError):
-            raise OutputError(f"cannot write to {path}: ffmpeg could not finish it; the disk may be full") from None
-
-    images, count = iter(images), 0
-    first = next(images, None)
-    if first is None:
-        return
-    width, height = (edge // 2 * 2 for edge in first.size)  # even, as the codec asks for
-    look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
-    writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
-    try:
-        with told():
-            writer.send(None)
-        for image in chain([first], images):
-            count += 1
-            with told():
-                writer.send(image.crop((0, 0, width, height)).tobytes())
-        with told():
-            writer.close()
-            if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
-                raise OSError
-    finally:
-        with suppress(OSError, RuntimeError):
-            writer.close()
 
 
 _ON_A_PLANE = "planar_robust"

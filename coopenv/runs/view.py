@@ -19,6 +19,7 @@ _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go
 _FADE_EVERY = 0.25  # s
 _RAISED = 0.7  # of the scene's side, by which it is lifted over the panel at the lower end of a narrow window
+_NEAR, _LENGTHS = 0.2, 12.0  # share of the first camera's distance from a picked vehicle, or so many of its lengths
 _NARROW = 0.7  # width over height of a window, from which on the camera begins farther away
 
 
@@ -45,15 +46,25 @@ class Viewer:
         )
         server.on_client_connect(self._welcome)
         self._k, self._speed, self.playing = 0, 1.0, True
-        self._live = not reel.abilities.pace
+        self._live, self._near = not reel.abilities.pace, 1.0
         self._due = self._shown_at = self._faded_at = -np.inf
         self.shown = 0
         """How many frames have been sent."""
         self._show(monotonic())
 
     def pick(self, vehicle: int | None) -> None:
-        """Look at a vehicle, or at none."""
+        """Look at a vehicle from near, or at all of them."""
         self._panel.pick(vehicle)
+        own = 0.0 if vehicle is None else self._stage.bodies()[0][vehicle, 0]
+        self._near = 1.0 if vehicle is None else max(_NEAR, _LENGTHS * own / self._stage.side)
+        aim(self._server.initial_camera, self._stage, near=self._near)
+        for client in self._server.get_clients().values():
+            self._aim(client.camera)
+
+    def _aim(self, camera: Any) -> None:
+        """Point a client's camera at the picked vehicle, or at everything."""
+        narrow = camera.aspect < _NARROW
+        aim(camera, self._stage, float(camera.aspect), _RAISED if narrow else 0.0, self._near)
 
     def run(self, going: Callable[[], bool] = lambda: True) -> None:
         """Show frames until `going` returns False."""
@@ -133,7 +144,7 @@ class Viewer:
             arrived = np.linalg.norm(camera.look_at - self._stage.middle) < 1e-3 * self._stage.side
             if waiting and arrived:  # the first camera is there, which would come after what is set before
                 waiting = False
-                aim(camera, self._stage, float(camera.aspect), _RAISED)
+                self._aim(camera)
 
         client.camera.on_update(once)
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _ROW, _NARROW_ROW, _FRAME = 1.35, 0.95, 0.95  # inches
 _LAST: dict[str, Any] = {"color": style.INK, "linewidth": 0.8, "linestyle": (0, (4, 2))}
 _TOLERATED: dict[str, Any] = {"color": style.GREY, "linewidth": 0.9, "linestyle": (0, (1, 1.5))}
+_LINEAR: dict[str, Any] = {"facecolor": "#FBF3DC", "edgecolor": "none", "zorder": 0}
+_PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1}
 _LATE = 0.7  # share of the record after which errors are small, and drawn linearly
 _LEAST_LINEAR = 1e-3  # m or deg
 _MOST_DECADES = 2  # that are labelled on each side of zero
@@ -67,13 +69,14 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, wi
     for ax, last in zip(axes[:, 0], converged, strict=True):
         when = f"last above {CONVERGED.position_m:g} m or {CONVERGED.orientation_deg:g} deg: {last:.1f} s"
         when = "above to the end" if np.isnan(last) else f"last above: {last:.1f} s" if narrow else when
-        style.note(ax, 0.985, 0.95, when, ha="right", va="top", path_effects=style.HALO)
+        style.note(ax, 0.985, 0.95, when, ha="right", va="top", bbox=_PAPER)
     dot = {"color": style.INK, "linestyle": "none", "marker": "o", "markersize": _DOT}
     axis_names = zip(style.AXES_COLOURS, ("x, roll", "y, pitch", "z, yaw"), strict=True)
     marks = style.marks(
         *((True, name, {"color": colour, "linewidth": style.LINE}) for colour, name in axis_names),
         (True, "at t = 0", dot),
         (True, f"± {CONVERGED.text}", _TOLERATED),
+        (True, "linear; log beyond", {"facecolor": _LINEAR["facecolor"], "edgecolor": style.RULE}),
         (np.isfinite(converged).any(), "last above either", _LAST),
         (any(map(np.any, events)), "moving target detected", {"facecolor": style.SHADE}),
         (live.min() < len(trajectory.t), "ended, parked", {"facecolor": style.ENDED}),
@@ -145,6 +148,7 @@ def _share_scale(column: Sequence[Axes], components: Sequence[np.ndarray], toler
     decades = decades[:: -(-len(decades) // _MOST_DECADES)]
     for ax in column:
         ax.set_yscale("symlog", linthresh=linear, linscale=1.0)
+        ax.axhspan(-linear, linear, **_LINEAR)
         ax.set_ylim(-1.6 * largest, 1.6 * largest)
         ax.set_yticks([*-decades[::-1], 0.0, *decades])
         ax.yaxis.set_minor_locator(NullLocator())
@@ -161,7 +165,8 @@ _STEADY: dict[str, Any] = {"color": style.INK, "linewidth": 0.7, "linestyle": (0
 _CLAIMED: dict[str, Any] = {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4}
 _ERROR: dict[str, Any] = {"color": style.INK, "linestyle": "-", "linewidth": 0.8}
 _SHORT = 9.0  # inches: in narrower figures panels have no room for sentences
-_TITLES, _NARROW_TITLES = ("NEES (6 dof)", "position [m]", "orientation [deg]"), ("NEES", "[m]", "[deg]")
+_TITLES = ("NEES (6 dof), log", "position [m], log", "orientation [deg], log")
+_NARROW_TITLES = ("NEES, log", "[m], log", "[deg], log")
 _ROOM = 0.3  # of the height, for words above the curves
 CONSISTENT = (
     "The NEES of a consistent observer lies in the band 95 % of the time; "
@@ -308,7 +313,7 @@ def observability_figure(
             keep = style.thinned(len(part.t))
             local.plot(part.t[keep], np.maximum(part.local_eigenvalue[keep, 0], _FLOOR), **look)
     local.axhline(observability.threshold, **_THRESHOLD)
-    window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-]"
+    window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-], log"
     local.set_ylabel(window, **style.TEXT)
     style.show_decades(local)
     occurring = _draw_verdict(verdict, cut, names)

@@ -208,7 +208,7 @@ def pointers(origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.nd
 
 
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
-_SHORTEST = 0.035  # of the picture's side, drawn length of a vehicle
+_STAND_IN = 0.042  # of the scene's side, length of a vehicle without a body
 _CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
 
 _ALL = slice(None)
@@ -253,14 +253,21 @@ class Stage:
         sensed = s.topology.mode == "sensed" and s.sensing == "sensed"
         return sensed and any(camera.model == "pinhole" for camera in s.cameras)
 
-    @cached_property
-    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """(N, 3) sizes and (N, 3) centres of the vehicles' boxes as drawn: those too small to be seen are enlarged."""
-        stand_in = Body(size=tuple(1.2 * _SHORTEST * self.side / _CAR[0] * np.array(_CAR)))
+    def bodies(self, least: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return (N, 3) sizes and (N, 3) centres of the vehicles' boxes, m; `least` is the least length drawn."""
+        stand_in = Body(size=tuple(_STAND_IN * self.side / _CAR[0] * np.array(_CAR)))
         given = [v.body or stand_in for v in self.scenario.vehicles]
         size, center = np.array([b.size for b in given], float), np.array([b.center for b in given], float)
-        grown = np.maximum(1.0, _SHORTEST * self.side / size[:, :1])
+        grown = np.maximum(1.0, least / size[:, :1])
         return size * grown, center * grown
+
+    @cached_property
+    def floor(self) -> float:
+        """Height of the ground, m: below the vehicles as they start, and no higher than the map's own."""
+        size, center = self.bodies()
+        starts = [v.initial_pose.position for v in self.scenario.vehicles if v.initial_pose]
+        lowest = min((start[2] for start in starts if start), default=self.origin[2]) - self.origin[2]
+        return float(lowest + np.min(center[:, 2] - size[:, 2] / 2))
 
     @cached_property
     def _fan(self) -> np.ndarray:

@@ -102,6 +102,11 @@ def explain(figure: Figure, text: str) -> None:
     sign(figure, fill(text, int(figure.get_figwidth() / LETTER)))
 
 
+def rgb(colour: str) -> np.ndarray:
+    """Return a colour of Matplotlib as three whole numbers up to 255."""
+    return np.round(255.0 * np.array(to_rgb(colour))).astype(np.uint8)
+
+
 def vehicle_colour(index: int) -> str:
     """Return the colour of a vehicle, the same in every figure."""
     return VEHICLE_COLOURS[index % len(VEHICLE_COLOURS)]

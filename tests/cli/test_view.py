@@ -11,6 +11,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from PIL import Image
 
 from coopenv.base.installation import data_directory
 from coopenv.cars.fake.fleet import fakes
@@ -52,6 +53,17 @@ def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().out.startswith("film.webp: 5 pictures, 1.25 s")
     Path("there/scene.npz").unlink()
     assert "has no scene.npz, which `coopenv run` writes" in refused("film", "there", "--out", "film.webp")
+
+
+def test_several_films_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["film", *SHORT, "--observer", "riccati,mekf", "--fps", "2"]
+    assert main([*command, "--map-only", "--out", "above.webp"]) == 0
+    pytest.importorskip("pyvista", reason="needs the extra film3d")
+    space = ["--3d", "--camera", "overview,driver", "--width", "320", "--vehicle", "f2"]
+    assert main([*command, *space, "--out", "space.webp"]) == 0
+    with Image.open("space.webp") as film:
+        assert film.n_frames == 3 and film.size == (320, 16 + 120 + 120)
+    assert "unknown camera of a film 'above'" in refused(*command, "--3d", "--camera", "above", "--out", "x.gif")
 
 
 def test_a_recording_has_its_page(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,9 +22,11 @@ from coopenv.cli import main
 from coopenv.cli.options import console
 from coopenv.policies import load_agent
 from coopenv.policies.base import zero_policy
+from coopenv.runs.films import Shot, frames_at, top_view_film, write_film, write_pictures
 from coopenv.runs.live import Keyboard, Keys, drive_by_hand, watch
-from coopenv.runs.scenes import frame_stride, frames_at, scene_of, write_film, write_pictures
+from coopenv.runs.scenes import frame_stride, scene_of
 from coopenv.viz.scene import Origin, SceneRecord
+from coopenv.viz.stage import Stage
 from coopenv.viz.topview import PictureWindow, TopView
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.processes import small_disk
@@ -148,7 +150,7 @@ def test_without_a_display_one_line_says_so(capsys: pytest.CaptureFixture[str]) 
 def test_a_film_in_place_of_the_window(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: None)
     out = tmp_path / "film"
     assert main(["watch", "route_follower", "--set", "horizon=2.0", "--out", str(out)]) == 0
     assert capsys.readouterr().out.count("under way, position error") == 4
@@ -188,7 +190,7 @@ def test_a_film_shows_the_frame_that_is_there() -> None:
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    assert write_film(record, path, fps=5.0, width=448, panel=False) == 16
+    assert write_film(top_view_film(record, False), path, fps=5.0, width=448) == 16
     with Image.open(path) as film:
         assert film.n_frames == 16 and film.size[0] == 448
         film.seek(15)
@@ -200,9 +202,27 @@ def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_pa
     assert np.abs(shown - wanted).mean() < 8.0
 
 
+def test_films_stand_side_by_side_with_who_is_lost(record: SceneRecord, tmp_path: Path) -> None:
+    """Both vehicles are placed 3 and 0.1 m off, and 0.1 m each: they are about half a metre long."""
+    (size, _), count = Stage(record.scenario).bodies(), len(record)
+    assert (size[:, 0] > 0.2).all() and (size[:, 0] < 2.5).all()
+    error = {name: np.tile(off, (count, 1)) for name, off in (("one", [3.0, 0.1]), ("none", [0.1, 0.1]))}
+    records = {
+        name: SceneRecord(record.scenario, record.source, {**record.fields, "position_error": off})
+        for name, off in error.items()
+    }
+    shots = [[Shot(each, TopView(each.scenario, panel=False), name) for name, each in records.items()]]
+    write_film(shots, tmp_path / "film.webp", fps=1.0, width=1304)
+    with Image.open(tmp_path / "film.webp") as film:
+        picture = np.asarray(film.convert("RGB"), float)
+        assert film.n_frames == 4 and film.size[0] == 1304
+    left, right = picture[20, 300], picture[20, 652 + 300]
+    assert left[0] > left[1] + 60.0 and right[1] > right[0] + 60.0  # vermilion, green
+
+
 def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
-    assert write_film(record, tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16
+    assert write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 16
 
 
@@ -210,10 +230,10 @@ def test_other_formats_and_missing_extras_are_told(
     record: SceneRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
-        write_film(record, tmp_path / "film.avi", fps=10.0)
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: None)
+        write_film(top_view_film(record), tmp_path / "film.avi", fps=10.0)
+    monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"pip install '\.\[video\]'"):
-        write_film(record, tmp_path / "film.mp4", fps=10.0)
+        write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0)
     assert not list(tmp_path.iterdir())
 
 

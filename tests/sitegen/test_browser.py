@@ -112,6 +112,24 @@ def test_a_picture_opens_by_itself(site: Path, browser: Any) -> None:
     page.close()
 
 
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_the_replay_of_the_home_page_can_be_worked(site: Path, browser: Any, size: tuple[int, int]) -> None:
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.goto((site / "index.html").as_uri())
+    page.get_by_role("button", name="Pause").click()
+    time = page.get_by_label("Time")
+    time.fill(time.get_attribute("max"))
+    verdict = page.locator("#replay .verdict")
+    assert verdict.inner_text() == "riccati: 5 of 5 lost"
+    page.get_by_role("button", name="robust", exact=True).click()
+    assert verdict.inner_text() == "robust: found"
+    painted = "document.querySelector('#replay canvas').toDataURL()"
+    whole = page.evaluate(painted)
+    page.get_by_role("button", name="f1", exact=True).click()
+    assert page.evaluate(painted) != whole
+    page.close()
+
+
 def test_search_works_from_disk(site: Path, browser: Any) -> None:
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     page.goto((site / "index.html").as_uri())

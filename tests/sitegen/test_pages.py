@@ -32,6 +32,9 @@ def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str,
     assert {f"reference/observers/{name}_.md" for name in ZOO} <= made.keys()
     assert {f"reference/agents/{name}.md" for name in list_agents()} <= made.keys()
     assert all((ROOT / "docs" / "environments" / f"{name}.md").is_file() for name in list_envs())
+    gallery = made["gallery.md"]
+    assert all(f"(environments/{name}.md)" in gallery for name in list_envs())
+    assert all((ROOT / "docs" / film).is_file() for film in re.findall(r"!\[[^]]*\]\(([^)]+)\)", gallery))
     listed = [next(iter(row.values())) for rows in pages.LISTED.values() for row in rows()]
     assert len(listed) == len(ZOO) + len(list_agents()) + len(list_envs())
     assert {page for page in listed if page.startswith("reference/")} <= made.keys()

@@ -92,7 +92,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
     _share_axes(axes.ravel(), len(shown), scene.t)
     for ax, i in zip(axes[0], shown, strict=True):
         ax.set_title(vehicle_label(scene.vehicles[i]), fontsize=NORMAL + 2, color=INK, pad=4)
-    figure.supylabel("position error [m]", **style.TEXT)
+    figure.supylabel("position error [m], log", **style.TEXT)
     median = ", median over seeds" if len(board.seeds) > 1 else ""
     handles = [
         Line2D([], [], color=BLUE, lw=1.2, label=f"error{median}"),
@@ -134,10 +134,10 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         ax.set_yscale("log")
         ax.set_title(name, fontsize=NORMAL, color=INK, pad=3)
     _share_axes(axes[: len(groups)], columns, scene.t)
-    figure.supylabel(f"NEES / {dof}" + (", mean over runs" if runs > 1 else ""), **style.TEXT)
+    figure.supylabel(f"NEES / {dof}, log" + (", mean over runs" if runs > 1 else ""), **style.TEXT)
     vehicles = [Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i])) for i in shown]
     runs_word = f"{runs} run{'s' if runs > 1 else ''}"
-    band = Patch(facecolor=SHADE, label=f"95 % of an honest one ($\\chi^2$, {runs_word}, at one instant)")
+    band = Patch(facecolor=SHADE, label=f"95 % of a consistent observer ($\\chi^2$, {runs_word}, at one instant)")
     style.legend_above(figure, [*vehicles, band])
     return figure
 
@@ -210,7 +210,7 @@ def cost_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         return None
     figure, _ = style.canvas(width, 4.6, f"{board.title}, {variant}")
     ax = figure.add_subplot()
-    style.tidy(ax, x_label="time per update [µs]", y_label="mean position RMSE [m]")
+    style.tidy(ax, x_label="time per update [µs], log", y_label="mean position RMSE [m], log")
     ax.set(xscale="log", yscale="log")
     rows = [board.rows_in(variant, name) for name in names]
     micro, sent = ([mean_of(own, column) for own in rows] for column in ("us_per_update", "bytes_per_s"))
@@ -256,7 +256,7 @@ def stanford_figure(board: Leaderboard, variant: str, width: float | None = None
     for n, (ax, (name, of)) in enumerate(zip(axes, counts.items(), strict=False)):
         exceeded, _, unknown, _ = figures[name]
         below, left = n + columns >= len(counts), n % columns == 0
-        style.tidy(ax, x_label="horizontal error [m]" * below, y_label="protection level [m]" * left)
+        style.tidy(ax, x_label="horizontal error [m], log" * below, y_label="protection level [m], log" * left)
         ax.fill_between(ends, low, ends, color=VERMILION, alpha=0.14, linewidth=0, zorder=0)
         image = ax.pcolormesh(LEVEL_BINS, LEVEL_BINS, np.where(of > 0, of, np.nan).T, norm=norm, cmap="viridis_r")
         ax.plot(ends, ends, color=INK, linewidth=1.0)

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
+from coopenv.viz import meshes
+from coopenv.viz.meshes import Mesh, quad
 from coopenv.viz.stage import CORNERS, Stage, roads
-from coopenv.viz.style import linear_light
-from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
+from coopenv.viz.style import linear_light, rgb
 
 
 @dataclass
@@ -37,76 +37,9 @@ class Look:
     """Whether the view goes along with it."""
 
 
-def rgb(colour: str) -> np.ndarray:
-    """Return a colour of Matplotlib as three whole numbers up to 255."""
-    return np.round(255.0 * np.array(to_rgb(colour))).astype(np.uint8)
-
-
 def linear(colours: np.ndarray) -> np.ndarray:
     """Return colours (..., 3) as viser wants those of many things at once: linear in light, uint8."""
     return np.asarray(np.round(255.0 * linear_light(np.asarray(colours, float) / 255.0)), np.uint8)
-
-
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Vertices (V, 3) and faces (F, 3)."""
-
-_SIDES = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7), (3, 2, 1, 0))
-_FACES = np.array([t for a, b, c, d in _SIDES for t in ((a, b, c), (a, c, d))], np.uint32)
-
-
-def _prism(low: tuple[float, ...], high: tuple[float, ...], bottom: float, top: float) -> Mesh:
-    """Return a body between two rectangles (x from, x to, half width) at two heights."""
-    rings = []
-    for (rear, front, half), z in ((low, bottom), (high, top)):
-        rings += [(rear, -half, z), (front, -half, z), (front, half, z), (rear, half, z)]
-    return np.array(rings, np.float32), _FACES
-
-
-def box() -> Mesh:
-    """Return a cube of edge 1 about the origin."""
-    return _prism((-0.5, 0.5, 0.5), (-0.5, 0.5, 0.5), -0.5, 0.5)
-
-
-def car() -> Mesh:
-    """Return a car in the cube of edge 1, which looks along x: a hull, and a cabin nearer to the rear."""
-    hull, _ = _prism((-0.5, 0.5, 0.5), (-0.48, 0.44, 0.46), -0.5, 0.05)
-    cabin, _ = _prism((-0.42, 0.2, 0.42), (-0.34, 0.04, 0.33), 0.05, 0.5)
-    return np.concatenate([hull, cabin]), np.concatenate([_FACES, _FACES + np.uint32(len(hull))])
-
-
-def arrow() -> Mesh:
-    """Return an arrow head on the bonnet of that car and on its roof, which shows where the front is."""
-    bonnet = [(0.24, -0.3, 0.07), (0.46, 0.0, 0.07), (0.24, 0.3, 0.07)]
-    roof = [(-0.3, -0.22, 0.52), (0.02, 0.0, 0.52), (-0.3, 0.22, 0.52)]
-    return np.array([*bonnet, *roof], np.float32), np.array([(0, 1, 2), (3, 4, 5)], np.uint32)
-
-
-def _turned(radius: np.ndarray, height: np.ndarray, sides: int) -> Mesh:
-    """Return the surface of a profile, from above to below, that is turned about z."""
-    angle = np.linspace(0.0, 2 * np.pi, sides, endpoint=False)
-    rings = [np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), np.outer(height, np.ones(sides))]
-    i, j = np.meshgrid(np.arange(len(radius) - 1) * sides, np.arange(sides), indexing="ij")
-    a, b = i + j, i + (j + 1) % sides
-    faces = np.stack([a, a + sides, b, b, a + sides, b + sides], -1).reshape(-1, 3)
-    return np.stack(rings, axis=-1).reshape(-1, 3).astype(np.float32), faces.astype(np.uint32)
-
-
-def sphere(rings: int = 10) -> Mesh:
-    """Return a sphere of radius 1."""
-    polar = np.linspace(0.0, np.pi, rings + 1)
-    return _turned(np.sin(polar), np.cos(polar), 2 * rings)
-
-
-def pole() -> Mesh:
-    """Return a pole of radius 1 from z = 0 to 1."""
-    return _turned(np.ones(2), np.array([1.0, 0.0]), 8)
-
-
-def _quad(corners: np.ndarray, z: float) -> Mesh:
-    """Return a flat quadrilateral of corners (4, 2), which follow one another, at a height; it is seen from above."""
-    (x, y), (u, v) = corners[1] - corners[0], corners[2] - corners[0]
-    points = np.column_stack([corners, np.full(4, z)])[:: 1 if x * v - y * u >= 0 else -1]
-    return points.astype(np.float32), np.array([(0, 1, 2), (0, 2, 3)], np.uint32)
 
 
 class Copies(NamedTuple):
@@ -222,8 +155,7 @@ def dashes(start: np.ndarray, end: np.ndarray, count: int, share: float) -> np.n
 
 ROOT = "/world"
 """The node that everything hangs on; moving it moves the world."""
-_SOLID, _FADED = 0.8, 0.15  # opacity of buildings, and of those in front of the picked vehicle
-_GRID = "#DEDBD1"
+_SOLID, _FADED = 1.0, 0.15  # opacity of buildings, and of those in front of the picked vehicle
 _FLAT = {"cast_shadow": False, "receive_shadow": False}
 
 
@@ -239,33 +171,28 @@ class Ground:
     def __init__(self, scene: Any, stage: Stage) -> None:
         """Draw them; `scene` is viser's."""
         self._scene, self._stage = scene, stage
-        size, center = stage.bodies
-        starts = [
-            v.initial_pose.position[2] for v in stage.scenario.vehicles if v.initial_pose and v.initial_pose.position
-        ]
-        lowest = min(starts, default=stage.origin[2]) - stage.origin[2]
-        self.z = float(lowest + np.min(center[:, 2] - size[:, 2] / 2))
-        """Height of the floor, m: below the vehicles as they start, and no higher than the map's own."""
+        self.z = stage.floor
         self.step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
         """Of positions, m."""
         self.root = scene.add_frame(ROOT, show_axes=False)
         """viser's handle of the node that everything hangs on."""
-        scene.configure_environment_map(None)  # light is even, so that colours are those of the figures
+        scene.configure_environment_map(None)
         scene.configure_default_lights(False, False)
-        scene.add_light_ambient("/light/everywhere", intensity=3.0)
-        sun = tuple(stage.side * np.array([-0.5, -0.9, 1.6]))
-        scene.add_light_directional("/light/sun", intensity=0.9, position=sun)
+        scene.add_light_ambient("/light/everywhere", intensity=1.7)
+        sun = tuple(stage.side * meshes.SUN)
+        scene.add_light_directional("/light/sun", intensity=2.2, position=sun, cast_shadow=True)
+        shade = np.linspace(rgb(meshes.SKY), rgb(meshes.HORIZON), 64)
+        scene.set_background_image(shade[:, None].repeat(2, axis=1).astype(np.uint8), "png")
         self._add_floor()
         self._add_roads()
         self._buildings = [
             scene.add_box(
                 f"{ROOT}/buildings/{i}",
                 dimensions=tuple(building.size),
-                color=rgb(ROOF),
+                color=rgb(meshes.WALL),
                 opacity=_SOLID,
                 position=tuple(building.center),
                 wxyz=tuple(Rotation.from_matrix(building.rotation).as_quat(scalar_first=True)),
-                cast_shadow=False,
             )
             for i, building in enumerate(stage.buildings)
         ]
@@ -278,15 +205,15 @@ class Ground:
     def _add_floor(self) -> None:
         side, spacing = self._stage.side, spacing_of(self._stage.side)
         middle = self._stage.middle[:2]
-        corners = middle + 0.75 * side * CORNERS
-        floor = _quad(corners, self.z - 0.004 * side)
-        self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(GROUND), **_FLAT)
+        corners = middle + 8.0 * side * CORNERS
+        floor = quad(corners, self.z - 0.004 * side)
+        self._scene.add_mesh_simple(f"{ROOT}/floor", *floor, color=rgb(meshes.GRASS), cast_shadow=False)
         count = int(np.ceil(0.7 * side / spacing))
         at, reach = spacing * np.arange(-count, count + 1), spacing * count
         lines = [np.array([(x, -reach, 0.0), (x, reach, 0.0)]) for x in at]
         lines += [line[:, [1, 0, 2]] for line in lines]
         place = (*(np.round(middle / spacing) * spacing), self.z - 0.003 * side)
-        add_lines(self._scene, f"{ROOT}/grid", np.array(lines), linear(rgb(_GRID)), 1.0, position=place)
+        add_lines(self._scene, f"{ROOT}/grid", np.array(lines), rgb(meshes.GRID), 1.0, position=place)
         edge = (float(middle[0]), float(self._stage.low[1] + 0.02 * side), self.z)
         unit = f"grid {spacing:g} m" if spacing >= 1 else f"grid {100 * spacing:g} cm"
         self._scene.add_label(f"{ROOT}/scale", unit, position=edge, font_screen_scale=0.85, anchor="top-center")
@@ -295,8 +222,8 @@ class Ground:
         side, origin, scenario = self._stage.side, self._stage.origin[:2], self._stage.scenario
         marks = [np.zeros((0, 2, 3))]
         for i, (road, corners) in enumerate(zip(scenario.roads, roads(scenario), strict=True)):
-            mesh = _quad(corners, self.z - side * (2e-3 - 1e-4 * (i % 8)))
-            self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(ASPHALT), **_FLAT)
+            mesh = quad(corners, self.z - side * (2e-3 - 1e-4 * (i % 8)))
+            self._scene.add_mesh_simple(f"{ROOT}/roads/{i}", *mesh, color=rgb(meshes.ASPHALT), cast_shadow=False)
             if road.marked:
                 start, end = (np.array([[*(p - origin), self.z - 5e-4 * side]]) for p in (road.start, road.end))
                 count = max(1, int(np.linalg.norm(end - start) / (0.04 * side)))

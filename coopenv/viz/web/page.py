@@ -194,9 +194,14 @@ def write_replay(
     return path
 
 
-def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0) -> None:
-    """Point one of viser's cameras at the whole scene; `raised` lifts it in the picture, in the scene's sides."""
-    position, middle = (at - [0.0, raised * stage.side, 0.0] for at in first_camera(stage, aspect))
+def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0, near: float = 1.0) -> None:
+    """Point one of viser's cameras at the scene's middle.
+
+    `raised` lifts it in the picture, in the scene's sides; `near` is a share of the distance at which all is in sight.
+    """
+    far, middle = first_camera(stage, aspect)
+    below = np.array([0.0, near * raised * stage.side, 0.0])
+    position, middle = middle + near * (far - middle) - below, middle - below
     settings = {"near": 1e-3 * stage.side, "far": 20.0 * stage.side, "fov": FIELD_OF_VIEW}
     for name, value in {**settings, "position": position, "look_at": middle}.items():
         setattr(camera, name, value)

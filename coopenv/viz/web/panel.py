@@ -150,15 +150,15 @@ class Panel:
             self._add_playback(length, abilities.seek)
         vehicles = {NONE_PICKED: None} | {stage.short_name(stage.landmarks + i): i for i in range(stage.vehicles)}
         self._vehicles = self._choice("Vehicle", vehicles, "Its camera, its plots; the view goes along.")
+        if abilities.observers:
+            hint = "The episode runs again from its start to this moment, under this observer."
+            self._choice("Observer", {name: name for name in abilities.observers}, hint)
+        if abilities.faults:
+            faults = {name: name for name in (NO_FAULT, *abilities.faults)}
+            self._choice("Fault", faults, "What goes wrong from this moment on.")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Errors"):
             self._table = gui.add_html("")
-            if abilities.observers:
-                hint = "The episode runs again from its start to this moment, under this observer."
-                self._choice("Observer", {name: name for name in abilities.observers}, hint)
-            if abilities.faults:
-                faults = {name: name for name in (NO_FAULT, *abilities.faults)}
-                self._choice("Fault", faults, "What goes wrong from this moment on.")
         with tabs.add_tab("Vehicle"):
             self._vehicle_words = gui.add_markdown(_PICK)
             self._image = gui.add_image(np.full((2, 3, 3), 255, np.uint8), visible=False)

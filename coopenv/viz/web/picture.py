@@ -7,11 +7,11 @@ import numpy as np
 
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.viz import meshes
 from coopenv.viz.scene import Frame, Origin, semi_axes
 from coopenv.viz.stage import Box, Stage, entries
-from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
-from coopenv.viz.web import ground
 from coopenv.viz.web.ground import (
     NOTHING,
     ROOT,
@@ -23,7 +23,6 @@ from coopenv.viz.web.ground import (
     dashes,
     fine,
     placed,
-    rgb,
     update,
 )
 
@@ -31,8 +30,16 @@ _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are 
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
 _HONEST, _GAIN = 0.2, 0.08  # opacity of an ellipsoid: of a covariance, of a matrix of gains
 _STEPS, _TURN = 32, 2.0**-9  # of an ellipsoid: sizes in a doubling, and steps of its quaternion
+_SMALL = 0.25  # of that, where the view is near
+_LIT: dict[str, Any] = {"flat_shading": True, "cast_shadow": True}
+_PIN = 0.035  # of the scene's side, height of the pin over a vehicle, which is drawn to scale
 _DOT = 0.008  # of the scene's side, radius of a landmark
 _FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
+
+
+def pin_height(stage: Stage, look: Look) -> float:
+    """Return the height of the pin over a vehicle, m."""
+    return _PIN * stage.side * (_SMALL if look.picked is not None and look.follow else 1.0)
 
 
 class Actors:
@@ -41,19 +48,22 @@ class Actors:
     def __init__(self, scene: Any, stage: Stage, source: Origin, floor: Ground, colours: np.ndarray) -> None:
         """Add the nodes."""
         self._scene, self._stage, self._floor = scene, stage, floor
-        self._size, self._center = stage.bodies
+        self._size, self._center = stage.bodies()
         white = np.full((stage.vehicles, 3), 255, np.uint8)
-        self.cars = Batch(scene, f"{ROOT}/cars/true", ground.car(), colours, flat_shading=True)
-        self._arrows = Batch(scene, f"{ROOT}/cars/front", ground.arrow(), white, side="double")
-        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", ground.car(), colours, opacity=0.32, flat_shading=True)
-        self._frames = Batch(scene, f"{ROOT}/estimates/edges", ground.box(), colours, wireframe=True, opacity=0.5)
-        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", ground.sphere(), colours, opacity=_HONEST)
+        self.cars = Batch(scene, f"{ROOT}/cars/true", meshes.car(), colours, **_LIT)
+        dark = np.tile(rgb(meshes.DARK), (stage.vehicles, 1))
+        self._trims = Batch(scene, f"{ROOT}/cars/trim", meshes.car_trim(), dark, **_LIT)
+        self._pins = Batch(scene, f"{ROOT}/cars/pins", meshes.pin(), colours, flat_shading=True)
+        self._arrows = Batch(scene, f"{ROOT}/cars/front", meshes.arrow(), white, side="double")
+        self._ghosts = Batch(scene, f"{ROOT}/estimates/body", meshes.car(), colours, opacity=0.32, flat_shading=True)
+        self._frames = Batch(scene, f"{ROOT}/estimates/edges", meshes.box(), colours, wireframe=True, opacity=0.5)
+        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", meshes.sphere(), colours, opacity=_HONEST)
         self.set_source(source)
         dark = np.tile(rgb(DARK_BLUE), (stage.landmarks, 1))
-        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", ground.sphere(6), dark)
-        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", ground.pole(), dark)
+        self._dots = Batch(scene, f"{ROOT}/landmarks/dots", meshes.sphere(6), dark, cast_shadow=True)
+        self._poles = Batch(scene, f"{ROOT}/landmarks/poles", meshes.pole(), dark, cast_shadow=True)
         bodies = sum(landmark.body is not None for landmark in stage.scenario.landmarks)
-        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", ground.box(), dark[:bodies])
+        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", meshes.box(), dark[:bodies])
         self._marks = np.zeros((0, 3))
         self._traffic: Batch | None = None
 
@@ -69,6 +79,10 @@ class Actors:
         true, ghosts = placed(R, at, self._size), placed(R_hat, estimated, _SHELL * self._size)
         self.cars.put(true)
         self._arrows.put(true)
+        self._trims.put(true)
+        pin = pin_height(self._stage, look)
+        top = at + self._size * [0.0, 0.0, 0.5] + [0.0, 0.0, 0.1 * pin]
+        self._pins.put(placed(None, fine(top, step), np.full((len(top), 3), pin)))
         self._ghosts.put(ghosts, look.estimates)
         self._frames.put(ghosts, look.estimates)
         semi, axes = semi_axes(frame.position_covariance)
@@ -81,7 +95,7 @@ class Actors:
         if len(frame.traffic_half):
             if self._traffic is None:
                 grey = np.tile(rgb(TRAFFIC), (len(frame.traffic_half), 1))
-                self._traffic = Batch(self._scene, f"{ROOT}/traffic", ground.car(), grey, flat_shading=True)
+                self._traffic = Batch(self._scene, f"{ROOT}/traffic", meshes.car(), grey, **_LIT)
             size = np.where(frame.traffic_half[:, :1] > 0.0, 2.0 * frame.traffic_half, np.nan)
             self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
 
@@ -210,7 +224,7 @@ class MessageBeads:
         n = stage.vehicles
         self._stage, self._step = stage, floor.step
         self._receiver, self._sender = (part.ravel() for part in np.indices((n, n)))
-        self._batch = Batch(scene, f"{ROOT}/messages", ground.sphere(5), colours[self._sender])
+        self._batch = Batch(scene, f"{ROOT}/messages", meshes.sphere(5), colours[self._sender])
         self._began = np.full(n * n, -np.inf)
         self._last = np.full(n * n, -1)
         self._time = -np.inf
@@ -252,7 +266,7 @@ class Labels:
         """Add them."""
         self._stage, self._said = stage, -np.inf
         self._marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
-        self._above = stage.bodies[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.012 * stage.side]
+        self._above = stage.bodies()[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.005 * stage.side]
 
         def label(name: str, text: str, **look: Any) -> Any:
             return scene.add_label(f"{ROOT}/names/{name}", text, anchor="bottom-center", depth_test=False, **look)
@@ -266,15 +280,16 @@ class Labels:
             if landmark.group is None and stage.landmarks <= _MOST_NAMES
         }
 
-    def place(self, frame: Frame, time: float, shown: bool, turn: int | None = None) -> None:
+    def place(self, frame: Frame, time: float, look: Look, turn: int | None = None) -> None:
         """Move the names; with a `turn` those of some vehicles, as in `Picture.show`."""
-        stage, side = self._stage, self._stage.side
+        stage, side, shown = self._stage, self._stage.side, look.names
         if not 0.0 <= time - self._said < _OFTEN - 1e-9:
             self._said = time
             for i, label in enumerate(self._cars if shown else ()):
                 label.text = self._text(frame, i)
         mine = in_turn(turn, stage.vehicles)
-        places, estimates = frame.vehicle_position + self._above, frame.estimate_position + self._above
+        above = self._above + 1.1 * pin_height(stage, look) * np.array([0.0, 0.0, 1.0])
+        places, estimates = frame.vehicle_position + above, frame.estimate_position + above
         places[:, 2] += _RAISED * side * levels(places[:, :2], _CLOSE * side)
         inside = np.all((estimates[:, :2] > stage.low) & (estimates[:, :2] < stage.high), axis=-1)
         named = inside & (frame.position_error > _APART * side)  # those that are not where their vehicles are
@@ -347,7 +362,7 @@ class Picture:
         """
         time, look, side = float(frame.tick) / self.stage.scenario.rates.camera, self.look, self.stage.side
         self.actors.place(frame, look)
-        self._labels.place(frame, time, look.names, turn)
+        self._labels.place(frame, time, look, turn)
         self._pulses.place(frame, time, look.messages)
         trail = self._trails.lines(frame, time, self._colours, self.ground.z + 1e-3 * side)
         self._lines["trails"].show(trail if look.trails else NOTHING)

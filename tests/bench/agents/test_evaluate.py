@@ -36,7 +36,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coopenv.runs.scenes.find_spec", lambda name: find_spec(name) if name == "viser" else None)
+    monkeypatch.setattr("coopenv.runs.films.find_spec", lambda name: find_spec(name) if name == "viser" else None)
     command = ["evaluate", *SHORT, "--agents", "own.py:still,route_follower", "--ideal", "--out", "eval"]
     assert main([*command, "--film"]) == 0
     out = capsys.readouterr().out

@@ -1,0 +1,207 @@
+"""Films of scenes: from above or in space, one or several side by side, as MP4, GIF or WebP."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import replacing_file, writing
+from coopenv.base.installation import install_command
+from coopenv.viz.scene import Frame, SceneRecord
+from coopenv.viz.stage import Stage
+from coopenv.viz.style import GREEN, VERMILION
+from coopenv.viz.topview import TopView
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+"""Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
+VIDEO_FILES = ("video.mp4", "video.gif")
+"""Names of a film in a folder of results, with and without the extra."""
+SMALL = 480
+"""Largest width of a GIF or WebP where none is asked for, pixels: its pictures are held in memory until the end."""
+
+
+def check_film(path: Path) -> None:
+    """Make sure that a film can have the format that its path names.
+
+    Raises:
+        OutputError: no such format.
+        CoopenvError: the format needs an extra.
+    """
+    if path.suffix not in SUFFIXES:
+        raise OutputError(f"{path}: unknown format of a film; known: {', '.join(SUFFIXES)}")
+    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise CoopenvError(f"{path}: MP4 needs an extra: {install_command('video')}; GIF and WebP do not")
+
+
+def video_path(folder: Path) -> Path:
+    """Return the path of a film in a folder of results: MP4, or GIF without the extra."""
+    return folder / VIDEO_FILES[find_spec("imageio_ffmpeg") is None]
+
+
+class View(Protocol):
+    """Draws frames of one scenario."""
+
+    def paint(self, frame: Frame) -> np.ndarray:
+        """Return an (H, W, 3) uint8 picture of a frame."""
+        ...
+
+    def close(self) -> None:
+        """Let go of everything."""
+        ...
+
+
+class Shot(NamedTuple):
+    """One part of the picture of a film."""
+
+    record: SceneRecord
+    view: View
+    name: str = ""
+    """Stands above the picture, with whether the vehicles are lost; empty: nothing does."""
+
+
+def write_film(
+    shots: Sequence[Sequence[Shot]],
+    path: Path,
+    fps: float,
+    speed: float = 1.0,
+    width: int | None = 896,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> int:
+    """Write a film of scenes that begin together; return how many pictures it has. The views are closed.
+
+    Args:
+        shots: rows of the picture; all shots of a row are equally high, all rows equally wide.
+        path: of the film, which is replaced as a whole; its suffix is the format.
+        fps: pictures a second; frames of a scene are repeated where it has fewer.
+        speed: times real time.
+        width: as for `write_pictures`.
+        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
+
+    Raises:
+        CoopenvError: unknown format, or it needs an extra.
+        OutputError: the file cannot be written.
+    """
+    check_film(path)
+    chosen = [[(shot, frames_at(shot.record.time, fps, speed)) for shot in row] for row in shots]
+    count = max(len(frames) for row in chosen for _, frames in row)
+
+    def pictures() -> Iterator[np.ndarray]:
+        for k in range(count):
+            rows = ([_picture(shot, int(frames[min(k, len(frames) - 1)])) for shot, frames in row] for row in chosen)
+            yield np.vstack([np.hstack(row) for row in rows])
+            on_progress((k + 1) / count)
+
+    with ExitStack() as stack:
+        for shot in chain(*shots):
+            stack.enter_context(closing(shot.view))
+        with replacing_file(path) as new:
+            write_pictures(new, fps, pictures(), width)
+    return count
+
+
+def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
+    """Return the film of one scene from above; `panel`: table and legend beside the map."""
+    return [[Shot(record, TopView(record.scenario, panel=panel))]]
+
+
+def _picture(shot: Shot, k: int) -> np.ndarray:
+    """Return the picture of frame k of a shot, below its heading."""
+    frame = shot.record.frame(k)
+    picture = shot.view.paint(frame)
+    return np.vstack([_heading(shot, frame, picture.shape[1]), picture]) if shot.name else picture
+
+
+_BAND = 0.1  # of the width, height of a heading
+
+
+def _heading(shot: Shot, frame: Frame, width: int) -> np.ndarray:
+    """Return a band with the name of a shot and how many vehicles are lost; its colour tells the same."""
+    count, total = int(lost(Stage(shot.record.scenario), frame).sum()), len(frame.nees)
+    found = f"{count} of {total} lost" if count and total > 1 else "lost" if count else "found"
+    height = round(_BAND * width)
+    band = Image.new("RGB", (width, height), VERMILION if count else GREEN)
+    draw, middle = ImageDraw.Draw(band), height / 2
+    draw.text((middle / 2, middle), shot.name, "white", ImageFont.load_default(0.5 * height), anchor="lm")
+    place = (width - middle / 2, middle)
+    draw.text(place, found, "white", ImageFont.load_default(0.62 * height), anchor="rm", stroke_width=1)
+    return np.asarray(band)
+
+
+def lost(stage: Stage, frame: Frame) -> np.ndarray:
+    """Return (N,) which vehicles are farther from their estimates than they are long."""
+    return np.asarray(frame.position_error > stage.bodies()[0][:, 0])
+
+
+def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
+    """Return which frames, of times (K,) s, a film shows: the last one that is there at each of its pictures."""
+    count = int(np.floor((time[-1] - time[0]) / speed * fps + 1e-6)) + 1
+    moments = time[0] + np.arange(count) * speed / fps
+    return np.asarray(np.searchsorted(time, moments + 1e-6, side="right") - 1)
+
+
+def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width: int | None = None) -> None:
+    """Write pictures, (H, W, 3) uint8, as they come, as a film in the format that its path names; none: no file.
+
+    Those that are wider than `width` pixels are made smaller (None: MP4 of any width, the others of at most `SMALL`).
+
+    Raises:
+        OutputError: the film cannot be written.
+    """
+    mp4 = path.suffix == ".mp4"
+    widest = width or (None if mp4 else SMALL)
+    images = (_no_wider(Image.fromarray(picture), widest) for picture in pictures)
+    if mp4:
+        _write_mp4(path, fps, images)
+        return
+    quality: dict[str, Any] = {"quality": 55, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
+    if kept := [image if quality else image.quantize(64) for image in images]:
+        ends = np.round(np.arange(len(kept) + 1) * 100.0 / fps) * 10.0
+        duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second
+        with writing(path):
+            kept[0].save(path, save_all=True, append_images=kept[1:], duration=duration, loop=0, **quality)
+
+
+def _no_wider(image: Image.Image, width: int | None) -> Image.Image:
+    if width is None or image.width <= width:
+        return image
+    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+
+
+def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
+    """Write H.264 and read it back: ffmpeg's writer does not report a full disk."""
+    import imageio_ffmpeg
+
+    @contextmanager
+    def told() -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError):
+            raise OutputError(f"cannot write to {path}: ffmpeg could not finish it; the disk may be full") from None
+
+    images, count = iter(images), 0
+    first = next(images, None)
+    if first is None:
+        return
+    width, height = (edge // 2 * 2 for edge in first.size)  # even, as the codec asks for
+    look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
+    try:
+        with told():
+            writer.send(None)
+        for image in chain([first], images):
+            count += 1
+            with told():
+                writer.send(image.crop((0, 0, width, height)).tobytes())
+        with told():
+            writer.close()
+            if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
+                raise OSError
+    finally:
+        with suppress(OSError, RuntimeError):
+            writer.close()
