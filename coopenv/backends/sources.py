@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
     from coopenv.scenario import Scenario
 
-BACKENDS = ("simulated", "highway", "replay", "svea")
+BACKENDS = ("simulated", "highway", "sumo", "program", "replay", "svea")
 
 LOG_SUFFIX = ".mcap"
 BAG_SUFFIXES = (".bag", ".db3")

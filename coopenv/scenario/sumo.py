@@ -8,6 +8,7 @@ import gzip
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
@@ -96,16 +97,17 @@ def _names(given: Any) -> list[str]:
 def _read_network(section: Sumo) -> Network:
     """Return the network of a section. Raises ScenarioError: it cannot be read."""
     path = Path(section.net)
-    try:
-        return _network(path, path.stat().st_mtime_ns)
-    except OSError as error:
-        raise ScenarioError(f"sumo.net: {shown(section.net)}: {error.strerror}") from None
+    with _reading(path, "sumo.net"):
+        found = _network(path, path.stat().st_mtime_ns)
+    if not found.lanes:
+        raise ScenarioError(f"sumo.net: {path.name}: no roads in it; expected a network of netconvert or netgenerate")
+    return found
 
 
 @lru_cache(maxsize=8)
 def _network(path: Path, modified: int) -> Network:
     found = Network()
-    for element in _elements(path, "sumo.net"):
+    for element in _elements(path):
         if element.tag == "location":
             left, bottom, right, top = map(float, element.attrib["convBoundary"].split(","))
             found.center = (round((left + right) / 2, 2), round((bottom + top) / 2, 2))
@@ -121,26 +123,30 @@ def _network(path: Path, modified: int) -> Network:
         elif element.tag == "connection":
             turn = int(element.attrib["fromLane"]), int(element.attrib["toLane"]), element.get("via", "")
             found.turns.setdefault((element.attrib["from"], element.attrib["to"]), []).append(turn)
-    if not found.lanes:
-        raise ScenarioError(f"sumo.net: {path.name}: no roads in it; expected a network of netconvert or netgenerate")
     return found
 
 
-def _elements(path: Path, key: str) -> Iterator[Element]:
-    """Yield the elements below the root of a file, plain or .gz. Raises ScenarioError: it is no such file."""
+def _elements(path: Path) -> Iterator[Element]:
+    """Yield the elements below the root of a file, plain or .gz."""
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        depth = 0
+        for event, element in iterparse(file, events=("start", "end")):
+            depth += 1 if event == "start" else -1
+            if event == "end" and depth == 1:
+                yield element
+                element.clear()
+
+
+@contextmanager
+def _reading(path: Path, key: str) -> Iterator[None]:
+    """Turn what goes wrong with a file into a `ScenarioError` that names the key and the file."""
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            depth = 0
-            for event, element in iterparse(file, events=("start", "end")):
-                depth += 1 if event == "start" else -1
-                if event == "end" and depth == 1:
-                    yield element
-                    element.clear()
+        yield
     except OSError as error:
         raise ScenarioError(f"{key}: {shown(str(path))}: {error.strerror or error}") from None
     except (ParseError, EOFError) as error:
         raise ScenarioError(f"{key}: {path.name}: not XML: {error}") from None
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, IndexError) as error:
         raise ScenarioError(f"{key}: {path.name}: an element lacks or spoils an attribute: {error}") from None
 
 
@@ -172,15 +178,16 @@ def _shapes(section: Sumo) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     marks: list[dict[str, Any]] = []
     buildings: list[dict[str, Any]] = []
     for name in section.additional:
-        for element in _elements(Path(name), "sumo.additional"):
-            kind, low = element.get("type", ""), section.post_height
-            height = {p.get("key"): p.get("value", "") for p in element.iter("param")}.get("height")
-            if element.tag == "poi" and kind.startswith(section.landmarks):
-                place = [float(element.attrib["x"]), float(element.attrib["y"]), float(height or low)]
-                marks.append({"name": f"poi_{len(marks) + 1}", "position": place})
-            elif element.tag == "poly" and kind.startswith(section.buildings):
-                tall = float(height or section.building_height)
-                buildings += _building(f"{element.attrib['id']}"[:50], _shape(element.attrib["shape"]), tall)
+        with _reading(Path(name), "sumo.additional"):
+            for element in _elements(Path(name)):
+                kind, low = element.get("type", ""), section.post_height
+                height = {p.get("key"): p.get("value", "") for p in element.iter("param")}.get("height")
+                if element.tag == "poi" and kind.startswith(section.landmarks):
+                    place = [float(element.attrib["x"]), float(element.attrib["y"]), float(height or low)]
+                    marks.append({"name": f"poi_{len(marks) + 1}", "position": place})
+                elif element.tag == "poly" and kind.startswith(section.buildings):
+                    tall = float(height or section.building_height)
+                    buildings += _building(f"{element.attrib['id']}"[:50], _shape(element.attrib["shape"]), tall)
     return marks, buildings
 
 
@@ -221,10 +228,11 @@ def route_edges(section: Sumo) -> dict[str, list[str]]:
     found = {}
     for key in ("routes", "additional"):
         for name in getattr(section, key):
-            for element in _elements(Path(name), f"sumo.{key}"):
-                route = element if element.tag == "route" else element.find("route")
-                if route is not None and "edges" in route.attrib:
-                    found[element.get("id", "")] = route.attrib["edges"].split()
+            with _reading(Path(name), f"sumo.{key}"):
+                for element in _elements(Path(name)):
+                    route = element if element.tag == "route" else element.find("route")
+                    if route is not None and "edges" in route.attrib:
+                        found[element.get("id", "")] = route.attrib["edges"].split()
     return found
 
 
