@@ -230,6 +230,10 @@ class Cosimulated(Simulated):
         self._worlds: list[CosimulatedWorld] = []
         self._make = make
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy it without the worlds that it has made."""
+        return Cosimulated, (self.scenario, self._make)
+
     def kind(self, *arguments: Any, **options: Any) -> CosimulatedWorld:
         """Return worlds; arguments as for `World`."""
         made = CosimulatedWorld(self._make, *arguments, **options)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
+from weakref import finalize
 
 import numpy as np
 
@@ -78,7 +79,6 @@ class Sumo(TrafficProgram):
         self._taken = self._begin_taken.copy()
         self._seed, self._moved = -1, list[Array]()
         self._process: subprocess.Popen[bytes] | None = None
-        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (as long as this object)
         self._unanswered = False
         self._last = np.zeros((len(bodies), 4))
 
@@ -190,8 +190,9 @@ class Sumo(TrafficProgram):
     def _ask(self, request: Mapping[str, Any]) -> None:
         if self._process is None:
             command = [sys.executable, "-P", str(Path(sumo_process.__file__))]
-            pipe = subprocess.PIPE
+            pipe, self._errors = subprocess.PIPE, tempfile.TemporaryFile()  # noqa: SIM115 (closed by _end)
             self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors)
+            self._end = finalize(self, _end, self._process, self._errors)
         self._unanswered = True
         assert self._process.stdin is not None
         try:
@@ -217,11 +218,11 @@ class Sumo(TrafficProgram):
 
     def _fail(self, why: str = "") -> Any:
         """End the process. Raises CoopenvError: what SUMO says, or what has ended it."""
+        process, at = self._process, len(self._moved) / self._scenario.rates.camera
+        status = None if why or process is None else process.wait(PATIENCE)
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").splitlines()
         told = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
-        process, at = self._process, len(self._moved) / self._scenario.rates.camera
-        status = None if why or process is None else process.wait(PATIENCE)
         self.close()
         if status is not None and status < 0:
             raise CoopenvError(f"SUMO was ended by {signal.Signals(-status).name} {at:g} s after the reset")
@@ -257,12 +258,15 @@ class Sumo(TrafficProgram):
 
     def close(self) -> None:
         """End the process."""
-        process, self._process, self._unanswered = self._process, None, False
-        if process is not None:
-            process.kill()
-            process.communicate()
-        self._errors.seek(0)
-        self._errors.truncate()
+        if self._process is not None:
+            self._end()
+        self._process, self._unanswered = None, False
+
+
+def _end(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+    process.kill()
+    process.communicate()
+    errors.close()
 
 
 def _option(value: Any) -> str:

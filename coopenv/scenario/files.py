@@ -192,6 +192,7 @@ def schema_text() -> str:
     for name in merged:
         text = json.dumps({key: value for key, value in definitions[name].items() if key != "required"})
         definitions[f"Partial{name}"] = json.loads(partial.sub("#/$defs/Partial", text))
+    schema["required"].remove("landmarks")  # which SUMO's files may have
     schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
     about = "Of an entry of `vehicles`: so many equal ones."
     number = {"type": "integer", "minimum": 1, "maximum": MOST_VEHICLES, "description": about}
