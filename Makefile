@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train test-sumo agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -72,6 +72,10 @@ test-train: $(VENV)/.train ## the tests that train policies (installs torch)
 
 agents: $(VENV)/.train ## train the agents of agents/ that learn, about two hours; goes on where it was interrupted
 	@$(BIN)/coopenv bench learning agents/study.toml
+
+test-sumo: $(VENV)/.dev ## the tests that need SUMO (250 MB)
+	@$(PIP) --editable '.[sumo]'
+	@$(BIN)/python -m pytest -k sumo tests/backends tests/test_envs.py
 
 test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile

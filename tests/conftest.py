@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -65,6 +66,14 @@ def browser() -> Iterator[Any]:
         started = tools.chromium.launch(executable_path=program, args=DRAWS_WITHOUT_A_GRAPHICS_CARD)
         yield started
         started.close()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what is asked of environments of SUMO where it is not installed: it is too large for `make test`."""
+    if find_spec("libsumo") is None:
+        for item in items:
+            if "sumo" in item.name:
+                item.add_marker(pytest.mark.skip(reason="needs the extra sumo: make test-sumo"))
 
 
 def pytest_collection_finish() -> None:

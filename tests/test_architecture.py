@@ -86,8 +86,8 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (120, 2),
-    "api": (4010, 19),
-    "backends": (3285, 17),
+    "api": (4030, 19),
+    "backends": (3825, 21),
     "base": (1630, 11),
     "bench": (5290, 20),
     "cars": (10525, 47),
@@ -97,8 +97,8 @@ LINES_AND_FILES = {
     "observers": (11820, 47),
     "policies": (1725, 10),
     "runs": (3305, 13),
-    "scenario": (3210, 12),
-    "training": (1380, 5),
+    "scenario": (3555, 14),
+    "training": (1385, 5),
     "viz": (4800, 19),
     "world": (5185, 19),
 }

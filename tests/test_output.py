@@ -216,9 +216,9 @@ WITHOUT = """
 import json, os, subprocess, sys
 
 LIBRARIES = {
-    "cryptography", "foxglove", "gtsam", "h5py", "highway_env", "imageio_ffmpeg", "lz4", "mcap", "minari", "moviepy",
-    "nats", "onnx", "ray", "rosbags", "stable_baselines3", "tensorboard", "tomlkit", "torch", "torchrl", "viser",
-    "zenoh", "zstandard",
+    "cryptography", "foxglove", "gtsam", "h5py", "highway_env", "imageio_ffmpeg", "libsumo", "lz4", "mcap", "minari",
+    "moviepy", "nats", "onnx", "ray", "rosbags", "stable_baselines3", "tensorboard", "tomlkit", "torch", "torchrl",
+    "viser", "zenoh", "zstandard",
 }
 
 class Filtered:
@@ -260,6 +260,7 @@ COMMANDS = {
     "train facade --out agent": "train",
     "dataset facade": "minari",
     "describe highway_intersection": "highway",
+    "describe sumo_crossing": "sumo",
     "bench observers overtaking --observers factor_graph": "bench",
     "bench observers overtaking --engine ray": "ray",
     "svea demo": "svea",

@@ -12,7 +12,8 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.backends.highway import Followed, flipped, poses_of
+from coopenv.backends.cosimulation import Cosimulated, Moment, Poses, TrafficProgram
+from coopenv.backends.highway import flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import Array, position_covariance
@@ -27,6 +28,25 @@ class Kinematics(NamedTuple):
     xy: Array  # (2,) m
     heading: float  # rad
     speed: float  # m/s
+
+
+class Followed(TrafficProgram):
+    """Vehicles that stand at the poses of `present`."""
+
+    present: Poses
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Follow what the wrapper puts into `present`."""
+
+    def reset(self, seed: int) -> None:
+        """Begin where the vehicles stand."""
+
+    def command(self, now: Moment) -> None:
+        """Do nothing: the environment has moved them."""
+
+    def poses(self) -> Poses:
+        """Return where they stand."""
+        return self.present
 
 
 class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -142,12 +162,12 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         rates = {"rates.camera": frequency, "rates.decision": frequency, "rates.odometry": 5.0 * frequency}
         fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], "highway.most_vehicles": most, **rates}
         scenario: Scenario = self._load({**self._overrides, **fixed})
-        return Engine(scenario, 1, backend=Followed(scenario))
+        return Engine(scenario, 1, backend=Cosimulated(scenario, Followed))
 
     def _follow(self) -> None:
         """Put the vehicles of the world where the cars are."""
         origin = np.array(self._world.scenario.map.origin)
-        self._world.present = poses_of(self._cars, self.highway.road, origin, self._most)
+        self._world.programs[0].present = poses_of(self._cars, self.highway.road, origin, self._most)
 
     def _observe(self, observe: Any) -> Any:
         """Return the observation that highway-env makes when all cars have their estimated poses."""

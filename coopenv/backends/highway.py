@@ -1,44 +1,20 @@
 """highway-env as a co-simulator: its roads, traffic and dynamics under this project's cameras, radio and observers."""
 
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from coopenv.backends.simulated import CosimulatedWorld, Poses, Simulated
+from coopenv.backends.cosimulation import Moment, Poses, TrafficProgram
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, listed, shown, suggest
 from coopenv.base.installation import install_command, needing
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
-from coopenv.scenario.schema import Highway
-from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
-
-
-class FollowedWorld(CosimulatedWorld):
-    """One world whose vehicles stand at the poses of `present`."""
-
-    present: Poses
-
-    def restart(self) -> None:
-        """Begin an episode where the vehicles stand, see `World.restart`."""
-        if self.mask.numpy().any():
-            self.place(0, self.present)
-        super().restart()
-
-    def fetch(self) -> bool:
-        """Move the vehicles to where they stand."""
-        self.move(0, self.present)
-        return True
-
-
-class Followed(Simulated):
-    """One world that follows an environment of highway-env."""
-
-    kind = FollowedWorld
-
+from coopenv.scenario.cosimulators import Highway
+from coopenv.scenario.learning import Dynamics
+from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING
 
 BEND = 2.0  # m, length of a strip of a lane that bends
 MARGIN = 25.0  # m, of road that is drawn beyond the outermost landmark
@@ -86,12 +62,37 @@ def make_environment(scenario: Scenario) -> Any:
         ScenarioError: it has no such environment or key, or it does not take a value.
     """
     assert scenario.highway is not None  # the schema asks for it
+    for problem in _unknown_to_it(scenario):
+        raise ScenarioError(problem)
     creator = _creator(scenario.highway.id)
     config = _config(scenario, scenario.highway, creator.default_config())
     try:
         return creator(config=config)
     except Exception as error:  # whatever highway-env makes of it
         raise ScenarioError(f"highway: {scenario.highway.id} cannot be made: {error_text(error)}") from None
+
+
+LIMITS = {"max_acceleration", "max_speed", "max_steering", "reverse"}
+"""Keys of `[dynamics]` that are limits of commands; the others describe this project's own bicycle."""
+
+
+def _unknown_to_it(s: Scenario) -> Iterator[str]:
+    """Yield what of a scenario highway-env cannot do."""
+    given = {"dynamics": s.dynamics, **{f"vehicles.{i}.dynamics": v.dynamics for i, v in enumerate(s.vehicles)}}
+    for where, part in given.items():
+        for name in sorted(_changed(part) - LIMITS):
+            yield f"{where}.{name}: highway-env has its own; allowed: {', '.join(sorted(LIMITS))}"
+    if s.rates.camera % 1.0:
+        yield f"rates.camera: highway-env steps a whole number of times a second, not {s.rates.camera:g}"
+    if not s.driven:
+        yield "vehicles: highway-env needs at least one that is driven"
+    if s.action.pan is not None:
+        yield "action.pan: cameras of vehicles of highway-env do not turn"
+
+
+def _changed(part: Dynamics | None) -> set[str]:
+    """Return the keys that differ from their defaults; a scenario in a file of results has all of its defaults."""
+    return {name for name, field in Dynamics.model_fields.items() if part and getattr(part, name) != field.default}
 
 
 def _creator(name: str) -> Any:
@@ -161,7 +162,7 @@ HEIGHT = 1.5  # m, of the traffic's boxes: highway-env is flat
 MOST_DRAWS = 50  # resets until there is enough traffic to connect
 
 
-class Simulation:
+class Simulation(TrafficProgram):
     """An environment of highway-env whose cars are the scenario's vehicles, in its order."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -173,11 +174,11 @@ class Simulation:
         self._cars: list[Any] = []
 
     @property
-    def begun(self) -> bool:
-        """Whether it has been reset."""
-        return bool(self._cars)
+    def roads(self) -> tuple[Road, ...]:
+        """Its lanes."""
+        return drawn_roads(self.environment.road.network, self._scenario)
 
-    def reset(self, seed: int) -> Poses:
+    def reset(self, seed: int) -> None:
         """Draw traffic and starts; of the traffic, the cars nearest to the first driven one are connected.
 
         Those beyond `most_vehicles` are taken off the road.
@@ -203,25 +204,20 @@ class Simulation:
         self.environment.road.vehicles = [car for car in self.environment.road.vehicles if id(car) not in surplus]
         own, others = iter(drivers), iter(traffic)
         self._cars = [next(own if is_driven else others) for is_driven in self._driven]
-        return self.poses()
 
-    def drive(self, commands: Array, present: Array) -> Poses:
-        """Drive for one camera tick under commands (N, 3), see `coopenv.world.dynamics`; traffic drives itself.
-
-        Those that are not present (N,) are taken off the road.
-        """
-        gone = {id(car) for car, there in zip(self._cars, present, strict=True) if not there}
+    def command(self, now: Moment) -> None:
+        """Drive to the next tick; traffic drives itself, and vehicles that are not present are taken off the road."""
+        gone = {id(car) for car, there in zip(self._cars, now.present, strict=True) if not there}
         road = self.environment.road
         road.vehicles = [car for car in road.vehicles if id(car) not in gone]
         (acceleration, steering), rate = most_of_actions(self._scenario), self._scenario.rates.camera
         actions = []
-        for car, command in zip(self._cars, commands, strict=True):
+        for car, command in zip(self._cars, now.command, strict=True):
             wanted = (command[SPEED] - car.speed) * rate
             most = command[ACCELERATION]
             gas = np.clip(wanted, -most, most) / acceleration
             actions.append(np.array([gas, -command[STEERING] / steering]))
         self._call("step", tuple(action for action, driven in zip(actions, self._driven, strict=True) if driven))
-        return self.poses()
 
     def poses(self) -> Poses:
         """Return the poses of all vehicles; errors as for `poses_of`."""
@@ -266,62 +262,3 @@ def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:
 def flipped(xy: Array) -> Array:
     """Return (x, y) of highway-env in a frame whose y axis points up, or the other way round."""
     return np.array([xy[0], -xy[1]])
-
-
-class HighwayWorld(CosimulatedWorld):
-    """Worlds of which each has an environment of highway-env, stepped one after the other."""
-
-    def __init__(self, scenario: Scenario, *arguments: Any, **options: Any) -> None:
-        """Build the arrays and the environments; arguments and errors as for `World` and `make_environment`."""
-        super().__init__(scenario, *arguments, **options)
-        self._simulations = [Simulation(scenario) for _ in range(self.worlds)]
-
-    def restart(self) -> None:
-        """Start the next episode in the worlds of `self.mask`, see `World.restart`."""
-        seeds, episodes = self.view("seed"), self.view("episode")
-        for w in np.flatnonzero(self.mask.numpy()).tolist():
-            key = [int(seeds[w]), (int(episodes[w]) + 1) % 2**32]
-            self.place(w, self._simulations[w].reset(int(np.random.SeedSequence(key).generate_state(1)[0])))
-        super().restart()
-
-    def fetch(self) -> bool:
-        """Drive to the next tick in the worlds that are not over.
-
-        Who has ended brakes with its wheels straight: here it still rolls, and its action must not steer it.
-        """
-        commands, k = np.array(self.view("command"), dtype=float), self.view("tick")
-        ended = self.view("ended") != UNDER_WAY
-        commands[ended, SPEED] = commands[ended, STEERING] = 0.0
-        present = self.view("present")[:, self.model.landmarks :]
-        for w in np.flatnonzero((self.mask.numpy() == 0) & (k < self.model.horizon_ticks)).tolist():
-            self.move(w, self._simulations[w].drive(commands[w], present[w]))
-        return True
-
-    def source_state(self) -> dict[str, Any]:
-        """Return copies of the environments, which are objects."""
-        return {"highway": deepcopy(self._simulations)}
-
-    def set_source_state(self, values: Mapping[str, Any]) -> None:
-        """Go on with copies of environments. Raises CoopenvError: they are not of these worlds."""
-        given: Any = values.get("highway")
-        if not isinstance(given, list) or [type(simulation) for simulation in given] != [Simulation] * self.worlds:
-            raise CoopenvError("state: no environments of highway-env in it")
-        self._simulations = deepcopy(given)
-        for w, simulation in enumerate(self._simulations):
-            if simulation.begun:
-                self.remember(w, simulation.poses())
-
-
-class HighwayBackend(Simulated):
-    """Worlds of highway-env: many at once on the CPU, or one of them tick by tick."""
-
-    kind = HighwayWorld
-
-    def __init__(self, scenario: Scenario) -> None:
-        """Make one environment, whose roads are drawn; errors as for `make_environment`."""
-        road = Simulation(scenario).environment.road
-        roads = scenario.roads or drawn_roads(road.network, scenario)
-        super().__init__(scenario.model_copy(update={"roads": roads}))
-
-
-__all__ = ["HighwayBackend"]

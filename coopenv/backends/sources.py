@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from coopenv.base.errors import CoopenvError, DataError, check_one_of
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
     from coopenv.scenario import Scenario, ScenarioLike
 
-BACKENDS = ("simulated", "highway", "replay", "svea")
+BACKENDS = ("simulated", "highway", "sumo", "program", "replay", "svea")
 
 LOG_SUFFIX = ".mcap"
 BAG_SUFFIXES = (".bag", ".db3")
@@ -134,8 +133,9 @@ def simulation_of(scenario: Scenario) -> Simulated:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
     """
     if scenario.cosimulator is not None:
-        made: Simulated = resolve_name(scenario.cosimulator.backend)(scenario)
-        return made
+        from coopenv.backends.cosimulation import Cosimulated
+
+        return Cosimulated(scenario)
     from coopenv.backends.simulated import Simulated
 
     return Simulated(scenario)

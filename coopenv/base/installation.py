@@ -171,8 +171,10 @@ def is_reference(text: str) -> bool:
 
 
 def absolute_reference(reference: str, folder: Path | None = None) -> str:
-    """Return a reference, in which a file is looked for in a folder (None: the current one), as one for any folder."""
-    place, _, name = reference.rpartition(":")
+    """Return a reference, or a path, of a file in a folder (None: the current one) as one for any folder."""
+    place, colon, name = reference.rpartition(":")
+    if not colon:
+        return str(_file(reference, folder))
     return f"{_file(place, folder)}:{name}" if place.endswith(".py") else reference
 
 

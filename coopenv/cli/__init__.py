@@ -80,7 +80,7 @@ def describe(given: DescribeOptions) -> None:
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:
         scenario, recorded = options.load(given.environment, given.changes), False
-        if scenario.backend != "simulated":  # the roads of highway-env are drawn by highway-env itself
+        if scenario.backend != "simulated":  # whose roads may be those of the program
             scenario = simulation_of(scenario).scenario
     if given.as_json:
         options.print_json(document(name, scenario))

@@ -78,7 +78,7 @@ def start(vehicle: Vehicle) -> str:
     if isinstance(vehicle.motion, WaypointMotion):
         return vector(vehicle.motion.waypoints[0].position)
     if vehicle.initial_pose is None and not vehicle.routes:
-        return "drawn by highway-env"
+        return "drawn with the traffic"
     pose = vehicle.initial_pose or InitialPose()
     return lines(
         "start of its route" if pose.position is None else vector(pose.position),
@@ -116,7 +116,7 @@ def motion(moves: Any) -> str:
     if isinstance(moves, DrivenMotion):
         return f"driven by actions, starts at {number(moves.initial_speed)} m/s"
     if isinstance(moves, TrafficMotion):
-        return "driven by highway-env's traffic"
+        return "driven by the traffic"
     return "stands still"
 
 

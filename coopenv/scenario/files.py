@@ -15,11 +15,15 @@ from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import TOO_DEEP, read_toml, validated
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.own_terms import located
-from coopenv.scenario.scenes import scene_text
+from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
 from coopenv.scenario.schema import Scenario
+from coopenv.scenario.sumo import with_sumo
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""
+
+COUNT_KEY = "count"
+"""Key of an entry of `vehicles` that stands for so many equal ones."""
 
 OVERRIDES = "overrides"
 """Where a field stands that an override has made wrong."""
@@ -64,7 +68,9 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
             raw = located(read_toml(path, ScenarioError, path.name), path.parent)
+        repeat_vehicles(raw, path.name)
         override(raw, overrides or {})
+        repeat_vehicles(raw, OVERRIDES)
         raw = located(raw, Path.cwd())  # those of overrides
         return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
     except RecursionError:
@@ -102,12 +108,28 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        text = json.dumps(with_groups(raw), default=plain)
+        text = json.dumps(with_groups(with_sumo(raw, where)), default=plain)
     except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:
         raise ScenarioError(f"{where}: {TOO_DEEP}") from None
     return validated(Scenario, text, where, ScenarioError)
+
+
+def repeat_vehicles(raw: dict[str, Any], where: str) -> None:
+    """Replace vehicles with a count by so many, in place. Raises ScenarioError: a count is no such number."""
+    repeated: list[Any] = []
+    for i, given in enumerate(raw["vehicles"] if isinstance(raw.get("vehicles"), list) else ()):
+        vehicle, count = given, 1
+        if isinstance(given, dict) and COUNT_KEY in given:
+            vehicle = {**given}
+            count = vehicle.pop(COUNT_KEY)
+        if type(count) is not int or not 1 <= count <= MOST_VEHICLES:
+            expected = f"expected a whole number 1 to {MOST_VEHICLES}, got {shown(count)}"
+            raise ScenarioError(f"{where}: vehicles.{i}.{COUNT_KEY}: {expected}")
+        repeated += [vehicle, *(deepcopy(vehicle) for _ in range(count - 1))]
+    if repeated:
+        raw["vehicles"] = repeated
 
 
 def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
@@ -191,7 +213,11 @@ def schema_text() -> str:
     for name in merged:
         text = json.dumps({key: value for key, value in definitions[name].items() if key != "required"})
         definitions[f"Partial{name}"] = json.loads(partial.sub("#/$defs/Partial", text))
+    schema["required"].remove("landmarks")  # which SUMO's files may have
     schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
+    about = "Of an entry of `vehicles`: so many equal ones."
+    number = {"type": "integer", "minimum": 1, "maximum": MOST_VEHICLES, "description": about}
+    definitions["PartialVehicle"]["properties"][COUNT_KEY] = number
     schema["properties"][DEFAULTS_KEY] = {
         "$ref": "#/$defs/PartialVehicle",
         "description": "Entries of every vehicle without its own.",

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.sections import one_line
+from coopenv.scenario.cosimulators import FILES
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -139,14 +140,27 @@ def record_count(where: str, function: Any, allowed: tuple[int, ...]) -> int:
 def located(
     raw: Mapping[str, Any], folder: Path, place: Callable[[str, Path], str] = installation.absolute_reference
 ) -> dict[str, Any]:
-    """Return a scenario with the references of its own terms, relative to `folder`, replaced (default: by absolute)."""
+    """Return a scenario with its files and the references of its own terms, relative to `folder`, replaced.
+
+    By default they become absolute.
+    """
     result = dict(raw)
     for section in SECTIONS:
         part = result.get(section)
         if isinstance(part, dict) and isinstance(part.get("custom"), dict):
             rows = {name: _located(row, folder, place) for name, row in part["custom"].items()}
             result[section] = {**part, "custom": rows}
+    for section, keys in FILES.items():
+        part = result.get(section)
+        if isinstance(part, dict):
+            result[section] = {k: _placed(v, folder, place) if k in keys else v for k, v in part.items()}
     return result
+
+
+def _placed(given: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
+    if isinstance(given, list):
+        return [_placed(entry, folder, place) for entry in given]
+    return place(given, folder) if isinstance(given, str) else given
 
 
 def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
@@ -156,8 +170,12 @@ def _located(row: Any, folder: Path, place: Callable[[str, Path], str]) -> Any:
 
 
 def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario with terms of coopenv only, for recordings, which must not name code."""
+    """Return a scenario with terms of coopenv only, for recordings, which must name neither code nor folders."""
     result = dict(raw)
+    nothing = {"net": "not_recorded", "routes": [], "additional": [], "included": True}
+    for key, own in (("program", {"code": "not_recorded:none"}), ("sumo", nothing)):
+        if isinstance(raw.get(key), dict):
+            result[key] = {**raw[key], **own}
     for section, kind in SECTIONS.items():
         if not isinstance(raw.get(section), dict):
             continue

@@ -44,7 +44,7 @@ class Pieces:
 class Route(Section):
     """A way that vehicles are to go, of which every reset draws a variant."""
 
-    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     waypoints: tuple[Vector2, ...] = Field(min_length=2, max_length=1000)
     """x and y in the coordinates of this file, m; the route lies at z = 0 and must not come near itself."""
     corner_radius: NonNegative = 0.0

@@ -5,7 +5,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -13,8 +13,9 @@ from pydantic import Field, field_validator, model_validator
 from coopenv.base.errors import ScenarioWarning, check_one_of, listed, shown, suggest
 from coopenv.base.notebook import facts_html, one_line
 from coopenv.base.sections import Section
-from coopenv.scenario.base import Number, Positive, Text, Vector3, Word, overlaid, rotation_of
+from coopenv.scenario.base import Positive, Text, Vector3, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
+from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Boxes, Route, followers, overlapping_pairs, possible_boxes, start_of
 from coopenv.scenario.sensing import Camera, Faults, Noise, ObserverSettings, Rates, Topology, V2x
@@ -23,58 +24,10 @@ MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters a
 
 MOST_PAIRS = 2e7  # of vehicles and their targets
 
-LIMITS = {"max_acceleration", "max_speed", "max_steering", "reverse"}
-"""Keys of `[dynamics]` that are limits of commands; the others describe this project's own bicycle."""
-
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
 SAME_PLACE = 1e-6  # m
-
-Setting = bool | int | Number | Word | tuple[Number, ...] | None
-
-
-class Cosimulator(Section):
-    """Section of a program that moves the vehicles. A subclass is a field of `Scenario`, named as in `backend`."""
-
-    title: ClassVar[str]
-    """Name of the program."""
-    backend: ClassVar[str]
-    """Its backend, `module:class`, made from the scenario."""
-    reference_midway: ClassVar[bool] = False
-    """Whether its vehicles' reference point is midway between the axles instead of the rear one."""
-
-    most_vehicles: int = Field(default=40, ge=0, le=1000)
-    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
-
-    @property
-    def roads(self) -> str:
-        """What roads and traffic are made of, in words."""
-        return self.title
-
-
-class Highway(Cosimulator):
-    """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
-
-    title = "highway-env"
-    backend = "coopenv.backends.highway:HighwayBackend"
-    reference_midway = True
-
-    id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
-    """Its id in Gymnasium's registry, such as `intersection-v0`."""
-    config: dict[str, Setting] = Field(default={})
-    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
-    dynamical: bool = False
-    """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
-
-    @property
-    def roads(self) -> str:
-        """What roads and traffic are made of, in words."""
-        return f"{self.title}'s `{self.id}`"
-
-
-COSIMULATORS = ("highway",)
-"""Fields of `Scenario` that are sections of a co-simulator, by their names in `backend`."""
 
 
 class Map(Section):
@@ -93,13 +46,15 @@ class Scenario(Section):
     """Where the figures come from."""
     horizon: Positive
     """Length of an episode, s."""
-    backend: Literal["simulated", "highway"] = "simulated"
-    """What moves the vehicles: coopenv itself, or highway-env with the section `[highway]`."""
+    backend: Literal["simulated", "highway", "sumo", "program"] = "simulated"
+    """What moves the vehicles: coopenv itself, or a co-simulator with the section of this name."""
     highway: Highway | None = None
+    sumo: Sumo | None = None
+    program: Program | None = None
     map: Map = Map()
     routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
-    roads: tuple[Road, ...] = Field(default=(), max_length=10_000)
-    obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
+    roads: tuple[Road, ...] = Field(default=(), max_length=50_000)
+    obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=50_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
     landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
     vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=4_096)
@@ -281,19 +236,6 @@ def _misplaced(s: Scenario) -> Iterator[str]:
             yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = {' or '.join(COSIMULATORS)}"
         if not elsewhere and kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
             yield f"vehicles.{i}.initial_pose: needed, with at least a position"
-    given = {"dynamics": s.dynamics, **{f"vehicles.{i}.dynamics": v.dynamics for i, v in enumerate(s.vehicles)}}
-    for where, part in given.items() if elsewhere else ():
-        for name in sorted(_changed(part) - LIMITS):
-            yield f"{where}.{name}: {title} has its own; allowed: {', '.join(sorted(LIMITS))}"
-    if elsewhere and s.rates.camera % 1.0:
-        yield f"rates.camera: {title} steps a whole number of times a second, not {s.rates.camera:g}"
-    if elsewhere and not s.driven:
-        yield f"vehicles: {title} needs at least one that is driven"
-
-
-def _changed(part: Dynamics | None) -> set[str]:
-    """Return the keys that differ from their defaults; a scenario in a file of results has all of its defaults."""
-    return {name for name, field in Dynamics.model_fields.items() if part and getattr(part, name) != field.default}
 
 
 def _problems(s: Scenario) -> Iterator[str]:
@@ -347,8 +289,6 @@ def _problems_of_nearby(s: Scenario) -> Iterator[str]:
 
 def _problems_of_driving(s: Scenario) -> Iterator[str]:
     """Yield what of action and reward does not fit to the vehicles, and what is beyond their own limits."""
-    if s.action.pan is not None and s.cosimulator is not None:
-        yield f"action.pan: cameras of vehicles of {s.cosimulator.title} do not turn"
     driven = sum(vehicle.motion.kind == "driven" for vehicle in s.vehicles)
     if s.reward.team != "own" and driven < 2:
         yield f"reward.team: '{s.reward.team}' needs at least two driven vehicles, got {driven}"

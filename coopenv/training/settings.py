@@ -32,6 +32,7 @@ from coopenv.base.sections import Section, read_toml, validated
 from coopenv.policies.loader import AGENT_FILE, load_agent
 from coopenv.scenario import Scenario
 from coopenv.scenario.base import NonNegative, Positive, Probability
+from coopenv.scenario.cosimulators import FILES
 from coopenv.scenario.files import merged
 from coopenv.scenario.own_terms import SECTIONS, located
 from coopenv.scenario.scenes import scene_text
@@ -308,12 +309,12 @@ def environment_file(environment: str, overrides: Mapping[str, Any] | None = Non
 
 
 def _beside(reference: str, folder: Path, code: dict[str, Path]) -> str:
-    """Return a reference of some folder as one to a copy beside; note the file, and those it imports, in `code`."""
-    place, _, name = absolute_reference(reference, folder).rpartition(":")
-    if not place.endswith(".py"):
+    """Return a path or reference of some folder as one to a copy beside; note its file, and imports, in `code`."""
+    place, colon, name = absolute_reference(reference, folder).rpartition(":")
+    if colon and not place.endswith(".py"):
         return reference
-    _add_code(Path(place), code)
-    return f"{Path(place).name}:{name}"
+    _add_code(Path(place or name), code)
+    return f"{Path(place).name}:{name}" if colon else Path(name).name
 
 
 def _add_code(path: Path, code: dict[str, Path]) -> None:
@@ -322,6 +323,8 @@ def _add_code(path: Path, code: dict[str, Path]) -> None:
             raise CoopenvError(f"{path} and {code[path.name]}: one folder must hold both; give one another name")
         return
     code[path.name] = path
+    if path.suffix != ".py":
+        return
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
         for name in [node.module or ""] if isinstance(node, ast.ImportFrom) else names:
@@ -336,7 +339,7 @@ def _with_code_beside(overrides: Mapping[str, Any], code: dict[str, Path]) -> di
 
 
 def _movable(text: str, folder: Path, code: dict[str, Path]) -> str:
-    """Return a scenario of some folder as it means the same with copies of its own terms beside it, see `_beside`."""
+    """Return a scenario of some folder as it means the same with copies of its files and own terms beside it."""
     raw = tomllib.loads(text)
     changed = located(raw, folder, partial(_beside, code=code))
     if changed == raw:
@@ -348,6 +351,9 @@ def _movable(text: str, folder: Path, code: dict[str, Path]) -> str:
         rows = changed.get(section, {}).get("custom", {})
         for name, row in rows.items():
             document[section]["custom"][name] = row
+    for section, keys in FILES.items():
+        for key in {*keys} & changed.get(section, {}).keys():
+            document[section][key] = changed[section][key]
     return tomlkit.dumps(document)
 
 

@@ -65,7 +65,7 @@ def test_truth_of_highway_env_is_not_observed_sent_or_estimated(name: str, obser
     driven, state, away = driven_vehicles(scenario), engine.get_state(), np.array([0.3, -0.2])
     for i in driven:
         state["position"][1, len(scenario.landmarks) + i, :2] += away
-        state["highway"][1]._cars[i].position += away * (1.0, -1.0)  # its y axis points down
+        state["programs"][1]._cars[i].position += away * (1.0, -1.0)  # its y axis points down
     engine.set_state(state)
     for _ in range(8):
         engine.step(np.zeros((2, len(scenario.vehicles), 2)))

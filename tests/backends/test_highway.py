@@ -26,7 +26,7 @@ def engine_of(name: str, worlds: int = 1, **overrides: Any) -> Engine:
 
 
 def road_of(engine: Engine, world: int = 0) -> Any:
-    return engine.world._simulations[world].environment.road
+    return engine.world.programs[world].environment.road
 
 
 def test_cars_are_where_highway_env_has_them_with_y_up() -> None:
@@ -223,7 +223,7 @@ def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: py
     ("overrides", "why"),
     [
         ({"backend": "simulated"}, 'highway: only with backend = "highway"'),
-        ({"backend": "higway"}, "backend: Input should be 'simulated' or 'highway'"),
+        ({"backend": "higway"}, "backend: Input should be 'simulated', 'highway', 'sumo' or 'program'"),
         ({"highway.id": "intersection-v9"}, r"highway\.id: highway-env has no environment 'intersection-v9' \(did you"),
         (
             {"highway.config.initial_vehicle_cout": 3},
@@ -292,8 +292,8 @@ def test_states_of_others_are_refused() -> None:
     state = other.get_state()
     before = env.engine.view("position").copy()
     for wrong in (None, [], [1]):
-        with pytest.raises(CoopenvError, match="no environments of highway-env in it"):
-            env.set_state({**state, "highway": wrong})
+        with pytest.raises(CoopenvError, match="programs: expected 1 of backend 'highway'"):
+            env.set_state({**state, "programs": wrong})
         assert np.array_equal(env.engine.view("position"), before)
     env.set_state(state)
     assert np.array_equal(env.engine.view("position"), other.engine.view("position"))
@@ -332,7 +332,7 @@ def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed
     assert infos[driver]["outcome"] == "arrived"
     assert max(offset[5:]) < 1.0
     engine, agent = env.engine, env.engine.world.model.landmarks + place
-    driven = engine.world._simulations[0].environment.vehicle
+    driven = engine.world.programs[0].environment.vehicle
     engine.step(ticks=2)
     assert engine.view("present")[0, agent] == 0  # who has arrived leaves
     assert not any(car is driven for car in road_of(engine).vehicles)

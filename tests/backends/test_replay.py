@@ -211,7 +211,7 @@ def test_names(data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     assert coopenv.parallel_env("mrclam_scene.toml").possible_agents == ["vehicle_1", "vehicle_2"]
     for options, why in (
         ({"backend": "replay"}, "'busy_intersection' is no recording; known: FILE.mcap, mrclam_1 .. mrclam_9"),
-        ({"backend": "reply"}, r"unknown backend 'reply' \(did you mean 'replay'\?\); known: simulated, highway"),
+        ({"backend": "reply"}, r"unknown backend 'reply' \(did you mean 'replay'\?\); known: simulated, highway, sumo"),
         ({"variant": "blind"}, "variant is for recorded data, 'busy_intersection' is simulated"),
         ({"data": data}, "data is for recorded data"),
     ):

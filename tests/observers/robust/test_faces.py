@@ -81,7 +81,7 @@ def started(name: str) -> Engine:
     scenario = load_scenario(name)
     if scenario.backend == "highway":
         pytest.importorskip("highway_env", reason="needs the extra highway")
-    engine = Engine(scenario, 24 if scenario.backend == "highway" else 256, "float64")
+    engine = Engine(scenario, {"highway": 24, "sumo": 6}.get(scenario.backend, 256), "float64")
     engine.reset(range(engine.world.worlds))
     return engine
 

@@ -1,0 +1,286 @@
+"""SUMO as a co-simulator: its networks, routes and traffic under this project's cameras, radio and observers.
+
+SUMO runs in a process of its own for each world (`coopenv.backends.sumo_process`): worlds of a batch run at the same
+time, and the end of one is an error and not the end of this program.
+"""
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, Any
+from weakref import finalize
+
+import numpy as np
+
+from coopenv.backends import sumo_process
+from coopenv.backends.cosimulation import Moment, Poses, TrafficProgram
+from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of, shortened
+from coopenv.base.installation import install_command
+from coopenv.estimation.poses import Array
+from coopenv.scenario import Scenario
+from coopenv.scenario.sumo import route_edges
+
+OWNED = {
+    "additional-files": "sumo.additional",
+    "begin": "sumo.warm_up",
+    "configuration-file": "sumo.net, sumo.routes and sumo.additional",
+    "net-file": "sumo.net",
+    "remote-port": "the connection",
+    "route-files": "sumo.routes",
+    "seed": "the world's seed",
+    "step-length": "rates.camera",
+}
+"""SUMO's options that follow from other parts of a scenario, named here."""
+
+OPTIONS: Mapping[str, Any] = {
+    "collision.action": "none",  # collisions are judged here
+    "lanechange.duration": 2.0,  # s; a vehicle that changed lanes in one step would jump aside by a lane's width
+    "no-step-log": True,
+    "no-warnings": True,
+    "time-to-teleport": -1.0,  # vehicles in jams do not jump
+}
+"""SUMO's options unless the scenario gives others."""
+
+INSERTION = 60.0
+"""s that SUMO may take until there is room for the driven vehicles."""
+
+PATIENCE = 5.0
+"""s that the process may take to end."""
+
+
+class Sumo(TrafficProgram):
+    """A simulation of SUMO whose vehicles are the scenario's, in its order.
+
+    A driven vehicle begins where SUMO inserts it on its route. It is in the hands of actions (`take`) or of SUMO
+    (`release`), and may change between the two at every tick. Vehicles of the traffic begin in SUMO's hands.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Prepare a simulation; its process is started by the first reset.
+
+        Raises:
+            CoopenvError: SUMO is not installed.
+            ScenarioError: the scenario does not fit to SUMO.
+        """
+        assert scenario.sumo is not None  # the schema asks for it
+        if find_spec("libsumo") is None:
+            raise CoopenvError(f"backend 'sumo' needs SUMO, which is not installed: {install_command('sumo')}")
+        self._scenario, self._section = scenario, scenario.sumo
+        self._names, self._origin = scenario.vehicle_names, np.array(scenario.map.origin[:2])
+        bodies = [vehicle.body for vehicle in scenario.vehicles]
+        self._front = np.array([body.center[0] + body.size[0] / 2 if body else 0.0 for body in bodies])
+        self._request = self._reset_request()
+        self._begin_taken = np.array([vehicle.motion.kind == "driven" for vehicle in scenario.vehicles])
+        self._taken = self._begin_taken.copy()
+        self._seed, self._moved = -1, list[Array]()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._unanswered = False
+        self._last = np.zeros((len(bodies), 4))
+
+    def _reset_request(self) -> dict[str, Any]:
+        section, scenario = self._section, self._scenario
+        period = 1000.0 / scenario.rates.camera
+        if abs(period - round(period)) > 1e-9:
+            raise ScenarioError(f"rates.camera: SUMO steps in whole milliseconds, not in {period:.6g} ms")
+        for key in section.options:
+            if key in OWNED:
+                raise ScenarioError(f"sumo.options.{key}: follows from {OWNED[key]}; leave this out")
+        files = {"net-file": [section.net], "route-files": section.routes, "additional-files": section.additional}
+        options = {key: ",".join(paths) for key, paths in files.items() if paths} | {"step-length": period / 1000.0}
+        arguments = [f"--{key}={_option(value)}" for key, value in {**OPTIONS, **section.options, **options}.items()]
+        edges = route_edges(section) if scenario.driven else {}
+        vehicles: list[dict[str, Any] | None] = []
+        for i, (vehicle, limits) in enumerate(zip(scenario.vehicles, scenario.limits, strict=True)):
+            if vehicle.motion.kind != "driven":
+                vehicles.append(None)
+                continue
+            if len(vehicle.routes) != 1 or vehicle.body is None:
+                raise ScenarioError(f"vehicles.{i}: SUMO needs one of its routes, and a body, of a driven vehicle")
+            check_one_of(f"vehicles.{i}.routes: unknown route of SUMO", vehicle.routes[0], edges, ScenarioError)
+            route = edges[vehicle.routes[0]]
+            vehicles.append({"route": route, "size": vehicle.body.size, "speed": limits.max_speed})
+        return {
+            "do": "reset",
+            "arguments": arguments,
+            "warm_up": section.warm_up,
+            "vehicles": vehicles,
+            "center": scenario.map.origin[:2],
+            "wait": INSERTION,
+        }
+
+    def take(self, vehicle: str) -> None:
+        """Let actions drive a vehicle from the next tick on. Raises CoopenvError: there is none of that name."""
+        self._taken[self._index(vehicle)] = True
+
+    def release(self, vehicle: str) -> None:
+        """Let SUMO drive a vehicle along its route from the next tick on, from the nearest lane of the route.
+
+        Raises:
+            CoopenvError: there is none of that name, or SUMO has it no more.
+        """
+        i = self._index(vehicle)
+        if np.isnan(self._last[i, 0]):
+            raise CoopenvError(f"{vehicle}: SUMO has it no more: it has left the road or reached the end of its route")
+        self._taken[i] = False
+
+    def _index(self, vehicle: str) -> int:
+        check_one_of("unknown vehicle", vehicle, self._names)
+        return self._names.index(vehicle)
+
+    def reset(self, seed: int) -> None:
+        """Load the network and let traffic drive for `sumo.warm_up`; see `TrafficProgram`."""
+        if self._unanswered:  # an interrupt has come between a request and its reply
+            self.close()
+        self._taken[:] = self._begin_taken
+        self._seed, self._moved = seed % 2**31, []
+        self._ask({**self._request, "arguments": [*self._request["arguments"], f"--seed={self._seed}"]})
+
+    def command(self, now: Moment) -> None:
+        """Let SUMO drive to the next tick, at whose end taken vehicles are where they now drive to."""
+        dt = 1.0 / self._scenario.rates.camera
+        turned = now.heading + now.yaw_rate * dt
+        middle, moved = now.heading + now.yaw_rate * dt / 2, np.full((len(turned), 4), np.nan)
+        xy = now.xy + self._origin + (now.speed * dt)[:, None] * _direction(middle)
+        moved[:, 0] = np.arange(len(turned))
+        moved[:, 1:3] = xy + self._front[:, None] * _direction(turned)
+        moved[:, 3] = 90.0 - np.degrees(turned)
+        gone = np.logical_not(now.present)
+        moved[gone, 1:] = np.nan
+        self._step(moved[self._taken | gone])
+
+    def _step(self, moved: Array) -> None:
+        self._moved.append(moved)
+        rows = [[int(i), *(None if np.isnan(x) else float(x) for x in row)] for i, *row in moved]
+        self._ask({"do": "step", "moved": rows})
+
+    def poses(self) -> Poses:
+        """Return where everything is, see `TrafficProgram`."""
+        own, others = self._answer()
+        left = np.isnan(own[:, 0])
+        self._last = own
+        most = self._section.most_vehicles
+        if len(others) > most:
+            raise CoopenvError(f"sumo.most_vehicles: {most} are too few, there are {len(others)} on the road")
+        heading, traffic_heading = np.radians(90.0 - own[:, 2]), np.zeros(most)
+        position, half = np.zeros((most, 3)), np.zeros((most, 3))
+        traffic_heading[: len(others)] = np.radians(90.0 - others[:, 2])
+        half[: len(others)] = others[:, 3:] / 2
+        back = half[: len(others), :1] * _direction(traffic_heading[: len(others)])
+        position[: len(others), :2] = others[:, :2] - back - self._origin
+        position[:, 2] = half[:, 2]
+        xy = own[:, :2] - self._front[:, None] * _direction(heading) - self._origin
+        return Poses(
+            xy=np.where(left[:, None], 0.0, xy),
+            heading=np.where(left, 0.0, heading),
+            speed=np.where(left, 0.0, own[:, 3]),
+            steering=np.zeros(len(own)),
+            crashed=np.zeros(len(own), bool),
+            left=left & ~self._taken,
+            traffic_position=position,
+            traffic_heading=traffic_heading,
+            traffic_half=half,
+            driven=self._taken,
+        )
+
+    def _ask(self, request: Mapping[str, Any]) -> None:
+        if self._process is None:
+            command = [sys.executable, "-P", str(Path(sumo_process.__file__))]
+            pipe, self._errors = subprocess.PIPE, tempfile.TemporaryFile()  # noqa: SIM115 (closed by _end)
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors)
+            self._end = finalize(self, _end, self._process, self._errors)
+        self._unanswered = True
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            self._fail()
+
+    def _answer(self) -> tuple[Array, Array]:
+        """Return x, y (m), angle (deg) and speed (m/s) of the vehicles, and x, y, angle and size of all others."""
+        assert self._process is not None and self._process.stdout is not None
+        line = self._process.stdout.readline()
+        head = json.loads(line) if line.endswith(b"\n") else self._fail()
+        if "error" in head:
+            self._fail(head["error"])
+        size = 8 * (4 * head["own"] + 6 * head["others"])
+        body = self._process.stdout.read(size)
+        if len(body) < size:
+            self._fail()
+        self._unanswered = False
+        values = np.frombuffer(body)
+        return values[: 4 * head["own"]].reshape(-1, 4), values[4 * head["own"] :].reshape(-1, 6)
+
+    def _fail(self, why: str = "") -> Any:
+        """End the process. Raises CoopenvError: what SUMO says, or what has ended it."""
+        process, at = self._process, len(self._moved) / self._scenario.rates.camera
+        status = None if why or process is None else process.wait(PATIENCE)
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").splitlines()
+        told = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+        self.close()
+        if status is not None and status < 0:
+            raise CoopenvError(f"SUMO was ended by {signal.Signals(-status).name} {at:g} s after the reset")
+        said = " ".join((told or [why or f"it ended with status {status}"])[-1].split())
+        raise CoopenvError(f"SUMO, {at:g} s after the reset: {shortened(said, 300)}")
+
+    def save(self) -> dict[str, Any]:
+        """Return the seed, and what vehicles have been moved to since the reset: SUMO repeats itself."""
+        return {"seed": self._seed, "moved": [rows.copy() for rows in self._moved], "taken": self._taken.copy()}
+
+    def accepts(self, saved: Any) -> bool:
+        """Return whether it is such a record for as many vehicles."""
+        if not isinstance(saved, Mapping) or not {"seed", "moved", "taken"} <= saved.keys():
+            return False
+        seed, moved, taken, count = saved["seed"], saved["moved"], saved["taken"], len(self._taken)
+        return (
+            type(seed) is int
+            and isinstance(moved, list)
+            and all(_are_rows(rows, count) for rows in moved)
+            and isinstance(taken, np.ndarray)
+            and (taken.dtype, taken.shape) == (np.dtype(bool), (count,))
+        )
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Drive again from the reset on."""
+        if saved["seed"] >= 0:
+            self.reset(saved["seed"])
+            self._answer()
+            for rows in saved["moved"]:
+                self._step(rows.copy())
+                self._last, _ = self._answer()
+        self._taken = saved["taken"].copy()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._end()
+        self._process, self._unanswered = None, False
+
+
+def _end(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+    process.kill()
+    process.communicate()
+    errors.close()
+
+
+def _option(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _direction(heading: Array) -> Array:
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def _are_rows(rows: Any, count: int) -> bool:
+    """Return whether these are rows of vehicle, x, y and angle."""
+    if not isinstance(rows, np.ndarray) or rows.dtype != np.float64 or rows.ndim != 2 or rows.shape[1] != 4:
+        return False
+    return bool(np.isin(rows[:, 0], np.arange(count)).all() and not np.isinf(rows).any())

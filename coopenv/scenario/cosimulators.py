@@ -1,0 +1,104 @@
+"""Sections of the programs that may move the vehicles in place of coopenv; see docs/backends.md."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from coopenv.base.sections import Section
+from coopenv.scenario.base import NonNegative, Number, Positive, Word
+
+Setting = bool | int | Number | Word | tuple[Number, ...] | None
+File = Annotated[str, Field(min_length=1, max_length=1_000)]
+"""A path; a relative one is looked for beside the scenario's file."""
+
+
+class Cosimulator(Section):
+    """Section of a program that moves the vehicles. A subclass is a field of `Scenario`, named as in `backend`."""
+
+    title: ClassVar[str]
+    """Name of the program."""
+    program: ClassVar[str]
+    """Its `coopenv.backends.cosimulation.TrafficProgram`, `module:class`, made from the scenario."""
+    reference_midway: ClassVar[bool] = False
+    """Whether its vehicles' reference point is midway between the axles instead of the rear one."""
+
+    most_vehicles: int = Field(default=40, ge=0, le=10_000)
+    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+
+    @property
+    def roads(self) -> str:
+        """What roads and traffic are made of, in words."""
+        return self.title
+
+
+class Highway(Cosimulator):
+    """Roads, traffic (IDM and MOBIL) and dynamics of an environment of highway-env, see docs/highway.md."""
+
+    title = "highway-env"
+    program = "coopenv.backends.highway:Simulation"
+    reference_midway = True
+
+    id: Annotated[str, Field(max_length=64, pattern=r"^[a-z0-9][A-Za-z0-9-]*-v\d+$")]
+    """Its id in Gymnasium's registry, such as `intersection-v0`."""
+    config: dict[str, Setting] = Field(default={})
+    """Its own configuration by key; settings of this file (rates, sizes of actions) are not repeated here."""
+    dynamical: bool = False
+    """Whether driven vehicles have tyres that slip (highway-env's BicycleVehicle); otherwise its kinematic bicycle."""
+
+    @property
+    def roads(self) -> str:
+        """What roads and traffic are made of, in words."""
+        return f"{self.title}'s `{self.id}`"
+
+
+class Sumo(Cosimulator):
+    """Network, routes and traffic of SUMO, see docs/sumo.md."""
+
+    title = "SUMO"
+    program = "coopenv.backends.sumo:Sumo"
+
+    most_vehicles: int = Field(default=1_000, ge=0, le=10_000)
+    """Vehicles on its road at most, besides those of this file: the traffic that only occludes and collides."""
+    net: File
+    """Network (`.net.xml`, as of netconvert or netgenerate)."""
+    routes: tuple[File, ...] = Field(default=(), max_length=100)
+    """Routes, trips and flows (`.rou.xml`)."""
+    additional: tuple[File, ...] = Field(default=(), max_length=100)
+    """Further files (`.add.xml`): polygons, points of interest, types of vehicles."""
+    warm_up: NonNegative = 60.0
+    """Traffic before the episode begins, s."""
+    posts: bool = True
+    """Whether a landmark stands at the right of the stop line of every road into a junction."""
+    post_height: Positive = 3.0
+    """m"""
+    landmarks: Word = "landmark"
+    """Points of interest whose type begins so are landmarks, at their parameter `height` or `post_height`."""
+    buildings: Word = "building"
+    """Polygons whose type begins so are obstacles, up to their parameter `height` or `building_height`."""
+    building_height: Positive = 10.0
+    """m"""
+    options: dict[str, Setting] = Field(default={})
+    """SUMO's own options by name; those that follow from settings of this file are not repeated here."""
+    included: bool = False
+    """Whether this file has the roads, landmarks, buildings and routes of SUMO's files; written by coopenv."""
+
+
+class Program(Cosimulator):
+    """A program of the user's own."""
+
+    title = "the program"
+    program = "coopenv.backends.cosimulation:own_program"
+
+    code: Annotated[str, Field(min_length=1, max_length=1_000, pattern=":")]
+    """Class that is made from the scenario, `file.py:Class`."""
+    options: dict[str, Setting] = Field(default={})
+    """Further arguments of the class, by name."""
+
+
+COSIMULATORS: Mapping[str, type[Cosimulator]] = {"highway": Highway, "sumo": Sumo, "program": Program}
+"""By their names in `backend`, which are fields of `Scenario`."""
+
+
+FILES: Mapping[str, tuple[str, ...]] = {"sumo": ("net", "routes", "additional"), "program": ("code",)}
+"""Keys of sections that name files or code of the user's own."""
