@@ -59,7 +59,7 @@ def _has_arrays(kind: Any) -> bool:
     return any(isinstance(field.type, wp.array) or _has_arrays(field.type) for field in fields)
 
 
-_generate = codegen.codegen_kernel
+_generate: Any = codegen.codegen_kernel
 
 
 def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
