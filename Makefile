@@ -132,8 +132,9 @@ gpu: ## on a machine with a GPU: CUDA tests, CPU against CUDA, throughput, a tra
 schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors complete from
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json
 
-pages: $(VENV)/.base ## write the pages of the environments; MEASURE=--measure for their figures, too
+pages: $(VENV)/.base ## write the pages of the environments and the replay of the home page; MEASURE=--measure for their figures, too
 	@$(BIN)/coopenv page --all $(MEASURE) --out docs/environments
+	@$(BIN)/python -m sitegen.replay
 
 clean: ## remove the virtual environment and all results
 	@rm -rf $(VENV) .venv-gpu .venv-ros1 out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 Agent = Annotated[
     str | None,
     typer.Option(
-        help="Driver: zero, random, the name of an agent, its folder, or mine.py:Mine (default: route_follower, "
-        "where it can drive).",
+        help="Driver: zero, random, the name of an agent, its folder, or mine.py:Mine (default: look_ahead or peek, if "
+        "made for the environment; else route_follower, where it can drive).",
         **options.POLICY,
     ),
 ]
@@ -66,9 +66,9 @@ class SceneOptions(options.SourceOptions):
 
     def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
         """Return who drives in a scenario, and its name. Raises CoopenvError: it cannot drive here."""
-        from coopenv.runs.scenes import driver_of
+        from coopenv.runs.scenes import LOOKING, driver_of
 
-        return driver_of(self.agent, scenario, self.environment, self.seed)
+        return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
 
     def saved(self) -> "SceneRecord | None":
         """Return the scene of an earlier run; None: the source is no such run.
@@ -233,12 +233,6 @@ class ViewOptions(SceneOptions):
 
         watching = {} if self.observer is None else {"observer.name": self.observer}
         return open_svea(self.deployment, None, {**self.changes, **watching, **(more or {})}, connect=self.connect)
-
-    def driver(self, scenario: "Scenario") -> "tuple[Policy | None, str]":
-        """Return who drives, as of other commands; where none is asked for, one that keeps landmarks in view."""
-        from coopenv.runs.scenes import LOOKING, driver_of
-
-        return driver_of(self.agent, scenario, self.environment, self.seed, LOOKING)
 
     def reel(self) -> "Reel":
         """Return the source of frames; cars are observed and not driven.

@@ -129,7 +129,7 @@ def test_the_live_view_can_be_worked(
     box = page.get_by_label("Observer", exact=True)
     box.click()
     page.get_by_role("option", name="dead_reckoning").click()
-    page.get_by_text("observer dead").wait_for(timeout=30_000)
+    page.get_by_text("observer dead").wait_for(timeout=120_000)
     page.wait_for_timeout(1500)
     assert colours(page) > 8
     checked(watched)
