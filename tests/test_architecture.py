@@ -91,7 +91,7 @@ LINES_AND_FILES = {
     "base": (1630, 11),
     "bench": (5290, 20),
     "cars": (10525, 47),
-    "cli": (2520, 8),
+    "cli": (2510, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
     "observers": (11820, 47),
