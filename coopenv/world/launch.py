@@ -124,6 +124,7 @@ WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between 
 VEHICLES_PER_THREAD = 64
 """Of a world. Two threads run one world of 64, 128, 256 and 1,024 vehicles with `riccati` 1.3, 1.4, 1.6 and 1.9 times
 as fast as one, by the CPU time of the slower thread."""
+VEHICLES_PER_LEVEL = 8  # and lane; smaller levels (`coopenv.world.step.Turns`) are taken in turn
 
 
 @cache

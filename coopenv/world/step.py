@@ -6,7 +6,7 @@ simulated worlds (`Embedded.fused`) one kernel, `advance`, runs all ticks of a d
 
 A thread takes a world with all its vehicles, or every `lanes`-th vehicle of a world. The stages of `sense` are then
 launches of their own, and so is `finish`. `follow` is launched once, as what is received has been sent at earlier
-ticks; or, without a delay of the radio, level by level (`find_levels`).
+ticks; or, without a delay of the radio, level by level (`Turns`).
 """
 
 from functools import cache
@@ -20,7 +20,7 @@ from coopenv.world.launch import module_kernels
 from coopenv.world.model import Precision, model_struct
 from coopenv.world.nearby import sender_of
 from coopenv.world.quality import sample_gramian
-from coopenv.world.state import state_struct
+from coopenv.world.state import array, state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
 from coopenv.world.v2x import count_bytes, deliver, forget_everything
 from coopenv.world.warp_internals import device_function, host_only
@@ -42,6 +42,19 @@ def finish_tick(model: Any, state: Any, world: int, tick: int):
         for vehicle in range(model.vehicles):
             state.last_command[world, vehicle] = state.command[world, vehicle]
     state.tick[world] = tick
+
+
+@wp.struct
+class Turns:
+    """The order in which the vehicles of a world take their turns in a tick: level by level, then leaders first.
+
+    A vehicle is one level above the highest sender whose message of this very tick arrives at it.
+    """
+
+    vehicle: array("WN", wp.int32)  # in this order
+    first: array("WD", wp.int32)  # places in it at which levels begin, N behind the last level; D = N + 1
+    level: array("WN", wp.int32)  # of each vehicle; scratch of `find_levels`
+    due: array("WF", wp.int32)  # the levels that `follow` takes: from the first of F = 2 numbers up to the second
 
 
 MOVE, ARRANGE, LOOK = 1, 2, 4
@@ -136,25 +149,21 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
     The latter serve observers that are plug-ins (`coopenv.observers.kernel_observer`).
     """
     Model, State, Memory, Hold = model_struct(p), state_struct(p), observer.memory, wp.array(dtype=wp.int32)
-    Levels = wp.array2d(dtype=wp.int32)
     follow_tick, estimate_pose = _follow_tick(observer), observer.estimate
     start_vehicle, send_message = observer.start, observer.send
 
-    def follow(
-        model: Model, state: State, memory: Memory, hold: Hold, levels: Levels, level: int, first: int, lanes: int
-    ):
-        """Let every vehicle of a level receive, estimate and send. One thread per world and lane.
+    def follow(model: Model, state: State, memory: Memory, hold: Hold, turns: Turns, ends: int, first: int, lanes: int):
+        """Let every vehicle of the levels that are due receive, estimate and send. One thread per world and lane.
 
-        A single lane also ends the tick.
+        With `ends` the tick ends thereby.
         """
         world, lane = wp.tid()
         if is_active(model, state, hold, world):
             now = regular_tick(model, state.tick[world] + 1)
-            for place in range(first + lane, model.vehicles, lanes):
-                vehicle = model.order[place]
-                if levels[world, vehicle] == level:
-                    follow_tick(model, state, memory, world, vehicle, now)
-            if lanes == 1:
+            begin = turns.first[world, turns.due[world, 0]] + first + lane
+            for place in range(begin, turns.first[world, turns.due[world, 1]], lanes):
+                follow_tick(model, state, memory, world, turns.vehicle[world, place], now)
+            if ends == 1:
                 finish_tick(model, state, world, now.tick)
 
     def start(model: Model, state: State, memory: Memory, mask: Hold):
@@ -268,20 +277,29 @@ def host_kernels(p: Precision) -> Kernels:
         if is_active(model, state, hold, world):
             finish_tick(model, state, world, state.tick[world] + 1)
 
-    def find_levels(model: Model, state: State, hold: Hold, levels: wp.array2d(dtype=wp.int32)):
-        """Write the levels of vehicles in the next tick. One thread per world.
-
-        A vehicle is one level above the highest sender whose message of this very tick arrives at it.
-        """
+    def find_levels(model: Model, state: State, hold: Hold, turns: Turns):
+        """Sort the vehicles by their levels in the next tick. One thread per world."""
         world = wp.tid()
-        if is_active(model, state, hold, world):
-            tick = state.tick[world] + 1
-            for place in range(model.vehicles):
-                vehicle = model.order[place]
-                level = int(0)
-                for box in range(state.arriving.shape[2]):
-                    if state.arriving[world, vehicle, box] == tick:
-                        level = wp.max(level, levels[world, sender_of(model, state, world, vehicle, box)] + 1)
-                levels[world, vehicle] = level
+        if not is_active(model, state, hold, world):
+            return
+        for n in range(model.vehicles + 1):
+            turns.first[world, n] = 0
+        for place in range(model.vehicles):
+            vehicle = model.order[place]
+            level = int(0)
+            for box in range(state.arriving.shape[2]):
+                if state.arriving[world, vehicle, box] == state.tick[world] + 1:
+                    level = wp.max(level, turns.level[world, sender_of(model, state, world, vehicle, box)] + 1)
+            turns.level[world, vehicle] = level
+            turns.first[world, level + 1] += 1
+        for n in range(model.vehicles):
+            turns.first[world, n + 1] += turns.first[world, n]
+        for place in range(model.vehicles):
+            level = turns.level[world, model.order[place]]
+            turns.vehicle[world, turns.first[world, level]] = model.order[place]
+            turns.first[world, level] += 1
+        for back in range(model.vehicles):  # now they are where levels end
+            turns.first[world, model.vehicles - back] = turns.first[world, model.vehicles - back - 1]
+        turns.first[world, 0] = 0
 
     return module_kernels("host", p, receive, broadcast, finish, find_levels)

@@ -1,6 +1,7 @@
 """A batch of worlds on a device: allocate, reset by mask, advance, save and restore."""
 
 from collections.abc import Hashable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.launch import Call, Launcher, PerLane, PerWorld, threads_and_lanes
+from coopenv.world.launch import VEHICLES_PER_LEVEL, Call, Launcher, PerLane, PerWorld, threads_and_lanes
 from coopenv.world.model import check_device, device_memory, mat66d, precision
 from coopenv.world.random import NOT_SET
 from coopenv.world.state import (
@@ -36,6 +37,7 @@ from coopenv.world.step import (
     MOVE,
     SENSE,
     Kernels,
+    Turns,
     fused_kernels,
     host_kernels,
     observer_kernels,
@@ -117,7 +119,10 @@ class World:
         """What the embedded observer remembers besides the state."""
         others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
         self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
-        self._levels = wp.zeros((worlds, N), dtype=wp.int32, device=self.device)  # see `find_levels`
+        self._turns = allocate(Turns, {**sizes, "D": N + 1, "F": 2}, self.device)
+        self._turns.vehicle.assign(np.tile(self.model.order.numpy(), (worlds, 1)))
+        self._turns.first.assign(np.tile(np.minimum(np.arange(N + 1), 1) * N, (worlds, 1)))
+        self._set_due(0, 1)
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
@@ -212,7 +217,7 @@ class World:
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
             decide = sensing["decide"], [self.model, PerWorld(self.state), PerWorld(self.actions), hold]
-            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), self._follow())
+            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), self._follow(1))
         self.check_room()
 
     def _advance_in_lanes(self, ticks: int) -> None:
@@ -224,21 +229,39 @@ class World:
                 self.launch.by_lane("look and follow", self._sense(LOOK), self._follow())
             else:
                 self.launch.by_lane("look", self._sense(LOOK))
-                levels = host_kernels(self.precision)["find_levels"]
-                self._run("levels", levels, PerWorld(self.mask), PerWorld(self._levels))
-                for level in range(int(self._levels.numpy().max()) + 1):
-                    self.launch.by_lane(("follow", level), self._follow(level))
+                self._follow_by_level()
             self.finish()
+
+    def _follow_by_level(self) -> None:
+        """Let vehicles follow, those of a large level at once; small levels are not worth the handing over."""
+        self._run("levels", host_kernels(self.precision)["find_levels"], PerWorld(self.mask), PerWorld(self._turns))
+        sizes = np.trim_zeros(np.diff(self._turns.first.numpy()).sum(axis=0), "b")
+        large = (sizes >= VEHICLES_PER_LEVEL * self.launch.lanes) | (self.device != "cpu")
+        changes = np.flatnonzero(large[1:] | large[:-1]) + 1
+        for first, last in pairwise([0, *changes.tolist(), len(sizes)]):
+            self._set_due(first, last)
+            if large[first]:
+                self.launch.by_lane("follow", self._follow())
+            else:
+                follow, arguments = self._follow()
+                self.launch("follow in turn", follow, [*arguments, 0, 1], (1,))
+
+    def _set_due(self, first: int, last: int) -> None:
+        """Set the levels whose vehicles follow next."""
+        if self.device == "cpu":
+            self._turns.due.numpy()[...] = first, last
+        else:
+            self._turns.due.assign(np.full((self.worlds, 2), (first, last), dtype=np.int32))
 
     def _sense(self, stages: int) -> Call:
         """Return the launch of stages of a tick before observers."""
         sense = source_kernels(self.source, self.precision)["sense"]
         return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
 
-    def _follow(self, level: int = 0) -> Call:
-        """Return the launch of the observers of a level."""
-        follow, worlds = observer_kernels(self.observer, self.precision)["follow"], PerWorld(self.state)
-        return follow, [self.model, worlds, self._memories, PerWorld(self.mask), PerWorld(self._levels), level]
+    def _follow(self, ends: int = 0) -> Call:
+        """Return the launch of the observers; with `ends` it ends the tick."""
+        follow, state = observer_kernels(self.observer, self.precision)["follow"], PerWorld(self.state)
+        return follow, [self.model, state, self._memories, PerWorld(self.mask), PerWorld(self._turns), ends]
 
     def _move(self) -> None:
         """Move the truth to the next tick, in lanes."""

@@ -25,6 +25,7 @@ STREETS: dict[str, dict[str, Any]] = {
 @pytest.fixture
 def _small_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "VEHICLES_PER_THREAD", 1)
+    monkeypatch.setattr("coopenv.world.world.VEHICLES_PER_LEVEL", 2)  # some levels at once, some in turn
 
 
 @pytest.mark.parametrize("variant", STREETS)
@@ -81,7 +82,9 @@ def test_levels_are_the_longest_chains_of_messages() -> None:
     reset(world, [0])
     world.advance(5)
     levels = [longest_chain(world, vehicle, 5) for vehicle in range(64)]
-    assert world._levels.numpy()[0].tolist() == levels
+    turns, first = world._turns.vehicle.numpy()[0], world._turns.first.numpy()[0]
+    assert turns.tolist() == np.argsort(levels, kind="stable").tolist()
+    assert first.tolist() == np.searchsorted(np.sort(levels), np.arange(65)).tolist()
     assert max(levels) > 1
 
 
