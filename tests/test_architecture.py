@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3555, 14),
     "training": (1385, 5),
     "viz": (4800, 19),
-    "world": (5185, 19),
+    "world": (5225, 19),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 
