@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = {page.name: page for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))}
 RUN = {"README.md", "agents.md", "backends.md", "data.md", "draws.md", "highway.md"}
-RUN |= {"outputs.md", "replay.md", "terms.md", "trainers.md", "view.md"}
+RUN |= {"outputs.md", "replay.md", "sumo.md", "terms.md", "trainers.md", "view.md"}
 """Pages whose programs are run below."""
 
 
@@ -160,6 +160,14 @@ def test_the_page_on_draws() -> None:
 
 
 @pytest.mark.slow
+def test_the_page_on_sumo() -> None:
+    pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
+    (hands,) = run(DOCS / "sumo.md")
+    assert hands["program"] is hands["env"].engine.world.programs[0]
+    (text,) = tables("sumo.md")
+    assert {*tomllib.loads(text)["sumo"]} <= {*type(load_scenario("sumo_crossing").sumo).model_fields}
+
+
 def test_the_page_on_highway(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("highway_env", reason="needs the extra 'highway'")
     roundabout, estimates = run(DOCS / "highway.md")
