@@ -8,6 +8,7 @@ import inspect
 import json
 import math
 import tomllib
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.table import Table
 
-from coopenv.base.errors import CoopenvError, check_one_of, listed
+from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.base.installation import data_directory, is_reference, versions
 from coopenv.bench.executors import Local
@@ -88,7 +89,8 @@ class Frozen:
         defined = {about["name"]: about for about in self.definition["scenes"]}
         for name in names:
             check_one_of("unknown scene", name, defined)
-        return [self._scene(about) for name, about in defined.items() if not names or name in names]
+        with warnings.catch_warnings(action="ignore", category=ScenarioWarning):  # scenes are as they are
+            return [self._scene(about) for name, about in defined.items() if not names or name in names]
 
     def _scene(self, about: Mapping[str, Any]) -> FrozenScene:
         fault, policy = about.get("fault", ""), about.get("policy")
@@ -235,8 +237,7 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
         error = in_parentheses(total["rmse_m"], total["rmse_se_m"])
         totals.add_row(mark + total["observer"], error, *figures, *counts, *costs)
     yield totals
-    yield f"*: this run. Geometric means over {len(result['scenes'])} scenes; a failure or more than 5 m counts as 5 m."
-    yield ""
+    yield f"*: new. Geometric means over {len(result['scenes'])} scenes; failures and errors above 5 m count as 5 m.\n"
     names = [*own, *(name for name in SHOWN if any(row["observer"] == name for row in zoo))]
     cells = {(row["scene"], row["observer"]): row for row in [*zoo, *result["rows"]]}
     scenes = number_table(["RMSE [m]"], ["bound", *map(short_name, names)])
