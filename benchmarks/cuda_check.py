@@ -26,8 +26,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.engine import Engine
+from coopenv.backends.cosimulation_kernels import COSIMULATED
 from coopenv.backends.feed import RECORDED
-from coopenv.backends.simulated import COSIMULATED
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.format import json_text
