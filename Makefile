@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train test-sumo agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train test-sumo agents test-all test-matrix test-browser docs site-version notebooks names lint format bench stages cuda-check gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -124,6 +124,13 @@ bench: $(VENV)/.base ## measure steps per second
 
 stages: $(VENV)/.base ## measure what a vehicle tick costs, stage by stage
 	@$(BIN)/python -m benchmarks.stages
+
+$(VENV)/.cuda: $(VENV)/.dev
+	@$(PIP) --no-deps nvidia-cuda-nvcc
+	@touch $@
+
+cuda-check: $(VENV)/.cuda ## compile all kernels for three GPUs without one, and hold their limits; CUDA_OPTIONS=...
+	@$(BIN)/python -m benchmarks.cuda_check $(CUDA_OPTIONS)
 
 gpu: ## on a machine with a GPU: CUDA tests, CPU against CUDA, throughput, a training; DEVICE=cuda:1, WHEELS=DIR
 	@$(PYTHON) -m benchmarks.gpu.prepare .venv-gpu $(if $(WHEELS),--wheels $(WHEELS))

@@ -1,0 +1,106 @@
+"""`make cuda-check`: what is compiled, what ptxas reports, what is kept, and which limits hold; without a GPU."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import warp as wp
+
+from benchmarks.cuda_check import PRECISIONS, assembler, beyond, catalogue, check_module, limits, main, parsed
+from coopenv.base.errors import CoopenvError
+from coopenv.observers.registry import ZOO
+
+SMALL, ELF_OF_CUDA = "coopenv.host.float32", 190
+
+
+def has_ptxas() -> bool:
+    try:
+        return bool(assembler())
+    except CoopenvError:
+        return False
+
+
+needs_ptxas = pytest.mark.skipif(not has_ptxas(), reason="needs ptxas: make cuda-check installs it")
+
+
+@pytest.fixture(scope="module")
+def modules() -> dict[str, Any]:
+    return catalogue("float32")
+
+
+def test_every_module_has_limits(modules: dict[str, Any]) -> None:
+    assert {name.removeprefix("coopenv.") for p in PRECISIONS for name in catalogue(p)} == set(limits())
+    for name in (name for name, entry in ZOO.items() if entry.kernels):
+        assert any(name in module for module in modules), name
+
+
+def test_the_most_demanding_kernel_counts() -> None:
+    report = """
+ptxas info    : Compiling entry function 'a' for 'sm_90'
+ptxas info    : Function properties for a
+    0 bytes stack frame, 8 bytes spill stores, 4 bytes spill loads
+ptxas info    : Used 40 registers, used 0 barriers
+ptxas info    : Compiling entry function 'b' for 'sm_90'
+ptxas info    : Function properties for b
+    96 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
+ptxas info    : Used 32 registers, used 0 barriers, 720 bytes cumulative stack size
+ptxas info    : Function properties for of_b
+    0 bytes stack frame, 16 bytes spill stores, 16 bytes spill loads
+"""
+    assert parsed(report) == {"registers": 40, "stack": 720, "spills": 32}
+    with pytest.raises(CoopenvError, match="no kernel"):
+        parsed("ptxas info    : 0 bytes gmem")
+
+
+def test_what_is_above_a_limit_is_a_line() -> None:
+    row = {"module": "a", "arch": 90, "ptx_bytes": 10, "registers": 255, "stack": 100, "spills": 0}
+    allowed = {"ptx_bytes": 10, "registers": 255, "stack": 100, "spills": 0}
+    assert not beyond([row], {"a": allowed})
+    assert beyond([row], {"a": {**allowed, "stack": 99}}) == ["a, sm_90: stack 100, at most 99"]
+    assert beyond([row, row], {}) == ["a: no limits in cuda_limits.csv"]
+
+
+@needs_ptxas
+def test_code_is_where_warp_looks_for_it_and_is_made_once(modules: dict[str, Any], tmp_path: Path) -> None:
+    """An interrupted run goes on with the architecture that is missing; what is there is not compiled again."""
+    module, ptxas = modules[SMALL], assembler()
+    rows = check_module(module, tmp_path, [80], ptxas)
+    name = module.get_module_identifier()
+    code = (tmp_path / name / f"{name}.sm80.cubin").read_bytes()
+    assert code[:4] == b"\x7fELF" and int.from_bytes(code[18:20], "little") == ELF_OF_CUDA
+    assert (tmp_path / name / f"{name}.meta").exists()
+    assert check_module(module, tmp_path, [80], "no ptxas") == rows
+    both = check_module(module, tmp_path, [80, 90], ptxas)
+    assert both[0] == rows[0] and [row["arch"] for row in both] == [80, 90]
+    assert not beyond(both, limits())
+    shutil.rmtree(tmp_path / name)
+    assert check_module(module, tmp_path, [80], ptxas)[0]["registers"] == rows[0]["registers"]
+
+
+@needs_ptxas
+def test_records_are_not_copied(modules: dict[str, Any], tmp_path: Path) -> None:
+    """The records of a world have 9 kB; a thread that moves it has far less."""
+    (row,) = check_module(modules["coopenv.dead_reckoning.float32"], tmp_path, [90], assembler())
+    assert row["stack"] < 1000
+
+
+def test_mistakes_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["--only", "nothing", "--dtype", "float32", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == "error: --only: no module has 'nothing' in its name\n"
+    monkeypatch.setattr("benchmarks.cuda_check.metadata.files", lambda name: None)
+    assert main(["--only", "host", "--dtype", "float32", "--out", str(tmp_path)]) == 2
+    assert "pip install --no-deps nvidia-cuda-nvcc" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@needs_ptxas
+def test_all_limits_hold_on_one_architecture(tmp_path: Path) -> None:
+    assert main(["--arch", "90", "--out", str(tmp_path)]) == 0
+    assert len([*(tmp_path / wp.config.version).glob("wp_coopenv.*/*.sm90.cubin")]) == len(limits())
+    assert len(json.loads((tmp_path / "cuda_check.json").read_text())["rows"]) == len(limits())
