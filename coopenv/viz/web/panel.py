@@ -92,7 +92,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 SPEEDS = {text: float(text) for text in ("0.1", "0.25", "0.5", "1", "2", "4", "8")}
 MAGNIFICATIONS = {text: float(text) for text in ("1", "10", "100")}
-_CELL = "padding:2px 5px;text-align:right"
+_CELL = "padding:2px;text-align:right"
 NONE_PICKED = "none"
 _PICK = "*Pick a vehicle above, or click on one in the scene.*"
 NO_FAULT = "none"
@@ -331,7 +331,7 @@ def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
         rows.append(f'<tr><td style="white-space:nowrap">{mark}</td>{numbers}</tr>')
     style = "width:100%;font:12px/1.3 ui-monospace,monospace;border-collapse:collapse"
     whole = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
-    return f'<div style="padding:2px 14px;max-height:260px;overflow:auto">{whole}</div>'
+    return f'<div style="padding:2px 8px;max-height:260px;overflow:auto">{whole}</div>'
 
 
 def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
