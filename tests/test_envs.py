@@ -18,7 +18,13 @@ from coopenv.base.installation import environment_id
 from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_actions, rendering, rollout
 
 ENVS = coopenv.list_envs()
-short = cache(partial(coopenv.load_scenario, overrides={"horizon": 6.0}))
+SMALLER = {"city": {"streets.blocks": [2, 2], "vehicles.0.count": 8, "vehicles.1.count": 4}}
+"""What makes large environments quick to test."""
+
+
+@cache
+def short(name: str) -> coopenv.Scenario:
+    return coopenv.load_scenario(name, {"horizon": 6.0, **SMALLER.get(name, {})})
 
 
 @pytest.fixture(scope="module", params=ENVS)

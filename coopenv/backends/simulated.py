@@ -106,11 +106,11 @@ class Simulated(TickGenerator):
         """Simulate one world in float64, without an observer: deliveries do not depend on the contents of messages."""
         if self._world is None:
             self._world = self.kind(self.scenario, 1, "float64", threads=1)
-        world = self._world
+        world, acting = self._world, [vehicle.motion.kind != "traffic" for vehicle in self.scenario.vehicles]
         world.reset(None if seed is None else [seed])
         command = yield world.full_tick(0)
         for k in range(1, self.scenario.horizon_ticks + 1):
-            world.view("command")[0] = command.rows
+            world.view("command")[0, acting] = command.rows[acting]
             world.fetch()
             world.sense()
             for vehicle in world.observer_init.order:

@@ -27,8 +27,8 @@ from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS
 from coopenv.viz.scene import Origin
 from coopenv.viz.topview import TopView
 
-FPS, WIDTH = 6.0, 448
-"""Of a film: pictures a second, and their width in pixels."""
+FORMATS, MOST_BYTES = ((6.0, 448), (3.0, 320), (3.0, 240)), 280_000
+"""Of films: pictures a second, and their width in pixels; the first that makes no larger file is taken, or the last."""
 _LASTS = 8.0  # s, at most
 _SEED = 0
 _IDLE = "zero"  # the driver of a scene without a route
@@ -55,7 +55,10 @@ def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Ca
         source = Origin.of(name, scenario, policy=driver, seed=_SEED)
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
     speed = max(1.0, record.length / _LASTS)
-    write_film(top_view_film(record, False), path, FPS, speed, WIDTH, lambda share: on_progress(0.5 + share / 2))
+    for fps, width in FORMATS:
+        write_film(top_view_film(record, False), path, fps, speed, width, lambda share: on_progress(0.5 + share / 2))
+        if path.stat().st_size <= MOST_BYTES:
+            break
 
 
 def _moves(scenario: Scenario, driver: str) -> bool:
@@ -152,15 +155,20 @@ def read_value_of_sensing(path: Path) -> dict[str, Any] | None:
         return None
     try:
         value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        _rows(value)
-        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "rows")}
+        if "text" not in value:
+            _rows(value)
+        return {key: value[key] for key in ("coopenv", "worlds", "scenario", "text" if "text" in value else "rows")}
     except (OSError, ValueError, KeyError, TypeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise CoopenvError(f"{path}: no figures of a page ({why}); --measure makes them anew") from None
 
 
 def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[str, Any]) -> str:
-    """Return the figures in Markdown, with the commands that give them."""
+    """Return the figures in Markdown, with the commands that give them; `text` is what a benchmark has written."""
+    changed = value["scenario"] != fingerprint(scenario)
+    if "text" in value:
+        note = "*The environment has changed since these figures were measured.*\n\n" if changed else ""
+        return f"{note}{value['text']}"
     return rendered(
         "sensing.md.j2",
         environment=environment,
@@ -169,7 +177,7 @@ def value_of_sensing_text(environment: str, scenario: Scenario, value: Mapping[s
         rows=_rows(value),
         worlds=value["worlds"],
         coopenv=value["coopenv"],
-        changed=value["scenario"] != fingerprint(scenario),
+        changed=changed,
     ).strip()
 
 
@@ -257,6 +265,8 @@ def plain(text: str) -> str:
 
 GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
 """Facts that no table below repeats."""
+MOST_ROWS = 40
+"""Of a table of vehicles, routes, landmarks or buildings."""
 TOLD = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
 """Settings that other tables tell, as they tell the weights."""
 
@@ -298,7 +308,10 @@ def _scene(scenario: Scenario) -> Iterator[str]:
         yield bullets(lines)
     for listing in scenario_text.scene(scenario, grouped=False):
         yield f"## {listing.title}"
-        yield table(listing.columns, listing.rows)
+        rows = list(listing.rows)
+        if len(rows) > MOST_ROWS:
+            rows[MOST_ROWS:] = [(f"{len(rows) - MOST_ROWS} more", *[""] * (len(listing.columns) - 1))]
+        yield table(listing.columns, rows)
     yield "## Settings"
     yield "Those that differ from the default."
     rows = [

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from coopenv.api.terms.layout import row_counts
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 
@@ -23,8 +24,11 @@ def at_arc_lengths(points: np.ndarray, distance: np.ndarray, s: np.ndarray) -> n
 def right_of_way(scenario: Scenario) -> np.ndarray:
     """Return over whose messages each vehicle has the right of way, (N, N - 1): of driven vehicles after it in order.
 
-    None, where some driven vehicle does not receive another one's messages.
+    None, where some driven vehicle does not receive another one's messages. With `topology.most_nearby` the senders are
+    not known, so there are (N, M) for the M kept ones, and none.
     """
+    if scenario.topology.most_nearby is not None:
+        return np.zeros((len(scenario.vehicles), row_counts(scenario)["neighbour"]), dtype=bool)
     driven = np.array([vehicle.motion.kind == "driven" for vehicle in scenario.vehicles])
     first, landmarks = np.triu(driven[:, None] & driven, 1), len(scenario.landmarks)
     if scenario.v2x.links != "all":

@@ -176,6 +176,8 @@ class RouteFollower(Driver):
         """(N, N - 1), whether a vehicle has the right of way over the sender of each message."""
         traffic = [vehicle.motion.kind == "traffic" for vehicle in scenario.vehicles]
         self.traffic = np.array([traffic[:i] + traffic[i + 1 :] for i in range(len(traffic))])
+        if scenario.topology.most_nearby is not None:
+            self.traffic = np.zeros_like(self.goes_first)  # as the senders are not known
         """(N, N - 1), which senders are cars of a backend's traffic."""
         self.discs = np.zeros(1) if nimble else discs_along(self.length, self.width)
         """Centres of the discs that cover a car, m ahead of its reference point; a nimble car is one disc."""

@@ -85,6 +85,7 @@ def start(vehicle: Vehicle) -> str:
         pose.position and (orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"),
         any(pose.position_spread) and f"+- {vector(pose.position_spread)}",
         pose.yaw_spread and f"+- {number(math.degrees(pose.yaw_spread))} deg",
+        vehicle.entry and f"appears after {' to '.join(map(number, vehicle.entry))} s",
     )
 
 
@@ -162,6 +163,8 @@ def size(edges: Sequence[float]) -> str:
 
 def neighbours(scenario: Scenario) -> list[str]:
     """Return, per vehicle, the names of the targets that it may measure."""
+    if scenario.keeps_those_in_range:
+        return ["what is in range"] * len(scenario.vehicles)
     L, result = len(scenario.landmarks), []
     for indices in neighbour_sets(scenario):
         names = [scenario.target_names[index] for index in indices]
@@ -199,10 +202,13 @@ def drawn(s: Scenario) -> Iterator[str]:
     moving = [*s.vehicles, *s.landmarks]
     yield from _spans("pace of a prescribed motion", moving, lambda m: 100.0 * m.pace_spread, "%", "+- ")
     yield from _absent("a vehicle", s.vehicles)
+    alike: dict[tuple[int, str], list[str]] = {}
     for group in s.landmark_groups:
         sort, count = ("areas", len(group.boxes)) if group.boxes else ("lines", len(group.lines))
         where = f"{count} {sort}" if count > 1 else f"one {sort.removesuffix('s')}"
-        yield f"the places of {group.count} landmarks `{group.name}`, over {where}"
+        alike.setdefault((group.count, where), []).append(f"`{group.name}`")
+    for (count, where), names in alike.items():
+        yield f"the places of {count} landmarks {listed(names)}, over {where}"
     yield from _spans("place of a landmark along an axis", s.landmarks, lambda m: max(m.position_spread), "m", "+- ")
     yield from _absent("a landmark", s.landmarks)
     beliefs = [vehicle.initial_estimate for vehicle in s.vehicles]

@@ -137,7 +137,10 @@ class DrivenMotion(Section):
 
 
 class TrafficMotion(Section):
-    """Driven by the traffic of a backend that has one (`backend = "highway"`), not by actions."""
+    """Driven by a model of traffic, not by actions.
+
+    It is the backend's own, or in simulated worlds the intelligent driver model along the vehicle's routes.
+    """
 
     kind: Literal["traffic"] = "traffic"
 
@@ -255,8 +258,11 @@ class Vehicle(Section):
     """Chance that it is there, drawn at every reset; one vehicle is always left, a driven one where there is any."""
     pace_spread: Probability = 0.0
     """Half-width of a uniform factor about 1 of the pace of a prescribed motion, drawn at every reset."""
+    entry: tuple[NonNegative, NonNegative] | None = None
+    """First and last time at which it appears at its start, drawn uniformly, s (none: at the reset). It waits until no
+    other vehicle is near."""
     next_routes: tuple[str, ...] = Field(default=(), max_length=1000)
-    """Routes that may follow its routes where `termination.after_arrival` is `continue` (default: all)."""
+    """Routes that may follow its routes where `termination.after_arrival` is `continue` or `transit` (default: all)."""
     neighbours: tuple[str, ...] | None = None
     """Targets it may measure: landmark names and vehicle names (default: every landmark and every leader)."""
     goal: Goal | None = None
@@ -282,8 +288,11 @@ class Vehicle(Section):
     def _has_one_start_and_goal(self) -> Self:
         if self.motion.kind == "waypoints" and self.initial_pose is not None:
             raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
-        if self.routes and self.motion.kind != "driven":
-            raise ValueError(f"routes: for driven vehicles; the motion of this one is '{self.motion.kind}'")
+        drives = self.motion.kind in ("driven", "traffic")
+        if self.routes and not drives:
+            raise ValueError(f"routes: for driven vehicles and traffic; the motion of this one is '{self.motion.kind}'")
+        if self.entry and (not drives or self.entry[0] > self.entry[1]):
+            raise ValueError("entry: the first time, then the last one, of driven vehicles and traffic")
         for name, does in (("initial_pose", "starts on its route"), ("goal", "goes to the end of its route")):
             part = getattr(self, name)
             keys = ("position", "yaw", "quaternion_wxyz") if part is not None else ()

@@ -17,6 +17,8 @@ from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
 from coopenv.scenario.schema import Scenario
+from coopenv.scenario.streets import KEY as STREETS_KEY
+from coopenv.scenario.streets import Streets, with_streets
 from coopenv.scenario.sumo import with_sumo
 
 DEFAULTS_KEY = "vehicle_defaults"
@@ -24,6 +26,8 @@ DEFAULTS_KEY = "vehicle_defaults"
 
 COUNT_KEY = "count"
 """Key of an entry of `vehicles` that stands for so many equal ones."""
+COUNT_OVERRIDE = re.compile(r"vehicles\.(\d+|\*)\.count")
+"""Overrides of it, which number the entries of the file, other ones the vehicles that they stand for."""
 
 OVERRIDES = "overrides"
 """Where a field stands that an override has made wrong."""
@@ -68,11 +72,14 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
             raw = located(read_toml(path, ScenarioError, path.name), path.parent)
+        given = overrides or {}
+        counts = {key: value for key, value in given.items() if COUNT_OVERRIDE.fullmatch(str(key))}
+        override(raw, counts)
         repeat_vehicles(raw, path.name)
-        override(raw, overrides or {})
+        override(raw, {key: value for key, value in given.items() if key not in counts})
         repeat_vehicles(raw, OVERRIDES)
         raw = located(raw, Path.cwd())  # those of overrides
-        return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
+        return parse_scenario(with_streets(apply_vehicle_defaults(raw, path.name), path.name), path.name)
     except RecursionError:
         raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
     except ScenarioError as error:
@@ -201,7 +208,7 @@ REFERENCE = re.compile(r"#/\$defs/(\w+)")
 
 
 def schema_text() -> str:
-    """Return the schema of a file: that of `Scenario`, and the table of defaults that the loader merges.
+    """Return the schema of a file: that of `Scenario`, and the tables and keys that the loader works out.
 
     A vehicle may leave out what the defaults say, and the defaults what every vehicle says. Both are therefore
     checked for their keys and values, but not for completeness.
@@ -214,6 +221,7 @@ def schema_text() -> str:
         text = json.dumps({key: value for key, value in definitions[name].items() if key != "required"})
         definitions[f"Partial{name}"] = json.loads(partial.sub("#/$defs/Partial", text))
     schema["required"].remove("landmarks")  # which SUMO's files may have
+    schema["properties"][STREETS_KEY] = Streets.model_json_schema()
     schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
     about = "Of an entry of `vehicles`: so many equal ones."
     number = {"type": "integer", "minimum": 1, "maximum": MOST_VEHICLES, "description": about}

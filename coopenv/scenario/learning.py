@@ -207,9 +207,10 @@ class Termination(Section):
     """Reaching its goal ends the vehicle's episode."""
     off_route: Positive | None = None
     """A vehicle that is so far beside its route, or beyond an end of it, has left the road, and its episode ends, m."""
-    after_arrival: Literal["park", "leave", "continue"] = "park"
+    after_arrival: Literal["park", "leave", "continue", "transit"] = "park"
     """`park`: a vehicle that has arrived stands where it is; `leave`: it is gone from the next camera tick on;
-    `continue`: it draws a new route that starts where the old one ends, and its episode goes on to the horizon."""
+    `continue`: it draws a new route that starts where the old one ends, and its episode goes on to the horizon;
+    `transit`: likewise, and it leaves at the end of a route that none follows."""
     custom: dict[Annotated[str, AfterValidator(TERMINATION_CONDITIONS.free)], Term] = Field(default={})
     """Conditions of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False

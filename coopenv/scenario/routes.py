@@ -1,7 +1,7 @@
 """Routes that vehicles follow, prescribed motions, and where agents start."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from coopenv.base.sections import Section
-from coopenv.scenario.base import NonNegative, Vector2, rotation_of
+from coopenv.scenario.base import NonNegative, Positive, Vector2, rotation_of
 from coopenv.scenario.bodies import ConstantMotion, Landmark, SegmentMotion, Vehicle, WaypointMotion
 
 SPACING = 0.25  # m between the points of a route that is not straight ...
@@ -41,6 +41,19 @@ class Pieces:
     length: np.ndarray  # (n,) m
 
 
+class Signal(Section):
+    """A traffic light with a fixed cycle, which the model of traffic obeys."""
+
+    at: NonNegative
+    """Arc length of the stop line on the route as designed, m."""
+    period: Positive
+    """Duration of a cycle, s."""
+    start: NonNegative = 0.0
+    """Begin of the green time in every cycle, s."""
+    green: NonNegative
+    """Duration of the green time, s."""
+
+
 class Route(Section):
     """A way that vehicles are to go, of which every reset draws a variant."""
 
@@ -55,6 +68,7 @@ class Route(Section):
     """Largest further sideways deviation, m: two waves with random phases, which vanish at both ends."""
     start_spread: NonNegative = 0.0
     """The start is drawn uniformly along the first so many metres."""
+    signal: Signal | None = None
 
     @property
     def breadth(self) -> float:
@@ -140,11 +154,16 @@ def _problems(route: Route) -> Iterator[str]:
         yield f"start_spread: {route.start_spread:g} m must be below the route's length ({total:g} m)"
 
 
-def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:
-    """Return the numbers of the routes that may follow one: as designed they start within the radius of its end."""
-    end, radius = route.waypoints[-1], vehicle.goal_radius
-    near = [i for i, other in enumerate(routes) if math.dist(other.waypoints[0], end) <= radius]
-    return [i for i in near if not vehicle.next_routes or routes[i].name in vehicle.next_routes]
+def followers(vehicle: Vehicle, routes: Sequence[Route]) -> list[list[int]]:
+    """Return, per route, the numbers of those that may follow: as designed they start within the radius of its end."""
+    from scipy.spatial import cKDTree  # here, as names are looked up without SciPy
+
+    if not routes:
+        return []
+    starts, ends = (np.array([route.waypoints[end] for route in routes]) for end in (0, -1))
+    allowed = {i for i, route in enumerate(routes) if not vehicle.next_routes or route.name in vehicle.next_routes}
+    near = cKDTree(starts).query_ball_point(ends, vehicle.goal_radius, return_sorted=True)
+    return [[i for i in row if i in allowed] for row in near]
 
 
 SPLINE_STEP = 0.02
@@ -258,7 +277,7 @@ def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray, until: f
 BLOCK = 200_000  # pairs of boxes that are compared at a time; each takes some 400 bytes
 
 
-def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.ndarray, np.ndarray]:
+def start_of(agent: Landmark | Vehicle, routes: Mapping[str, Route]) -> tuple[np.ndarray, np.ndarray]:
     """Return the nominal start of an agent: position (3,) in the file's coordinates, rotation (3, 3).
 
     Of a vehicle with routes it is on the first of them.
@@ -268,16 +287,11 @@ def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.nda
     if isinstance(agent, Landmark):
         return np.array(agent.position), rotation_of(agent.yaw, None)
     if agent.routes:
-        return _beside(route_points(_routes_of(agent, routes)[0], np.zeros(1))[0], 0.0)
+        return _beside(route_points(routes[agent.routes[0]], np.zeros(1))[0], 0.0)
     pose = agent.initial_pose
     if pose is None or pose.position is None:  # the backend draws it
         return np.zeros(3), np.eye(3)
     return np.array(pose.position), rotation_of(pose.yaw, pose.quaternion_wxyz)
-
-
-def _routes_of(vehicle: Vehicle, routes: Sequence[Route]) -> list[Route]:
-    by_name = {route.name: route for route in routes}
-    return [by_name[name] for name in vehicle.routes]
 
 
 def _beside(point: np.ndarray, aside: float) -> tuple[np.ndarray, np.ndarray]:
@@ -335,10 +349,10 @@ def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def possible_boxes(vehicle: Vehicle, routes: Sequence[Route]) -> Boxes:
+def possible_boxes(vehicle: Vehicle, routes: Mapping[str, Route]) -> Boxes:
     """Return the boxes of a vehicle at its nominal start, which comes first, and at the corners of its spread."""
     nominal = [start_of(vehicle, routes)]
-    for route in _routes_of(vehicle, routes):
+    for route in [routes[name] for name in vehicle.routes]:
         spread = {0.0, route.lateral_spread, -route.lateral_spread}
         points = route_points(route, np.array([*{0.0, route.start_spread}]))
         nominal += [_beside(point, aside) for point in points for aside in spread]

@@ -52,7 +52,7 @@ class Scenario(Section):
     sumo: Sumo | None = None
     program: Program | None = None
     map: Map = Map()
-    routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
+    routes: tuple[Route, ...] = Field(default=(), max_length=20_000)
     roads: tuple[Road, ...] = Field(default=(), max_length=50_000)
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=50_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
@@ -225,17 +225,25 @@ def _misplaced(s: Scenario) -> Iterator[str]:
     elsewhere = s.cosimulator is not None
     title = s.cosimulator.title if s.cosimulator else ""
     for i, vehicle in enumerate(s.vehicles):
-        kind = vehicle.motion.kind
-        if elsewhere and kind not in ("driven", "traffic"):
-            yield f"vehicles.{i}.motion.kind: '{kind}' is not known to {title}; known: driven, traffic"
-        speed = getattr(vehicle.motion, "initial_speed", 0.0)
-        drawn = {"initial_pose": vehicle.initial_pose is not None, "motion.initial_speed": speed != 0.0}
-        for key in [key for key, given in drawn.items() if given] if elsewhere else ():
-            yield f"vehicles.{i}.{key}: {title} draws it; leave this out"
-        if not elsewhere and kind == "traffic":
-            yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = {' or '.join(COSIMULATORS)}"
-        if not elsewhere and kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
-            yield f"vehicles.{i}.initial_pose: needed, with at least a position"
+        misplaced = _moved_elsewhere(vehicle, title) if elsewhere else _moved_here(vehicle)
+        yield from (f"vehicles.{i}.{problem}" for problem in misplaced)
+
+
+def _moved_elsewhere(vehicle: Vehicle, title: str) -> Iterator[str]:
+    kind, speed = vehicle.motion.kind, getattr(vehicle.motion, "initial_speed", 0.0)
+    if kind not in ("driven", "traffic"):
+        yield f"motion.kind: '{kind}' is not known to {title}; known: driven, traffic"
+    drawn = {"initial_pose": vehicle.initial_pose, "motion.initial_speed": speed, "entry": vehicle.entry}
+    for key in [key for key, given in drawn.items() if given]:
+        yield f"{key}: {title} draws it; leave this out"
+
+
+def _moved_here(vehicle: Vehicle) -> Iterator[str]:
+    kind = vehicle.motion.kind
+    if kind == "traffic" and not vehicle.routes:
+        yield f"routes: needed by traffic, but for backend = {' or '.join(COSIMULATORS)}"
+    if kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
+        yield "initial_pose: needed, with at least a position"
 
 
 def _problems(s: Scenario) -> Iterator[str]:
@@ -245,13 +253,14 @@ def _problems(s: Scenario) -> Iterator[str]:
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}; known: {listed(targets)}"
-    names = [route.name for route in s.routes]
+    names = dict.fromkeys(route.name for route in s.routes)
     for key in ("routes", "landmark_groups"):
         yield from (f"{key}: the name '{name}' is used twice" for name in _twice(getattr(s, key)))
     for i, vehicle in enumerate(s.vehicles):
         for key in ("routes", "next_routes"):
             for name in [name for name in getattr(vehicle, key) if name not in names]:
-                yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
+                unknown = f"unknown route {shown(name)}{suggest(name, names)}"
+                yield f"vehicles.{i}.{key}: {unknown}; known: {listed([*names])}"
     yield from _problems_of_draws(s)
     if s.topology.most_nearby is not None:
         yield from _problems_of_nearby(s)
@@ -324,27 +333,32 @@ def _problems_of_draws(s: Scenario) -> Iterator[str]:
         return
     if not s.termination.arrival:
         yield f"termination.arrival: must be true where after_arrival is '{s.termination.after_arrival}'"
-    if s.termination.after_arrival == "continue":
+    if s.termination.after_arrival in ("continue", "transit"):
         yield from _problems_of_sequels(s)
 
 
 def _problems_of_sequels(s: Scenario) -> Iterator[str]:
     """Yield where a vehicle arrives and no route goes on."""
-    by_name = {route.name: route for route in s.routes}
+    number, seen = {route.name: i for i, route in enumerate(s.routes)}, set()
     for i, vehicle in enumerate(s.vehicles):
         if vehicle.goal is not None and not vehicle.routes:
-            yield f"vehicles.{i}.routes: needed by a vehicle with a goal where termination.after_arrival is 'continue'"
-        reached, new = set(), {*vehicle.routes}
+            key = f"vehicles.{i}.routes: needed by a vehicle with a goal where termination.after_arrival"
+            yield f"{key} is '{s.termination.after_arrival}'"
+        kind = vehicle.goal_radius, vehicle.next_routes, vehicle.routes
+        if s.termination.after_arrival == "transit" or kind in seen:
+            continue
+        seen.add(kind)
+        after = followers(vehicle, s.routes)
+        reached: set[int] = set()
+        new = {number[name] for name in vehicle.routes}
         while new:
             reached |= new
-            after = {name: followers(vehicle, by_name[name], s.routes) for name in new}
-            for name, sequels in after.items():
-                if not sequels:
-                    yield (
-                        f"vehicles.{i}: termination.after_arrival is 'continue', but no route that may follow starts "
-                        f"within {vehicle.goal_radius:g} m of the end of route '{name}'"
-                    )
-            new = {s.routes[k].name for sequels in after.values() for k in sequels} - reached
+            for route in [route for route in sorted(new) if not after[route]]:
+                yield (
+                    f"vehicles.{i}: termination.after_arrival is 'continue', but no route that may follow starts "
+                    f"within {vehicle.goal_radius:g} m of the end of route '{s.routes[route].name}'"
+                )
+            new = {k for route in new for k in after[route]} - reached
 
 
 def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
@@ -358,7 +372,7 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
     elif lonely:
         verb = "has" if len(lonely) == 1 else "have"
         yield f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed"
-    for landmark in s.landmarks:
+    for landmark in s.landmarks if s.observer.name == "riccati" else ():
         distance = float(np.linalg.norm(np.array(landmark.position) - np.array(s.map.origin)))
         if distance > FAR_FROM_ORIGIN:
             yield (
@@ -372,7 +386,8 @@ def _doubts(s: Scenario, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
 def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Return nominal start positions (A, 3) in the map frame and rotations (A, 3, 3), landmarks first."""
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    starts = [start_of(agent, scenario.routes) for agent in agents]
+    routes = {route.name: route for route in scenario.routes}
+    starts = [start_of(agent, routes) for agent in agents]
     return np.array([p for p, _ in starts]) - np.array(scenario.map.origin), np.array([R for _, R in starts])
 
 
@@ -381,7 +396,8 @@ def _check_room(s: Scenario) -> None:
 
     Vehicles with routes are drawn such that they do not touch, and need not be apart here.
     """
-    boxes = [possible_boxes(vehicle, s.routes) for vehicle in s.vehicles]
+    routes = {route.name: route for route in s.routes}
+    boxes = [possible_boxes(vehicle, routes) for vehicle in s.vehicles]
     if s.obstacles:
         walls = Boxes(
             np.array([o.center for o in s.obstacles]),
@@ -396,7 +412,7 @@ def _check_room(s: Scenario) -> None:
     fixed = [i for i, vehicle in enumerate(s.vehicles) if not vehicle.routes]
     if not fixed:
         return
-    starts = np.array([start_of(s.vehicles[i], s.routes)[0] for i in fixed])
+    starts = np.array([start_of(s.vehicles[i], routes)[0] for i in fixed])
     points = Boxes(starts, np.tile(np.eye(3), (len(starts), 1, 1)), np.full_like(starts, SAME_PLACE / 2))
     for second, first in overlapping_pairs(points, points)[:1].tolist():
         raise ValueError(_in_place(fixed[second], fixed[first]))

@@ -13,16 +13,13 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
-from coopenv.scenario.routes import compile_motion, even_points, followers, point_count
+from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count
 from coopenv.scenario.schema import agent_starts, neighbour_sets, processing_order
 from coopenv.scenario.sensing import Camera, Faults, Noise, Rates
 from coopenv.world.model import (
     BLIND,
-    CONTINUE,
     DRIVEN,
     IDEAL,
-    LEAVE,
-    PARK,
     PRESCRIBED,
     SENSED,
     STATIC,
@@ -32,7 +29,7 @@ from coopenv.world.model import (
 )
 from coopenv.world.warp_internals import field_types, scalar_of
 
-AFTER_ARRIVAL = {"park": PARK, "leave": LEAVE, "continue": CONTINUE}
+NO_SIGNAL = Signal(at=0.0, period=1.0, green=1.0)
 
 
 def routes_of(scenario: Scenario) -> dict[str, Any]:
@@ -43,6 +40,7 @@ def routes_of(scenario: Scenario) -> dict[str, Any]:
     places = [vehicle.goal and vehicle.goal.position for vehicle in scenario.vehicles]
     counts = [point_count(route) for route in routes]
     points = np.zeros((len(routes), max(counts, default=0), 3))
+    signals = [route.signal or NO_SIGNAL for route in routes]
     for route, row in zip(routes, points, strict=True):
         row[: point_count(route)] = even_points(route) - [*origin[:2], 0.0]
     return {
@@ -53,6 +51,9 @@ def routes_of(scenario: Scenario) -> dict[str, Any]:
         "count": counts,
         "point": points,
         **{name: [getattr(route, name) for route in routes] for name in ("lateral_spread", "wander", "start_spread")},
+        **{
+            f"signal_{name}": [getattr(light, name) for light in signals] for name in ("at", "period", "start", "green")
+        },
         "height": -origin[2],
     }
 
@@ -63,10 +64,14 @@ def drawn_of(scenario: Scenario) -> dict[str, Any]:
     motions = [vehicle.motion for vehicle in scenario.vehicles]
     drawn, hard = scenario.randomisation, scenario.difficulty
     routes = scenario.routes
-    following = [[followers(vehicle, route, routes) for route in routes] for vehicle in scenario.vehicles]
-    counts = [len(next_ones) for of_vehicle in following for next_ones in of_vehicle]
-    ends = np.cumsum([0, *counts])
-    rows = np.arange(len(scenario.vehicles))[:, None] * len(routes) + np.arange(len(routes) + 1)
+    after = scenario.termination.after_arrival
+    kinds = [(v.goal_radius, v.next_routes) if after in ("continue", "transit") else None for v in scenario.vehicles]
+    row = {kind: (k, scenario.vehicles[kinds.index(kind)]) for k, kind in enumerate(dict.fromkeys(kinds))}
+    following: list[list[int]] = []
+    for kind, (_, vehicle) in row.items():
+        following += followers(vehicle, routes) if kind else [[]] * len(routes)
+    ends = np.cumsum([0, *map(len, following)])
+    rows = np.arange(len(row))[:, None] * len(routes) + np.arange(len(routes) + 1)
     return {
         "presence": [agent.presence for agent in agents],
         "any_driven": scenario.driven,
@@ -76,9 +81,11 @@ def drawn_of(scenario: Scenario) -> dict[str, Any]:
         **{name: [part.factors(key)[0] for key in PARAMETERS] for name, part in (("low", drawn), ("easy", hard))},
         **{name: [part.factors(key)[1] for key in PARAMETERS] for name, part in (("high", drawn), ("hard", hard))},
         "level": scenario.difficulty.number,
-        "after_arrival": AFTER_ARRIVAL[scenario.termination.after_arrival],
+        "entry": [vehicle.entry or (-1.0, -1.0) for vehicle in scenario.vehicles],
+        "leaves": after in ("leave", "transit"),
+        "next_row": [row[kind][0] for kind in kinds],
         "next_first": ends[rows],
-        "next_choice": [i for of_vehicle in following for next_ones in of_vehicle for i in next_ones],
+        "next_choice": [i for next_ones in following for i in next_ones],
     }
 
 
@@ -212,6 +219,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     """Return the Warp `Model` of a scenario."""
     model = model_struct(p)()
     limits, cameras, noises, faults = scenario.limits, scenario.cameras, scenario.noises, scenario.all_faults
+    traffic = [v.motion.kind == "traffic" and scenario.cosimulator is None for v in scenario.vehicles]
     _fill(model, device, _world(scenario))
     _fill(model.start, device, _start(scenario))
     _fill(model.motion, device, _motion(scenario))
@@ -223,14 +231,14 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.observer, device, _observer(scenario), scenario.observer)
     _fill(model.judgement, device, {}, scenario.reward)
     of_vehicles: dict[str, tuple[list[Any], Callable[[int], dict[str, Any]]]] = {
-        "dynamics": (limits, lambda i: _dynamics(limits[i], scenario)),
+        "dynamics": (limits, lambda i: _dynamics(limits[i], scenario, traffic[i])),
         "camera": (cameras, lambda i: camera_entries(cameras[i], noises[i])),
         "noise": (noises, lambda i: noise_entries(noises[i], scenario.rates)),
         "fault": (faults, lambda i: fault_entries(faults[i], scenario)),
     }
     for name, (sections, values) in of_vehicles.items():
         kind, made = entry_struct(p, name), {}
-        keys = [(id(section), id(noise)) for section, noise in zip(sections, noises, strict=True)]
+        keys = [(id(section), id(noise), own) for section, noise, own in zip(sections, noises, traffic, strict=True)]
         for i, key in enumerate(keys):  # vehicles share the sections of the scenario
             if key not in made:
                 made[key] = kind()
@@ -346,11 +354,12 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
+def _dynamics(d: Dynamics, scenario: Scenario, traffic: bool) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
     return {
         "min_speed": -d.max_speed if d.reverse else 0.0,
-        "speed_lag": 0.0 if accelerates else d.speed_time_constant,  # an acceleration acts at once
+        "speed_lag": 0.0 if accelerates or traffic else d.speed_time_constant,  # an acceleration acts at once
+        "in_traffic": traffic,
         "steering_lag": d.steering_time_constant,
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": accelerates,

@@ -15,8 +15,16 @@ import warp as wp
 from coopenv.estimation.linalg import increment, orthonormalise, rigid_motion
 from coopenv.estimation.outcomes import Outcome
 from coopenv.world.cells import body_of, cell_at, first_in, has_body, last_of_all, next_in, window_about
-from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
-from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
+from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.route import (
+    draw_next_route,
+    goal_distance,
+    has_next_route,
+    has_routes,
+    is_past_end,
+    place_on_route,
+    route_length,
+)
 from coopenv.world.warp_internals import device_function
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
@@ -124,7 +132,7 @@ def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
 @device_function
 def depart(model: Any, state: Any, world: int, vehicle: int):
     """Take a vehicle that has arrived off the scene, where vehicles leave; called at the start of a tick."""
-    if model.drawn.after_arrival == LEAVE and state.ended[world, vehicle] == ARRIVED:
+    if model.drawn.leaves == 1 and state.ended[world, vehicle] == ARRIVED:
         state.present[world, model.landmarks + vehicle] = 0
 
 
@@ -139,7 +147,7 @@ def referee(model: Any, state: Any, world: int, vehicle: int):
         elif model.scene.end_on_arrival == 1:
             if reaches_goal(model, state, world, vehicle):
                 state.arrivals[world, vehicle] += 1
-                if model.drawn.after_arrival == CONTINUE:
+                if has_next_route(model, state, world, vehicle):
                     draw_next_route(model, state, world, vehicle)
                 else:
                     ended = ARRIVED
@@ -204,6 +212,8 @@ def decide(model: Any, state: Any, actions: Any, world: int):
         pan = type(first)(0.0)
         if model.pans == 1:
             pan = state.action[world, vehicle, 2]
+        if model.dynamics[vehicle].in_traffic == 1:
+            continue
         command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
         if model.dynamics[vehicle].gated == 1:
             duration = type(first)(model.camera_period) * type(first)(model.ticks_per_decision)
@@ -326,14 +336,14 @@ def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, comma
 
 @device_function
 def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
-    """Advance a driven vehicle in short steps; a vehicle whose episode has ended stands still."""
+    """Advance a driven vehicle in short steps; one that is absent, or whose episode has ended, stands still."""
     agent = model.landmarks + vehicle
     limits = model.dynamics[vehicle]
     R = state.rotation[world, agent]
     position = state.position[world, agent]
     speed = state.speed[world, vehicle]
     steering = state.steering[world, vehicle]
-    parked = state.ended[world, vehicle]
+    parked = wp.where(state.present[world, agent] == 0, 1, state.ended[world, vehicle])
     steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
     for _ in range(steps):

@@ -16,6 +16,7 @@ from coopenv.world.dynamics import depart, move, move_landmarks, referee
 from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import begin_sensing, place_everybody
+from coopenv.world.traffic import appear, direct_traffic
 from coopenv.world.v2x import transmit
 from coopenv.world.warp_internals import device_function
 
@@ -171,8 +172,9 @@ def move_vehicle(model: Any, state: Any, record: Any, world: int, vehicle: int, 
 
 @device_function
 def arrange_world(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Carry the landmarks to a tick, and sort everything into the grid."""
+    """Carry the landmarks to a tick, let vehicles appear, and sort everything into the grid."""
     move_landmarks(model, state, world, tick)
+    appear(model, state, world, tick)
     sort_into_cells(model, state, world)
 
 
@@ -182,6 +184,7 @@ def look_around(model: Any, state: Any, record: Any, world: int, vehicle: int, t
     referee(model, state, world, vehicle)
     observe(model, state, world, vehicle, tick)
     transmit(model, state, world, vehicle, tick)
+    direct_traffic(model, state, world, vehicle, tick)
 
 
 SIMULATED = Source(

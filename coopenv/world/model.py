@@ -75,12 +75,6 @@ IDEAL = wp.constant(1)
 BLIND = wp.constant(2)
 """Values of `Model.sensing`, see the scenario's key."""
 
-PARK = wp.constant(0)
-LEAVE = wp.constant(1)
-CONTINUE = wp.constant(2)
-"""Values of `Model.drawn.after_arrival`."""
-
-
 mat66d: Any = wp.types.matrix((6, 6), wp.float64)
 
 
@@ -135,6 +129,7 @@ def model_struct(p: Precision) -> Any:
         latency_ticks: wp.int32
         dead_band: scalar  # m/s
         gated: wp.int32  # 1: commands change gradually
+        in_traffic: wp.int32  # 1: the model of traffic drives it, see `coopenv.world.traffic`
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
         action_steering: scalar  # of an action of 1
         pan_limit: scalar  # of the camera; 0: it does not turn
@@ -181,6 +176,10 @@ def model_struct(p: Precision) -> Any:
         lateral_spread: wp.array(dtype=scalar)  # (R,) m
         wander: wp.array(dtype=scalar)  # (R,) m
         start_spread: wp.array(dtype=scalar)  # (R,) m
+        signal_at: wp.array(dtype=scalar)  # (R,) m, arc length of its stop line
+        signal_period: wp.array(dtype=scalar)  # (R,) s
+        signal_start: wp.array(dtype=scalar)  # (R,) s in every period, of the green time
+        signal_green: wp.array(dtype=scalar)  # (R,) s, its duration
         height: scalar  # m, of the ground that routes lie on, map
 
     @wp.struct
@@ -203,9 +202,11 @@ def model_struct(p: Precision) -> Any:
         easy: wp.array(dtype=scalar)  # (Q,) factor at difficulty 0
         hard: wp.array(dtype=scalar)  # (Q,) and at 1
         level: scalar  # difficulty, unless another one is set
-        after_arrival: wp.int32
-        next_first: wp.array2d(dtype=wp.int32)  # (N, R + 1) routes that may follow route r of vehicle i ...
-        next_choice: wp.array(dtype=wp.int32)  # ... are next_choice[next_first[i, r]] .. [next_first[i, r + 1] - 1]
+        entry: wp.array(dtype=vec2)  # (N,) s, first and last time of its appearance; negative: it is there at the reset
+        leaves: wp.int32  # 1: vehicles leave where no route follows, 0: they stand there
+        next_row: wp.array(dtype=wp.int32)  # (N,) row of a vehicle in the next table
+        next_first: wp.array2d(dtype=wp.int32)  # (K, R + 1) routes that may follow route r in row k ...
+        next_choice: wp.array(dtype=wp.int32)  # ... are next_choice[next_first[k, r]] .. [next_first[k, r + 1] - 1]
 
     @wp.struct
     class CameraValues:

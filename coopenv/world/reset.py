@@ -33,7 +33,8 @@ from coopenv.world.random import (
     unit_vector,
 )
 from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
-from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, transmit
+from coopenv.world.traffic import direct_traffic
+from coopenv.world.v2x import NOTHING, POSE_BYTES, draw_faults, first_tick_of, transmit
 
 ABSENT = wp.constant(-1)
 """Value of `ended` of a vehicle that is not there in this episode."""
@@ -59,7 +60,14 @@ def draw_presence(model: Any, state: Any, world: int):
         state.pace[world, agent] = pace
     keep_one_vehicle(model, state, world)
     for vehicle in range(model.vehicles):
-        state.ended[world, vehicle] = wp.where(state.present[world, model.landmarks + vehicle] == 0, ABSENT, 0)
+        agent = model.landmarks + vehicle
+        state.ended[world, vehicle] = wp.where(state.present[world, agent] == 0, ABSENT, 0)
+        state.entry_tick[world, vehicle] = 0
+        times = model.drawn.entry[vehicle]
+        if times[0] >= times.dtype(0.0) and state.present[world, agent] == 1:
+            words = random_words(state.seed[world], state.episode[world], 0, agent, PRESENCE)
+            state.entry_tick[world, vehicle] = first_tick_of(model, times[0], times[1] - times[0], words[2])
+            state.present[world, agent] = 0
 
 
 @wp.func
@@ -292,3 +300,4 @@ def begin_sensing(model: Any, state: Any, world: int):
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, 0)
         transmit(model, state, world, vehicle, 0)
+        direct_traffic(model, state, world, vehicle, 0)

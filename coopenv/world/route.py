@@ -191,13 +191,22 @@ def draw_route(model: Any, state: Any, world: int, vehicle: int, attempt: int):
 
 
 @wp.func
+def has_next_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a route may follow that of a vehicle."""
+    old = state.route_drawn[world, vehicle]
+    row = model.drawn.next_row[vehicle]
+    return old >= 0 and model.drawn.next_first[row, old + 1] > model.drawn.next_first[row, old]
+
+
+@wp.func
 def draw_next_route(model: Any, state: Any, world: int, vehicle: int):
     """Draw the route of a vehicle that has arrived, among those that start where its old one ends."""
     old = state.route_drawn[world, vehicle]
     arrival = state.arrivals[world, vehicle]
-    first = model.drawn.next_first[vehicle, old]
+    row = model.drawn.next_row[vehicle]
+    first = model.drawn.next_first[row, old]
     words = random_words(state.seed[world], state.episode[world], arrival, vehicle, NEXT_ROUTE)
-    choice = one_of(words[3], first, model.drawn.next_first[vehicle, old + 1] - first)
+    choice = one_of(words[3], first, model.drawn.next_first[row, old + 1] - first)
     shape_route(model, state, world, vehicle, model.drawn.next_choice[choice], AFTER_STARTS + arrival, words)
 
 

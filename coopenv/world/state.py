@@ -268,6 +268,7 @@ def state_struct(p: Precision) -> Any:
         difficulty: array("W", scalar, numbers(1.0))  # in [0, 1], of the episodes to come
         present: array("WA", wp.int32, FLAG)  # 1: in the scene now; landmarks keep their place on the map
         pace: array("WA", scalar, numbers(2.0 * MOST**3))  # of prescribed motions
+        entry_tick: array("WN", wp.int32, whole(0, 2**31 - 1))  # from which on an absent vehicle may appear
 
         route: array("WNP", vec3)  # x, y in m, map; arc length s from the first point, m
         route_count: array("WN", wp.int32, ROUTE_COUNT)  # points of it; 0: no goal

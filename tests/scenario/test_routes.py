@@ -97,7 +97,7 @@ def test_points_are_at_even_arc_length_and_few() -> None:
         ({"waypoints": [[0, 0]]}, r"routes.0.waypoints: too few entries, number 2 is missing|at least 2"),
         ({"lateral_spread": 1.5, "wander": 0.5}, r"routes.0.corner_radius: 2 m must be above lateral_spread \+ wander"),
         ({"start_spread": 14.0}, r"routes.0.start_spread: 14 m must be below the route's length \(13.1416 m\)"),
-        ({"name": "1st"}, r"routes.0.name"),
+        ({"name": "1 st"}, r"routes.0.name"),
         ({"wonder": 0.1}, r"routes.0.wonder: unknown key \(did you mean 'wander'\?\)"),
     ],
 )
@@ -110,7 +110,10 @@ def test_impossible_routes(wrong: dict[str, Any], message: str) -> None:
     ("car", "message"),
     [
         ({"routes": ["lift"], "motion": DRIVEN}, r"vehicles.0.routes: unknown route 'lift' \(did you mean 'left'\?\)"),
-        ({"routes": ["left"]}, r"vehicles.0.routes: for driven vehicles; the motion of this one is 'static'"),
+        (
+            {"routes": ["left"]},
+            r"vehicles.0.routes: for driven vehicles and traffic; the motion of this one is 'static'",
+        ),
         (vehicle(routes=["left"], motion=DRIVEN), r"vehicles.0.initial_pose.position: .* starts on its route"),
         (
             {"routes": ["left"], "motion": DRIVEN, "goal": {"position": [0, 0, 0]}},
