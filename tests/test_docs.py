@@ -152,9 +152,12 @@ def test_the_page_on_draws() -> None:
         "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}],
         "vehicles": [{"motion": {"kind": "driven"}, "initial_pose": {"position": [0.0, 0.0, 0.0]}}],
     }
-    routes, landmarks, factors = (tomllib.loads(text) for text in tables("draws.md"))
+    routes, streets, landmarks, factors = (tomllib.loads(text) for text in tables("draws.md"))
     routes["routes"].append({"name": "straight", "waypoints": [[-8.0, -0.5], [8.0, -0.5]]})
     assert parse_scenario(lot | routes, "draws.md").vehicles[0].routes == ("left", "straight")
+    city = load_scenario({"title": "city", "horizon": 1.0, **streets})
+    assert len(city.vehicles) == 34
+    assert len(city.obstacles) == 36
     assert len(parse_scenario(lot | landmarks, "draws.md").landmarks) == 11
     assert parse_scenario(lot | factors, "draws.md").randomisation.camera_range == (0.8, 1.2)
 
