@@ -273,9 +273,9 @@ def test_surplus_traffic_leaves_at_the_start_and_is_an_error_later() -> None:
             engine.step()
 
 
-def test_other_environments_know_no_traffic() -> None:
+def test_other_environments_need_what_highway_env_has() -> None:
     for overrides, why in (  # of an environment without defaults of vehicles
-        ({"vehicles.0.motion": {"kind": "traffic"}}, r"vehicles\.0\.motion\.kind: 'traffic' needs backend"),
+        ({"vehicles.0.motion": {"kind": "traffic"}}, r"vehicles\.0\.routes: needed by traffic"),
         ({"backend": "highway"}, "highway: needed"),
         ({"vehicles": [{}]}, r"vehicles\.0\.initial_pose: needed"),
     ):
