@@ -96,7 +96,7 @@ LINES_AND_FILES = {
     "evaluation": (495, 3),
     "observers": (11820, 47),
     "policies": (1730, 10),
-    "runs": (3315, 13),
+    "runs": (3320, 13),
     "scenario": (3750, 15),
     "training": (1385, 5),
     "viz": (4800, 19),

@@ -154,7 +154,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_contents(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     shipped = {Path(n).name for n in names if n.startswith("coopenv/data/envs/")}
-    assert shipped == {path.name for path in (ROOT / "envs").glob("*.toml")}
+    assert shipped == {path.name for path in (ROOT / "envs").iterdir()}
     agents = {Path(n).parts[3] for n in names if n.startswith("coopenv/data/agents/") and len(Path(n).parts) > 4}
     assert agents == {path.name for path in (ROOT / "agents").iterdir() if path.is_dir()}
     assert {"overtaking.toml", "crossing.toml"} <= {Path(n).name for n in names if "data/examples/fleet/" in n}

@@ -5,7 +5,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -14,9 +14,9 @@ from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_file, writing
 from coopenv.base.installation import install_command
 from coopenv.viz.scene import Frame, SceneRecord
-from coopenv.viz.stage import Stage
-from coopenv.viz.style import GREEN, VERMILION
-from coopenv.viz.topview import TopView
+
+if TYPE_CHECKING:
+    from coopenv.viz.stage import Stage  # imports Matplotlib, which is only needed where there is a film
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 """Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
@@ -107,6 +107,8 @@ def write_film(
 
 def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
     """Return the film of one scene from above; `panel`: table and legend beside the map."""
+    from coopenv.viz.topview import TopView
+
     return [[Shot(record, TopView(record.scenario, panel=panel))]]
 
 
@@ -122,6 +124,9 @@ _BAND = 0.1  # of the width, height of a heading
 
 def _heading(shot: Shot, frame: Frame, width: int) -> np.ndarray:
     """Return a band with the name of a shot and how many vehicles are lost; its colour tells the same."""
+    from coopenv.viz.stage import Stage
+    from coopenv.viz.style import GREEN, VERMILION
+
     count, total = int(lost(Stage(shot.record.scenario), frame).sum()), len(frame.nees)
     found = f"{count} of {total} lost" if count and total > 1 else "lost" if count else "found"
     height = round(_BAND * width)
@@ -133,7 +138,7 @@ def _heading(shot: Shot, frame: Frame, width: int) -> np.ndarray:
     return np.asarray(band)
 
 
-def lost(stage: Stage, frame: Frame) -> np.ndarray:
+def lost(stage: "Stage", frame: Frame) -> np.ndarray:
     """Return (N,) which vehicles are farther from their estimates than they are long."""
     return np.asarray(frame.position_error > stage.bodies()[0][:, 0])
 

@@ -285,11 +285,11 @@ def test_it_ends_with_the_vehicles_that_are_estimated_here(run: dict[str, Any]) 
     assert made.vehicles == (0,)
     assert [ending.outcome for ending in made.endings()] == ["arrived"]
     assert 30 < made.ticks_recorded < 400  # of 540
-    assert "all vehicles estimated here had ended" in run["result"]["outcome"]
+    assert "all vehicles estimated here had ended" in run["result"].metrics["outcome"]
 
 
 def test_no_table_is_about_a_vehicle_that_is_estimated_elsewhere(run: dict[str, Any]) -> None:
-    assert [row["vehicle"] for row in run["result"]["vehicles"]] == ["vehicle_1"]
+    assert [row["vehicle"] for row in run["result"].metrics["vehicles"]] == ["vehicle_1"]
     about = [line for line in run["out"].splitlines() if "vehicle_2" in line]
     assert about == ["vehicle_2: received by radio, not estimated here"]
     assert (run["folder"] / "errors.png").stat().st_size > 10_000

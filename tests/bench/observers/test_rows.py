@@ -227,7 +227,7 @@ def test_stanford_diagram(board: coopenv.Comparison) -> None:
     """A panel for the observer that states levels; its cells hold every tick with a known level once."""
     panel, bar = board.figure("protection").axes
     assert panel.get_title().startswith("robust\nexceeded 0 %, unknown ")
-    assert (panel.get_xlabel(), panel.get_ylabel()) == ("horizontal error [m]", "protection level [m]")
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("horizontal error [m], log", "protection level [m], log")
     assert panel.get_xlim() == panel.get_ylim() and bar.get_ylabel() == "vehicle ticks"
     (mesh,) = (drawn for drawn in panel.collections if drawn.get_array() is not None)
     shown: Any = np.ma.filled(np.ma.masked_invalid(mesh.get_array()), 0.0).reshape((len(LEVEL_BINS) - 1,) * 2)

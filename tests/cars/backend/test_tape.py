@@ -240,7 +240,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[
             time.sleep(0.3)
         finally:
             backend.close()
-    return folder / "drive.mcap", text.getvalue(), result
+    return folder / "drive.mcap", text.getvalue(), result.metrics
 
 
 def ticks_of(path: Path) -> list[Any]:
@@ -277,8 +277,9 @@ def test_a_replay_says_what_the_live_run_said(recorded: Any, tmp_path: Path) -> 
     run = Rollout(backend.scenario, backend=backend)
     text = StringIO()
     log, out = Console(quiet=True), Console(file=text)
-    result = execute("lab", run, tmp_path / "out", log, {}, None, None, False)
-    report(run, result, tmp_path / "out", out)
+    found = execute("lab", run, tmp_path / "out", log, {}, None, None, False)
+    result = found.metrics
+    report(run, found, tmp_path / "out", out)
     told = text.getvalue()
     assert f"Stopped: {REASON}" in told and "Replayed at" in told and "imulat" not in told
     assert result["policy"] == "recorded" and live["policy"] == "route_follower"
