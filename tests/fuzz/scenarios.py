@@ -16,8 +16,6 @@ import numpy as np
 
 import coopenv
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.scenario import parse_scenario
-from coopenv.scenario.files import apply_vehicle_defaults
 from coopenv.scenario.own_terms import located
 from tests.fuzz.harness import go_through, taken
 
@@ -48,14 +46,14 @@ def documents() -> list[tuple[str, dict[str, Any]]]:
     from coopenv.base.installation import data_directory
 
     paths = sorted(data_directory("envs").glob("*.toml"))
-    return [(path.read_text(), tomllib.loads(path.read_text())) for path in paths]
+    return [(path.read_text(), located(tomllib.loads(path.read_text()), path.parent)) for path in paths]
 
 
 def prepare() -> None:
     """Compile what the cases run in."""
     for text, data in documents():
         del text
-        scenario = parse_scenario(apply_vehicle_defaults(located(data, Path.cwd())), "here")
+        scenario = coopenv.load_scenario(data)
         for observer in ("riccati", "dead_reckoning", "robust"):
             run(scenario.model_copy(update={"observer": scenario.observer.model_copy(update={"name": observer})}), 0)
 
@@ -127,7 +125,7 @@ def changed(rng: np.random.Generator) -> Any:
         data[section] = {**data.get(section, {}), "custom": custom}
     for _ in range(rng.integers(1, 3)):
         mutate(rng, data)
-    return parse_scenario(apply_vehicle_defaults(located(data, Path.cwd())), "here")
+    return coopenv.load_scenario(data)
 
 
 def from_text(rng: np.random.Generator, text: str) -> Any:
