@@ -224,7 +224,7 @@ class Goals:
         shapes = center[:, None] + self._radius[:, None, None] * _CIRCLE
         self._discs.set_verts(list(shapes))
         self._rims.set_verts(list(shapes))
-        groups = touching(center, self._radius)
+        groups = touching(center, self._radius) if len(self._there) <= MOST_ROWS else []  # more names would overlap
         for name, members in zip(self._names, groups + [[]] * (len(self._names) - len(groups)), strict=True):
             named = len(members) if len(members) <= _MOST_NAMES else _MOST_NAMES - 1
             marks = ", ".join(vehicle_mark(self._there[k]) for k in members[:named])
