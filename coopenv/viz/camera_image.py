@@ -112,6 +112,8 @@ def _draw_box(draw: ImageDraw.ImageDraw, lens: Lens, box: Box, colour: str, edge
         outline = lens.pixels(whole)
         if lens.around and np.ptp(outline[:, 0]) > lens.size[0] / 2:
             continue  # it is behind, on both sides of the panorama
+        if (outline.max(axis=0) < 0).any() or (outline.min(axis=0) > lens.size).any():
+            continue
         points = [(float(u), float(v)) for u, v in np.clip(_SCALE * outline, -5000, 5000)]
         draw.polygon(points, fill=colour, outline=edge)
 

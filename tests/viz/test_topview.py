@@ -94,7 +94,7 @@ def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
     for key in before.keys() - {"programs"}:  # objects of co-simulators
         np.testing.assert_array_equal(before[key], after[key], err_msg=key)
     stage, frame = Stage(env.scenario), Frame.of(env.engine)
-    for i in range(stage.vehicles):
+    for i in range(min(stage.vehicles, 16)):
         image, (width, height) = camera_image(stage, frame, i), Lens(stage, frame, i).size
         assert image.shape == (height, width, 3) and image.std() > 1.0
 
