@@ -120,12 +120,13 @@ def _draw_box(draw: ImageDraw.ImageDraw, lens: Lens, box: Box, colour: str, edge
 
 def _before(face: np.ndarray) -> np.ndarray:
     """Return the part of a polygon (K, 3) that lies before the camera."""
+    near = max(_NEAR, 2.0 * _AHEAD * float(np.linalg.norm(face, axis=1).max()))  # what is kept has pixels
     kept = []
     for a, b in zip(face, np.roll(face, -1, axis=0), strict=True):
-        if a[2] > _NEAR:
+        if a[2] > near:
             kept.append(a)
-        if (a[2] > _NEAR) != (b[2] > _NEAR):
-            kept.append(a + (_NEAR - a[2]) / (b[2] - a[2]) * (b - a))
+        if (a[2] > near) != (b[2] > near):
+            kept.append(a + (near - a[2]) / (b[2] - a[2]) * (b - a))
     return np.array(kept).reshape(-1, 3)
 
 
