@@ -9,6 +9,7 @@ import tomllib
 import warnings
 from collections.abc import Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ def prepare() -> None:
     for text, data in documents():
         del text
         scenario = coopenv.load_scenario(data)
+        if scenario.backend == "sumo" and find_spec("libsumo") is None:
+            continue
         for observer in ("riccati", "dead_reckoning", "robust"):
             run(scenario.model_copy(update={"observer": scenario.observer.model_copy(update={"name": observer})}), 0)
 
