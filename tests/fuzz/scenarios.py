@@ -47,6 +47,8 @@ def documents() -> list[tuple[str, dict[str, Any]]]:
     from coopenv.base.installation import data_directory
 
     paths = sorted(data_directory("envs").glob("*.toml"))
+    if find_spec("libsumo") is None:
+        paths = [path for path in paths if not path.name.startswith("sumo")]
     return [(path.read_text(), located(tomllib.loads(path.read_text()), path.parent)) for path in paths]
 
 
@@ -55,8 +57,6 @@ def prepare() -> None:
     for text, data in documents():
         del text
         scenario = coopenv.load_scenario(data)
-        if scenario.backend == "sumo" and find_spec("libsumo") is None:
-            continue
         for observer in ("riccati", "dead_reckoning", "robust"):
             run(scenario.model_copy(update={"observer": scenario.observer.model_copy(update={"name": observer})}), 0)
 
