@@ -82,15 +82,28 @@ def test_list_as_json(line: str, names: Callable[[], list[str]], capsys: pytest.
     assert line != "list" or {row["id"] for row in rows} == {environment_id(name) for name in names()}
 
 
-def test_describe_says_what_matters_on_one_screen(capsys: pytest.CaptureFixture[str]) -> None:
-    for name in coopenv.list_envs():
-        assert main(["describe", name]) == 0
-        out = capsys.readouterr().out
-        assert len(out.splitlines()) <= 24
-        assert max(len(line.rstrip()) for line in out.splitlines()) <= 80
-        size = coopenv.parallel_env(name).observation_space("vehicle_1").shape[0]
-        assert f"Observation  {size} numbers per vehicle" in out
-        assert environment_id(name) in out
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_describe_says_what_matters_on_one_screen(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["describe", name]) == 0
+    out = capsys.readouterr().out
+    assert len(out.splitlines()) <= 24
+    assert max(len(line.rstrip()) for line in out.splitlines()) <= 80
+    size = coopenv.parallel_env(name).observation_space("vehicle_1").shape[0]
+    assert f"Observation  {size} numbers per vehicle" in out
+    assert environment_id(name) in out
+
+
+def test_describe_starts_no_traffic_program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("coopenv.backends.sumo.find_spec", lambda name: None)
+    assert main(["describe", "sumo_crossing"]) == 0
+    assert "6 in traffic" in capsys.readouterr().out
+
+
+def test_describe_states_vehicles_and_actions(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["describe", "urban_crossing"]) == 0
+    out = capsys.readouterr().out
     assert "4 driven by actions, up to 1 m/s; 4 with a goal" in out
     assert "Action       2 numbers in [-1, 1]: speed 0 to 1 m/s, steering" in out
 

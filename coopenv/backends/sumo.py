@@ -217,17 +217,17 @@ class Sumo(TrafficProgram):
         return values[: 4 * head["own"]].reshape(-1, 4), values[4 * head["own"] :].reshape(-1, 6)
 
     def _fail(self, why: str = "") -> Any:
-        """End the process. Raises CoopenvError: what SUMO says, or what has ended it."""
+        """End the process. Raises CoopenvError: SUMO's own error, or how the process ended."""
         process, at = self._process, len(self._moved) / self._scenario.rates.camera
         status = None if why or process is None else process.wait(PATIENCE)
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").splitlines()
-        told = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+        errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
         self.close()
         if status is not None and status < 0:
             raise CoopenvError(f"SUMO was ended by {signal.Signals(-status).name} {at:g} s after the reset")
-        said = " ".join((told or [why or f"it ended with status {status}"])[-1].split())
-        raise CoopenvError(f"SUMO, {at:g} s after the reset: {shortened(said, 300)}")
+        reason = " ".join((errors or [why or f"it ended with status {status}"])[-1].split())
+        raise CoopenvError(f"SUMO, {at:g} s after the reset: {shortened(reason, 300)}")
 
     def save(self) -> dict[str, Any]:
         """Return the seed, and what vehicles have been moved to since the reset: SUMO repeats itself."""

@@ -1,7 +1,7 @@
 """Frozen benchmarks, `coopenv bench v1`: scenes, seeds and limits that do not change, and the rows of the zoo.
 
-`v1.toml` says what is measured. `v1.json` is the result file of the zoo, whose hashes and figures of records are those
-that every other result is held against.
+`v1.toml` defines scenes, seeds and limits. `v1.json` is the result file of the zoo: results are comparable if their
+hashes and figures of records agree with it.
 """
 
 import inspect

@@ -51,7 +51,7 @@ class Divided(Protocol):
 
 @contextmanager
 def _deaf_children() -> Iterator[None]:
-    """Let processes that are started meanwhile not hear Ctrl-C, which a terminal sends to all: the parent decides."""
+    """Start processes that ignore Ctrl-C, which a terminal sends to all: the parent decides."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -102,7 +102,7 @@ class _Worker:
 
     def excess(self, limits: Limits) -> str:
         """Return the limit that the present part exceeds, in words; empty: none."""
-        with suppress(psutil.Error):  # it has ended, which its pipe tells
+        with suppress(psutil.Error):  # it has ended, and its pipe with it
             time, clock, memory = (now - then for now, then in zip(self.measured(), self.before, strict=True))
             if time > limits.seconds or clock > PATIENCE * limits.seconds:
                 return f"more than {limits.seconds:g} s on one record (--seconds)"

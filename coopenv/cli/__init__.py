@@ -48,11 +48,12 @@ def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
     """List environments, observers, agents, variants or scenes."""
-    from coopenv.bench.observers.faults import variant_rows
     from coopenv.runs import summary
 
+    if kind is Kind.variants:
+        from coopenv.bench.observers.faults import variant_rows
     with warnings.catch_warnings(action="ignore"):  # those of one environment do not name it
-        rows = summary.list_rows(kind) if kind is not Kind.variants else variant_rows()
+        rows = variant_rows() if kind is Kind.variants else summary.list_rows(kind)
     if as_json:
         options.print_json(rows)
     else:
@@ -80,7 +81,7 @@ def describe(given: DescribeOptions) -> None:
         scenario, recorded = backend.scenario, backend.capabilities.recorded
     else:
         scenario, recorded = options.load(given.environment, given.changes), False
-        if scenario.backend != "simulated":  # whose roads may be those of the program
+        if scenario.cosimulator is not None and not scenario.roads:  # they are those of the program
             scenario = simulation_of(scenario).scenario
     if given.as_json:
         options.print_json(document(name, scenario))

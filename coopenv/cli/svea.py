@@ -22,11 +22,7 @@ if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
 svea = typer.Typer(
-    name="svea",
-    cls=options.Grouped,
-    help="SVEA cars, real ones and fakes.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
+    cls=options.Grouped, help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None
 )
 HARMED = 1
 """Exit status of an attack that got through."""

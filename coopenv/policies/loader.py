@@ -19,12 +19,9 @@ if TYPE_CHECKING:
     from coopenv.scenario import Scenario
 
 Kind = Literal["learned", "scripted", "reference"]
-"""Trained, scripted, or a reference for what is possible."""
 AGENT_FILE = "agent.toml"
-CARD_FILES = ("card.json", "card.md")
-"""What `coopenv evaluate --write-card` writes beside it."""
-CHECKPOINT_FILE = "checkpoint.safetensors"
-"""What stands in its place while an agent is trained."""
+CARD_FILES = ("card.json", "card.md")  # written beside it by `coopenv evaluate --write-card`
+CHECKPOINT_FILE = "checkpoint.safetensors"  # in its place while an agent is trained
 LATER_FIELDS = {"center", "settings"}
 """Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
 
@@ -76,7 +73,9 @@ class AgentCard(BaseModel):
     environments: tuple[str, ...]
     """Environments that it was made for: names, or TOML files in the agent's folder."""
     kind: Kind = "scripted"
+    """Trained, scripted, or a reference for what is possible."""
     options: dict[str, Any] = {}
+    """Keyword arguments of the entry."""
     network: NetworkCard | None = None
     """Of a learned one: its weights, and the observation and action that it was trained with."""
     training: dict[str, Any] = {}
@@ -95,8 +94,11 @@ class Agent(AgentCard):
     name: str
     """What tables call it."""
     title: str = ""
+    """Of its card."""
     description: str = ""
+    """Of its card."""
     environments: tuple[str, ...] = ()
+    """As of its card, with absolute paths."""
     folder: Path | None = None
     """Where its `agent.toml` and its card are; None for an import path."""
 

@@ -123,7 +123,7 @@ _BAND = 0.1  # of the width, height of a heading
 
 
 def _heading(shot: Shot, frame: Frame, width: int) -> np.ndarray:
-    """Return a band with the name of a shot and how many vehicles are lost; its colour tells the same."""
+    """Return a band with the name of a shot and how many vehicles are lost, in the colour of success or failure."""
     from coopenv.viz.stage import Stage
     from coopenv.viz.style import GREEN, VERMILION
 
@@ -183,7 +183,7 @@ def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
     import imageio_ffmpeg
 
     @contextmanager
-    def told() -> Iterator[None]:
+    def reported() -> Iterator[None]:
         try:
             yield
         except (OSError, RuntimeError):
@@ -197,13 +197,13 @@ def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:
     look: dict[str, Any] = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
     writer = imageio_ffmpeg.write_frames(str(path), (width, height), **look)
     try:
-        with told():
+        with reported():
             writer.send(None)
         for image in chain([first], images):
             count += 1
-            with told():
+            with reported():
                 writer.send(image.crop((0, 0, width, height)).tobytes())
-        with told():
+        with reported():
             writer.close()
             if imageio_ffmpeg.count_frames_and_secs(str(path))[0] != count:
                 raise OSError

@@ -11,6 +11,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib import pyplot as plt
 from matplotlib.backends import backend_registry
 from matplotlib.colors import to_rgb
@@ -21,7 +23,7 @@ from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import Camera
-from coopenv.viz.camera_image import Lens, camera_image
+from coopenv.viz.camera_image import Lens, _before, camera_image, pixels
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import (
     Box,
@@ -94,9 +96,15 @@ def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
     for key in before.keys() - {"programs"}:  # objects of co-simulators
         np.testing.assert_array_equal(before[key], after[key], err_msg=key)
     stage, frame = Stage(env.scenario), Frame.of(env.engine)
-    for i in range(min(stage.vehicles, 16)):
+    for i in range(stage.vehicles):
         image, (width, height) = camera_image(stage, frame, i), Lens(stage, frame, i).size
         assert image.shape == (height, width, 3) and image.std() > 1.0
+
+
+@given(st.lists(st.tuples(*[st.floats(-200.0, 200.0)] * 3), min_size=4, max_size=4))
+def test_what_is_kept_of_a_large_face_has_pixels(corners: list[tuple[float, float, float]]) -> None:
+    kept = _before(np.array(corners))
+    assert np.isfinite(pixels(kept, Camera(range=6.0))).all()
 
 
 def test_vehicles_move_over_a_ground_that_stays(start: Any) -> None:

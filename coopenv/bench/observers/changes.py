@@ -1,6 +1,6 @@
 """Changes of a recording by faults of the radio, of bearings, of maps, of odometry and of broadcasts.
 
-Observers are not told. The truth is never changed. Every random draw is a function of the seed and the fault.
+No observer knows of a fault. The truth is never changed. Every random draw is a function of the seed and the fault.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
+from coopenv.estimation.poses import exp_so3
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
@@ -80,10 +81,8 @@ def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
     late = np.arange(recording.ticks) >= _first_tick(recording, fault)
     bias = fault.value * np.outer(late, _on(recording, fault))[..., None] * (0.0, 0.0, 1.0)
-    from scipy.spatial.transform import Rotation  # late: `coopenv list` imports this module
-
-    turn = Rotation.from_rotvec((bias * recording.dt).reshape(-1, 3)).as_matrix().reshape(recording.rotation.shape)
-    return replace(recording, rotation=recording.rotation @ turn, angular_velocity=recording.angular_velocity + bias)
+    rotation = recording.rotation @ exp_so3(bias * recording.dt)
+    return replace(recording, rotation=rotation, angular_velocity=recording.angular_velocity + bias)
 
 
 def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:

@@ -79,8 +79,8 @@ class RecordProperties:
     paper_noise: bool
     """Whether bearings are noisy on the image plane, and so less than the bound assumes off the optical axis."""
     figures: tuple[float, ...] = ()
-    """What tells another record: bearings, deliveries, and the root mean squares of bearings along x, of measured
-    velocities, m/s, and of the last true positions, m."""
+    """Figures in which another record differs: bearings, deliveries, and the root mean squares of bearings along x, of
+    measured velocities, m/s, and of the last true positions, m."""
 
     @property
     def steady_from(self) -> float:
