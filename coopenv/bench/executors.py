@@ -123,6 +123,8 @@ def find_executor(
 ) -> Executor:
     """Return an executor that is ready, by its name and the options of `bench observers`.
 
+    One job has no limits unless they are given: it is this very process, which takes any observer.
+
     Raises:
         CoopenvError: no such executor, an option of the other one, or it is not ready.
     """
@@ -131,9 +133,9 @@ def find_executor(
     if name == "local":
         if address is not None:
             raise CoopenvError(f"--address {address}: only --engine ray has an address")
-        given = {"seconds": seconds, "mebibytes": mebibytes}
-        limits = Limits(**{key: value for key, value in given.items() if value is not None})
-        return Local(jobs or available_cores(), limits)
+        both = {"seconds": seconds, "mebibytes": mebibytes}
+        given = {key: value for key, value in both.items() if value is not None}
+        return Local(jobs or available_cores(), Limits(**given) if given or jobs != 1 else None)
     for option, value in (("--jobs", jobs), ("--seconds", seconds), ("--memory", mebibytes)):
         if value is not None:
             raise CoopenvError(f"{option} {value:g}: with --engine ray the cluster decides")

@@ -77,7 +77,10 @@ class ObserverOptions:
     ] = None
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5
     first: First = 0
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of processes (default: one per core); 1 without limits: this very one."),
+    ] = None
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local"
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None
     seconds: Annotated[

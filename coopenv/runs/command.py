@@ -92,7 +92,8 @@ def execute(
                     record.tick(tick)
                 if keeper.tick(tick):
                     progress.update(tick, describe() if describe is not None else None)
-        judged, endings = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
+        trajectory, endings = run.trajectory(), run.endings()
+        judged = trajectory.of_vehicles(run.vehicles).where_truth_is_known()
         if len(judged.t) < 2:
             raise NoTruthError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
@@ -103,7 +104,7 @@ def execute(
         scene = keeper.record()
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
         replace_text(paths[0], json_text(results.metrics))
-        run.trajectory().save(paths[1])
+        trajectory.save(paths[1])
         scene.save(paths[2])
         if record is not None:
             paths.append(folder / RECORD_FILE)

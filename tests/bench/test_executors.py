@@ -15,6 +15,7 @@ import pytest
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import ONE_THREAD
 from coopenv.bench.executors import Local, find_executor, reach
+from coopenv.bench.watched import Limits
 
 THREADS = list(ONE_THREAD)
 
@@ -38,6 +39,12 @@ def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.delenv(THREADS[1], raising=False)
     assert Local(2).map(threads, range(4), lambda _: None) == [[x] + ["1"] * len(THREADS) for x in range(4)]
     assert os.environ[THREADS[0]] == "7" and THREADS[1] not in os.environ
+
+
+def test_one_job_is_this_process_unless_limits_are_given() -> None:
+    assert find_executor("local", 1) == Local(1)
+    assert find_executor("local", 2) == Local(2, Limits())
+    assert find_executor("local", 1, seconds=5.0) == Local(1, Limits(seconds=5.0))
 
 
 def test_what_cannot_be_sent_to_a_process_is_told() -> None:

@@ -251,6 +251,17 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(
     assert "'broken' (no_such_module:Thing) cannot be loaded" in told_now
 
 
+def test_one_job_takes_an_observer_that_no_process_can_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Here(Raises):
+        """Of this function alone."""
+
+    monkeypatch.setattr(registry, "_registered", {})
+    words = ["bench", "observers", "crossing_path", "--observers", f"{registry.named(Here)},dead_reckoning"]
+    words += ["--set", "horizon=0.3", "--seeds", "1", "--jobs"]
+    assert main([*words, "1"]) == 0
+    assert "cannot be sent to another process" in refused(*words, "2")
+
+
 def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures of another format go."""
     monkeypatch.setattr(registry, "_registered", {})
