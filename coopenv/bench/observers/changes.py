@@ -15,7 +15,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
-from coopenv.estimation.poses import exp_so3
+from coopenv.estimation.poses import about_z
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
@@ -80,9 +80,10 @@ def with_random_bearings(recording: Recording, fault: Fault, seed: int) -> Recor
 def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
     late = np.arange(recording.ticks) >= _first_tick(recording, fault)
-    bias = fault.value * np.outer(late, _on(recording, fault))[..., None] * (0.0, 0.0, 1.0)
-    rotation = recording.rotation @ exp_so3(bias * recording.dt)
-    return replace(recording, rotation=rotation, angular_velocity=recording.angular_velocity + bias)
+    bias = fault.value * np.outer(late, _on(recording, fault))
+    angular_velocity = recording.angular_velocity + bias[..., None] * (0.0, 0.0, 1.0)
+    rotation = recording.rotation @ about_z(bias * recording.dt)
+    return replace(recording, rotation=rotation, angular_velocity=angular_velocity)
 
 
 def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:
