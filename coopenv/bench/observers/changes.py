@@ -15,7 +15,6 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
-from coopenv.estimation.poses import about_z
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets, processing_order
 
@@ -79,6 +78,8 @@ def with_random_bearings(recording: Recording, fault: Fault, seed: int) -> Recor
 
 def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
+    from coopenv.estimation.poses import about_z  # late: `coopenv list variants` imports this module, and no Numba
+
     late = np.arange(recording.ticks) >= _first_tick(recording, fault)
     bias = fault.value * np.outer(late, _on(recording, fault))
     angular_velocity = recording.angular_velocity + bias[..., None] * (0.0, 0.0, 1.0)
