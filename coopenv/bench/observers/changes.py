@@ -80,8 +80,7 @@ def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Add a bias, rad/s, to the vertical axis of gyros from a time on."""
     from coopenv.estimation.poses import about_z  # late: `coopenv list variants` imports this module, and no Numba
 
-    late = np.arange(recording.ticks) >= _first_tick(recording, fault)
-    bias = fault.value * np.outer(late, _on(recording, fault))
+    bias = fault.value * np.outer(np.arange(recording.ticks) >= _first_tick(recording, fault), _on(recording, fault))
     angular_velocity = recording.angular_velocity + bias[..., None] * (0.0, 0.0, 1.0)
     rotation = recording.rotation @ about_z(bias * recording.dt)
     return replace(recording, rotation=rotation, angular_velocity=angular_velocity)
