@@ -66,7 +66,10 @@ def _work(pipe: Connection) -> None:
     """Do tasks as they come: send (part,) each, then () or the exception that ended the task."""
     end_with_parent()
     while True:
-        task = pipe.recv()
+        try:
+            task = pipe.recv()
+        except EOFError:  # the parent was interrupted before it sent a task
+            return
         try:
             for part in task.parts():
                 pipe.send((part,))

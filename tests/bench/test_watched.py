@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 from pathlib import Path
 
 import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import find_executor
+from coopenv.bench.watched import _work
 from coopenv.cli import main
+from tests.helpers.processes import DEADLOCK
 
 PLUGINS = '''
 import ctypes, os, subprocess, sys, time
@@ -120,3 +123,16 @@ def test_what_waits_delegates_or_crashes_is_ended(tmp_path: Path, monkeypatch: p
 def test_a_cluster_has_limits_of_its_own() -> None:
     with pytest.raises(CoopenvError, match="--memory 100: with --engine ray the cluster decides"):
         find_executor("ray", mebibytes=100.0)
+
+
+def test_a_worker_that_gets_no_task_ends_in_silence(capfd: pytest.CaptureFixture[str]) -> None:
+    """As when its parent is interrupted before it sends one."""
+    context = multiprocessing.get_context("spawn")
+    pipe, other = context.Pipe()
+    process = context.Process(target=_work, args=(other,))
+    process.start()
+    other.close()
+    pipe.close()
+    process.join(DEADLOCK)
+    assert process.exitcode == 0
+    assert capfd.readouterr().err == ""
