@@ -121,8 +121,8 @@ class Intruder:
             make(GATE_TYPES[Role.COMMAND], header=about, drive={"speed": self._speed if speed is None else speed})
         )
 
-    def _arm(self, car: str, late: float = 0.0) -> bytes:
-        about, nonce = header(time.time_ns() - round(late * 1e9)), self.gates.states[car].nonce
+    def _arm(self, car: str) -> bytes:
+        about, nonce = header(time.time_ns()), self.gates.states[car].nonce
         return encode(make(GATE_TYPES[Role.ARM], header=about, session="s", nonce=nonce, armed=True))
 
     def _gate(self, role: Role, make_payload: Send, signer: Signer | None = None) -> Send:
@@ -140,12 +140,15 @@ class Intruder:
         command = self._gate(Role.COMMAND, self._command, signer)
         return lambda car, i: (command if i % 2 else arm)(car, i)
 
-    def _under(self, *names: str, payload: Callable[[], bytes] | None = None) -> Send:
-        """Return what puts a driving command under one key after the other; `{car}` and `{wheels}` are filled in."""
+    def _under(self, *names: str, payload: Send | None = None, mode: str = "client") -> Send:
+        """Return what puts a driving command, or a payload, under one key after the other.
+
+        `{car}` and `{wheels}` are filled in.
+        """
 
         def send(car: str, i: int) -> None:
             key = names[i % len(names)].format(car=car, wheels=self.profile.topic_of(car, Role.MANUAL))
-            self.put(key, (payload or self.manual)())
+            self.put(key, payload(car, i) if payload else self.manual(), mode=mode)
 
         return send
 
@@ -201,30 +204,25 @@ class Intruder:
                 "fleet/**", "**", "fleet/*/mavros/**", "fleet/{car}/**/send", "{wheels}/**", "fleet/*/*/*/*"
             ),
             "by a declared key and publisher": self._declared,
-            "as a peer": lambda car, _: self.put(self.profile.topic_of(car, Role.MANUAL), self.manual(), mode="peer"),
-            "as a router": lambda car, _: self.put(
-                self.profile.topic_of(car, Role.MANUAL), self.manual(), mode="router"
-            ),
+            "as a peer": self._under(wheels, mode="peer"),
+            "as a router": self._under(wheels, mode="router"),
             "as a deletion": lambda car, _: self.session().delete(self.profile.topic_of(car, Role.MANUAL)),
-            "in the other byte order": self._under(wheels, payload=self._big_endian),
-            "random bytes to the wheels": self._under(wheels, payload=lambda: self._bytes(0, 200)),
-            "a repetition of the gate's own": lambda car, _: self.put(
-                self.profile.topic_of(car, Role.MANUAL), self._seen.get(car) or self.manual()
+            "in the other byte order": self._under(wheels, payload=lambda *_: self._big_endian()),
+            "random bytes to the wheels": self._under(wheels, payload=lambda *_: self._bytes(0, 200)),
+            "a repetition of the gate's own": self._under(
+                wheels, payload=lambda car, _: self._seen.get(car) or self.manual()
             ),
             "under other names of the topic": self._under(
                 *("{car}/mavros/manual_control/send", "self/mavros/manual_control/send", "mavros/manual_control/send"),
                 *("rt/{wheels}", "fleet/{car}/mavros/manual_control/control", "fleet/{car}/lli/ctrl_request"),
             ),
             "override of the remote control": self._under(
-                "fleet/{car}/mavros/rc/override", payload=lambda: ENCAPSULATION + struct.pack("<18H", *[1900] * 18)
+                "fleet/{car}/mavros/rc/override", payload=lambda *_: ENCAPSULATION + struct.pack("<18H", *[1900] * 18)
             ),
             "setpoints and MAVLink": self._under(
                 *("fleet/{car}/mavros/setpoint_velocity/cmd_vel_unstamped", "fleet/{car}/mavros/setpoint_raw/attitude"),
-                *(
-                    "fleet/{car}/mavros/actuator_control",
-                    "fleet/{car}/mavros/tunnel/in",
-                    "fleet/{car}/uas1/mavlink_sink",
-                ),
+                *("fleet/{car}/mavros/actuator_control", "fleet/{car}/mavros/tunnel/in"),
+                "fleet/{car}/uas1/mavlink_sink",
             ),
             "services: arming, mode, parameters": self._ask(
                 *("fleet/{car}/mavros/cmd/arming", "fleet/{car}/mavros/set_mode", "fleet/{car}/mavros/cmd/command"),
@@ -243,14 +241,12 @@ class Intruder:
                 Role.COMMAND, lambda car, i: self._command(car, i, late=(-60.0, 60.0)[i % 2]), self._forger
             ),
             "beyond all limits": gate(
-                Role.COMMAND,
-                lambda car, i: self._command(car, i, (np.nan, np.inf, 50.0, -50.0)[i % 4]),
-                self._forger,
+                Role.COMMAND, lambda car, i: self._command(car, i, (np.nan, np.inf, 50.0, -50.0)[i % 4]), self._forger
             ),
             "random bytes to the gate": gate(Role.COMMAND, lambda car, i: self._bytes(0, 600)),
             "up to 200 kB to the gate": gate(Role.ARM, lambda car, i: self._bytes(513, 600 if i % 20 else 200_000)),
-            "armings under wildcards": lambda car, i: self.put(
-                ("fleet/*/coopenv/arm", "fleet/*/coopenv/*", "fleet/**")[i % 3], self._arm(car)
+            "armings under wildcards": self._under(
+                "fleet/*/coopenv/arm", "fleet/*/coopenv/*", "fleet/**", payload=lambda car, _: self._arm(car)
             ),
             "release of the emergency stop": gate(
                 Role.STOP, lambda car, i: encode(make(GATE_TYPES[Role.STOP], data=False))
