@@ -9,7 +9,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, message_types, needing
-from coopenv.cars.profile import SVEA, CarProfile
+from coopenv.cars.profile import IMAGES, SVEA, CarProfile
 
 TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""
@@ -17,8 +17,8 @@ TICK = "coopenv_msgs/msg/Tick"
 STOPPED = "coopenv_msgs/msg/Stopped"
 """Type of the message there with the reason for which the watchdog stopped the cars."""
 
-MOST_BYTES = 65_536
-"""Of one message: a frame of a camera with 7 colours has hundreds of bytes, and nothing here has images."""
+MOST_BYTES, MOST_FRAME = 65_536, 2**25
+"""Of one message, and of a frame of a camera."""
 
 
 @cache
@@ -121,8 +121,8 @@ def cdr_of(payload: bytes, kind: str) -> bytes:
 
 
 def _decoded(read: Any, payload: bytes, kind: str) -> Any:
-    if len(payload) > MOST_BYTES:
-        raise CoopenvError(f"{kind}: {len(payload)} bytes are over {MOST_BYTES}")
+    if len(payload) > (most := MOST_FRAME if kind in IMAGES else MOST_BYTES):
+        raise CoopenvError(f"{kind}: {len(payload)} bytes are over {most}")
     try:
         return read(payload, kind)
     except Exception as error:  # whatever the library raises at bytes that make no sense

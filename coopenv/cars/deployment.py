@@ -297,7 +297,8 @@ class Deployment(Section):
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
     profile: CarProfile = SVEA
-    """Make of the cars: a shipped profile, `svea`, or a TOML file (relative to this file)."""
+    """Make of the cars: a shipped profile, `svea`; a TOML file (relative to this file); or a table of what differs from
+    the profile `base`."""
     cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
     """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
@@ -326,6 +327,11 @@ class Deployment(Section):
             if value > most:
                 raise ValueError(f"safety.{key}: {value:g} is over {most:.4g}, the largest of this make")
         refuse_foreign(self.network.kind, self.gate_connect, "gate.connect")
+        if self.profile.sees_frames and (self.sensors.detections, self.sensors.distorted) != ("bearings", False):
+            raise ValueError(
+                "sensors: frames are not sent to the station: `coopenv svea see` makes bearings of them on the car, "
+                'and here detections = "bearings" and distorted = false'
+            )
         return self
 
     @property
@@ -391,7 +397,8 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
 
 def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
     """Validate plain data that stands, or could stand, in a file; errors as for `load_deployment`."""
-    if isinstance(given := raw.get("profile"), str):
+    given = raw.get("profile")
+    if isinstance(given, str) or (isinstance(given, dict) and "base" in given):
         try:
             raw = {**raw, "profile": load_profile(given, path.parent)}
         except CoopenvError as error:

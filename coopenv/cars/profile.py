@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, shown, suggest
 from coopenv.base.sections import Section, read_toml, validated
 
 
@@ -285,6 +285,47 @@ class RemotePulses(Section):
     """Longest pulse that is a signal."""
 
 
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+"""Types of a camera's frames."""
+
+FAMILIES = (
+    *("tag16h5", "tag25h9", "tag36h10", "tag36h11"),
+    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12"),
+)
+"""Families of tags: AprilTag's as they are called there, ArUco's as in OpenCV."""
+
+
+def _family(name: str) -> str:
+    check_one_of("unknown family", name, FAMILIES, ValueError)
+    return name
+
+
+Hue = Annotated[float, Field(ge=0.0, le=360.0)]
+
+
+class VisionSettings(Section):
+    """Frames of a camera, and tags that were detected in them."""
+
+    family: Annotated[str, AfterValidator(_family)] = "tag36h11"
+    """Family of the tags: `tag16h5` to `tag36h11` of AprilTag, `DICT_4X4_50` to `DICT_7X7_1000` of ArUco."""
+    colours: dict[int, tuple[Hue, Hue]] = Field(default={})
+    """Hues, deg, from the first to the second (red 0, green 120, blue 240), by number of a marker. With any, blobs of
+    these colours are found instead of tags."""
+    exposure: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Time of exposure, s: half of it is added to the stamps, which are those of its begin."""
+    row_time: float = Field(default=0.0, ge=0.0, le=1e-3)
+    """Time from a row to the next of a rolling shutter, s: that of the tags is added to the stamps, which are those of
+    the first row."""
+    rectified: bool = False
+    """Whether pixels are those of rectified frames (`image_rect`): the matrix P of CameraInfo counts, no distortion."""
+
+    def late(self, rows: Sequence[float], height: int) -> int:
+        """Return the time, ns, from a stamp to the middle of the exposure of rows; none: of the middle row."""
+        row = sum(rows) / len(rows) if rows else 0.5 * height
+        return round(1e9 * (0.5 * self.exposure + self.row_time * row))
+
+
 class CarProfile(Section):
     """What differs between makes of cars."""
 
@@ -300,6 +341,13 @@ class CarProfile(Section):
     """Topics that a car must send before it is armed."""
     pulses: RemotePulses = RemotePulses()
     """Pulses of the remote control."""
+    vision: VisionSettings = VisionSettings()
+    """Tags, where `topics.detections` has frames or tags."""
+
+    @property
+    def sees_frames(self) -> bool:
+        """Whether cameras publish frames, which `coopenv svea see` reads on the car."""
+        return self.topics[Role.DETECTIONS].type in IMAGES
 
     @model_validator(mode="after")
     def _has_all_topics(self) -> Self:
@@ -323,23 +371,34 @@ class CarProfile(Section):
 FOLDER = Path(__file__).parent / "profiles"
 
 
-def load_profile(name: str, folder: Path = FOLDER) -> CarProfile:
-    """Read a profile.
+def load_profile(given: str | Mapping[str, Any], folder: Path = FOLDER) -> CarProfile:
+    """Return a profile.
 
     Args:
-        name: of a shipped profile, or a TOML file.
-        folder: what the path of a file is relative to.
+        given: name of a shipped profile, a TOML file, or its content. With `base`, the name of another one, it has
+            only what differs: entries of the tables, and whole topics.
+        folder: what the paths of files are relative to.
 
     Raises:
         CoopenvError: one line that names the file and the field.
     """
+    raw, where = _read(given, folder) if isinstance(given, str) else (dict(given), "profile")
+    if isinstance(base := raw.pop("base", None), str):
+        for key, value in _read(base, folder)[0].items():
+            own = raw.get(key, value)
+            raw[key] = {**value, **own} if isinstance(value, dict) and isinstance(own, dict) else own
+    return validated(CarProfile, raw, where)
+
+
+def _read(name: str, folder: Path) -> tuple[dict[str, Any], str]:
+    """Return the content of a profile and its file's name."""
     path = folder / name if name.endswith(".toml") else FOLDER / f"{name}.toml"
     known = sorted(file.stem for file in FOLDER.glob("*.toml"))
     if not name.endswith(".toml") and name not in known:
         raise CoopenvError(
             f"unknown profile {shown(name)}{suggest(name, known)}; known: {listed(known)}, or a TOML file"
         )
-    return validated(CarProfile, read_toml(path), path.name)
+    return read_toml(path), path.name
 
 
 SVEA = load_profile("svea")

@@ -1,19 +1,16 @@
-"""Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2; rays of a camera's pixels."""
+"""Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
-from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role
-from coopenv.cars.vision import FINDERS, Lens, VisionSettings
-from coopenv.estimation.lens import undistort
+from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role, VisionSettings
+from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import base
@@ -44,21 +41,6 @@ class CarPose:
     position: Array  # (3,) m
     rotation: Array | None = None  # (3, 3) body to map
     covariance: Array | None = None  # (6, 6) position then rotation about the map's axes, as ROS has it
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """Intrinsics of a camera; the number of coefficients is that of a model of `coopenv.estimation.lens`."""
-
-    image_size: tuple[int, int]
-    focal_length: tuple[float, float]
-    principal_point: tuple[float, float]
-    distortion: tuple[float, ...]
-
-    @classmethod
-    def of(cls, camera: Any) -> Self:
-        """Return the intrinsics of a camera of the scenario."""
-        return cls(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +94,6 @@ def covariance_of(values: Any, field: str) -> Array:
     return matrix
 
 
-UNIT = 1e-3
-"""How far from 1 the length of a quaternion or a bearing may be: single precision and rounded decimals are nearer."""
-
-
 def rotation_of(quaternion: Any, field: str) -> Array:
     """Return the rotation matrix (3, 3) of a message's quaternion. Raises CoopenvError: its length is not 1."""
     wxyz = [float(getattr(quaternion, part)) for part in "wxyz"]
@@ -125,107 +103,28 @@ def rotation_of(quaternion: Any, field: str) -> Array:
     return base.rotation_of(None, wxyz)
 
 
-def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the rays of pixels.
-
-    Args:
-        pixels: (m, 2) to the right and down from the image's corner.
-        calibration: of the camera.
-
-    Returns:
-        (m, 3) unit vectors in the optical frame, and (m,) which are rays: of pixels in the image that the lens gives.
-    """
-    size, focal, centre = (
-        np.asarray(v, dtype=np.float64)
-        for v in (calibration.image_size, calibration.focal_length, calibration.principal_point)
-    )
-    inside = ((pixels >= 0.0) & (pixels < size)).all(axis=-1)
-    flat, there = undistort((pixels - centre) / focal, calibration.distortion)
-    through = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
-    return through / np.linalg.norm(through, axis=-1, keepdims=True), inside & there
-
-
-@lru_cache(maxsize=2**17)
-def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, float] | None:
-    """Return the ray of a whole pixel, as `rays` does; None: it has none. There are few enough to remember them all."""
-    unit, there = rays(np.array([[u, v]], dtype=np.float64), calibration)
-    x, y, z = unit[0].tolist()
-    return (x, y, z) if there[0] else None
-
-
 MOST = 1000
-"""Blocks of a frame."""
-
-
-def detections(message: Any, calibration: Calibration, known: Collection[int] | None) -> Detections:
-    """Return the bearings of an ObjectInfoArrayStamped, by the largest block of each marker.
-
-    Dropped and counted: other blocks of a marker, those of unknown markers, without an area, or outside the image.
-    """
-    blocks = _few(message.objects, "objects")
-    width, height = calibration.image_size
-    found = []
-    for block in blocks:
-        u, v, marker = int(block.center_x), int(block.center_y), int(block.signature)
-        if 0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0:
-            found.append((marker, int(block.width) * int(block.height), ray_of(calibration, u, v)))
-    return _largest(found, len(blocks), known)
-
-
-def bearings(message: Any, calibration: Calibration | None, known: Collection[int] | None) -> Detections:
-    """Return the bearings of an ObjectBearingArrayStamped, whose vectors point from the target to the camera.
-
-    Args:
-        message: of the authors' node, which keeps the order of the camera, largest block first: the first counts.
-        calibration: of the camera if distortion was not removed from the pixels of the vectors: then they give back
-            the pixels. None: it was.
-        known: markers that there are (None: all).
-
-    Dropped and counted: later ones of a marker, those of unknown markers, without length 1, and with a calibration
-    those outside the image.
-    """
-    rows = [(b.id, b.bearing_x, b.bearing_y, b.bearing_z) for b in _few(message.bearing, "bearing")]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    with np.errstate(all="ignore"):
-        rays_ = -table[:, 1:]
-        lengths = np.linalg.norm(rays_, axis=-1)
-        there = np.abs(lengths - 1.0) <= UNIT
-        rays_ /= lengths[:, None]
-        if calibration is not None:
-            there &= rays_[:, 2] > 1e-6
-            flat = np.where(there[:, None], rays_[:, :2] / rays_[:, 2:], 0.0)
-            pixels = flat * calibration.focal_length + np.asarray(calibration.principal_point)
-            rays_, imaged = rays(np.round(pixels, 3), calibration)  # of single precision
-            there &= imaged
-    found = [(int(marker), 0, ray) for marker, ray in zip(table[there, 0], rays_[there], strict=True)]
-    return _largest(found, len(table), known)
+"""Detections in a frame."""
 
 
 def tags(
-    message: Any, calibration: Calibration, known: Collection[int] | None, vision: VisionSettings = PLAIN
+    message: Any, camera: Calibration | None, known: Collection[int] | None, vision: VisionSettings = PLAIN
 ) -> Detections:
-    """Return the bearings of tags in a frame, or of another detector's message, by the largest of each number."""
-    lens = Lens(calibration.image_size, partial(rays, calibration=calibration))
-    found = FINDERS[message.__msgtype__](message, vision, lens)
-    late = vision.late([tag.row for tag in found if tag.row is not None], lens.image_size[1])
-    return replace(_largest([tag[:3] for tag in found], len(found), known), late=late)
+    """Return the bearings of a frame or of a detector's message, by the first largest entry of each known number.
 
-
-def _few(entries: Any, field: str) -> Any:
-    if len(entries) > MOST:
-        raise CoopenvError(f"{field}: {len(entries)} entries, a camera has at most {MOST}")
-    return entries
-
-
-def _largest(found: Sequence[tuple[int, float, Any]], total: int, known: Collection[int] | None) -> Detections:
-    """Return the first largest entry (marker, size, ray or None) of each known marker, of so many entries in all."""
-    best: dict[int, tuple[float, Any]] = {}
-    for marker, size, ray in found:
-        counts = ray is not None and (known is None or marker in known)
-        if counts and (marker not in best or size > best[marker][0]):
-            best[marker] = size, ray
-    unit = np.array([best[marker][1] for marker in sorted(best)], dtype=np.float64).reshape(-1, 3)
-    return Detections(tuple(sorted(best)), unit, total - len(best))
+    Dropped and counted: others of a number, those of unknown numbers, and those without a ray, see `FINDERS`.
+    """
+    found, best = FINDERS[message.__msgtype__](message, vision, camera), dict[int, Tag]()
+    if len(found) > MOST:
+        raise CoopenvError(f"{len(found)} detections, a camera has at most {MOST}")
+    for tag in found:
+        counts = tag.ray is not None and (known is None or tag.number in known)
+        if counts and (tag.number not in best or tag.size > best[tag.number].size):
+            best[tag.number] = tag
+    units = np.array([best[number].ray for number in sorted(best)], dtype=np.float64).reshape(-1, 3)
+    rows = [tag.row for tag in found if tag.row is not None]
+    late = vision.late(rows, camera.image_size[1]) if camera else 0
+    return Detections(tuple(sorted(best)), units, len(found) - len(best), late)
 
 
 LONGEST_MODE = 64  # characters
@@ -317,9 +216,8 @@ def read(
         needed = role is Role.DETECTIONS or distorted
         if needed and calibration is None:
             raise CoopenvError("the camera's calibration is not known")
-        if kind in FINDERS and calibration is not None:
-            return tags(message, calibration, known, vision)
-        return readers[kind](message, calibration if needed else None, known)
+        settings = vision if role is Role.DETECTIONS else PLAIN  # bearings have their final stamps
+        return tags(message, calibration if needed else None, known, settings)
     except CoopenvError as error:
         raise CoopenvError(f"{role}: {error}") from None
 
@@ -381,8 +279,8 @@ TWISTS: dict[str, Callable[[Any], Value]] = {
     "nav_msgs/msg/Odometry": lambda message: Twist(*_velocities(message.twist.twist)),  # in the child frame
 }
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
-    Role.DETECTIONS: {"pixy_camera/msg/ObjectInfoArrayStamped": detections, **dict.fromkeys(FINDERS, tags)},
-    Role.BEARINGS: {"pixy_camera/msg/ObjectBearingArrayStamped": bearings},
+    Role.DETECTIONS: {kind: tags for kind in FINDERS if kind != BEARINGS},
+    Role.BEARINGS: {BEARINGS: tags},
     Role.CAMERA_INFO: {"sensor_msgs/msg/CameraInfo": calibration_of},
     Role.ODOMETRY: TWISTS,
     Role.WHEEL: TWISTS,

@@ -1,61 +1,72 @@
-"""Square tags, AprilTag and ArUco, in frames of a camera, and tags by other detectors."""
+"""Bearings of a camera: tags (AprilTag, ArUco) or colours in its frames, and the messages of other detectors."""
 
 import os
-from collections.abc import Callable
-from functools import cache
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
 from scipy.ndimage import map_coordinates
 
-from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
+from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.base.installation import install_command, needing
-from coopenv.base.sections import Section
+from coopenv.cars.profile import IMAGES, VisionSettings
+from coopenv.estimation.lens import distort, undistort
 from coopenv.estimation.poses import Array
 
-FAMILIES = (
-    *("tag16h5", "tag25h9", "tag36h10", "tag36h11"),
-    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
-    *("DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12"),
-)
-"""AprilTag's as they are called there, ArUco's as in OpenCV."""
 
-
-def _family(name: str) -> str:
-    try:
-        check_one_of("unknown family", name, FAMILIES)
-    except CoopenvError as error:
-        raise ValueError(str(error)) from None
-    return name
-
-
-class VisionSettings(Section):
-    """Frames of a camera, and tags that were detected in them."""
-
-    family: Annotated[str, AfterValidator(_family)] = "tag36h11"
-    """Family of the tags: `tag16h5` to `tag36h11` of AprilTag, `DICT_4X4_50` to `DICT_7X7_1000` of ArUco."""
-    exposure: float = Field(default=0.0, ge=0.0, le=1.0)
-    """Time of exposure, s: half of it is added to the stamps, which are those of its begin."""
-    row_time: float = Field(default=0.0, ge=0.0, le=1e-3)
-    """Time from a row to the next of a rolling shutter, s: that of the tags is added to the stamps, which are those of
-    the first row."""
-    rectified: bool = False
-    """Whether pixels are those of rectified frames (`image_rect`): the matrix P of CameraInfo counts, no distortion."""
-
-    def late(self, rows: list[float], height: int) -> int:
-        """Return the time, ns, from a stamp to the middle of the exposure of rows; none: of the middle row."""
-        row = sum(rows) / len(rows) if rows else 0.5 * height
-        return round(1e9 * (0.5 * self.exposure + self.row_time * row))
-
-
-class Lens(NamedTuple):
-    """What a frame needs of a camera."""
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Intrinsics of a camera; the number of coefficients is that of a model of `coopenv.estimation.lens`."""
 
     image_size: tuple[int, int]
-    rays: Callable[[Array], tuple[Array, NDArray[np.bool_]]]
-    """Of pixels (m, 2): unit vectors (m, 3) in the optical frame, and which are rays."""
+    focal_length: tuple[float, float]
+    principal_point: tuple[float, float]
+    distortion: tuple[float, ...]
+
+    @classmethod
+    def of(cls, camera: Any) -> Self:
+        """Return the intrinsics of a camera of the scenario."""
+        return cls(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)
+
+    def pixels(self, points: Array) -> Array:
+        """Return the pixels (m, 2) of points (m, 3) ahead, in the optical frame."""
+        flat = distort(points[:, :2] / points[:, 2:], self.distortion)
+        return np.asarray(flat * self.focal_length + np.asarray(self.principal_point))
+
+
+def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the rays of pixels.
+
+    Args:
+        pixels: (m, 2) to the right and down from the image's corner.
+        calibration: of the camera.
+
+    Returns:
+        (m, 3) unit vectors in the optical frame, and (m,) which are rays: of pixels in the image that the lens gives.
+    """
+    size, focal, centre = (
+        np.asarray(v, dtype=np.float64)
+        for v in (calibration.image_size, calibration.focal_length, calibration.principal_point)
+    )
+    inside = ((pixels >= 0.0) & (pixels < size)).all(axis=-1)
+    flat, there = undistort((pixels - centre) / focal, calibration.distortion)
+    through = np.concatenate([flat, np.ones((len(flat), 1))], axis=-1)
+    return through / np.linalg.norm(through, axis=-1, keepdims=True), inside & there
+
+
+@lru_cache(maxsize=2**17)
+def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, float] | None:
+    """Return the ray of a whole pixel, as `rays` does; None: it has none. There are few enough to remember them all."""
+    unit, there = rays(np.array([[u, v]], dtype=np.float64), calibration)
+    x, y, z = unit[0].tolist()
+    return (x, y, z) if there[0] else None
+
+
+UNIT = 1e-3
+"""How far from 1 the length of a quaternion or a bearing may be: single precision and rounded decimals are nearer."""
 
 
 class Tag(NamedTuple):
@@ -63,33 +74,68 @@ class Tag(NamedTuple):
 
     number: int
     size: float  # larger ones of the same number are preferred
-    ray: Array | None  # (3,) unit vector camera -> its centre, optical frame; None: it has none
+    ray: Sequence[float] | Array | None  # (3,) unit vector camera -> its centre, optical frame; None: it has none
     row: float | None = None  # of the image
 
 
-Find = Callable[[Any, VisionSettings, Lens], list[Tag]]
-"""Returns the tags of a message. Raises CoopenvError: it is malformed, or no extra."""
+Find = Callable[[Any, VisionSettings, Any], list[Tag]]
+"""Returns the tags of a message by the Calibration of its camera (None: bearings without distortion).
+
+Raises CoopenvError: it is malformed, or no extra."""
 
 
-def _frame(message: Any, settings: VisionSettings, lens: Lens) -> list[Tag]:
-    """Return the tags in an Image or CompressedImage."""
-    gray = gray_of(message)
-    if gray.shape[::-1] != lens.image_size:
-        width, height = lens.image_size
-        raise CoopenvError(f"{gray.shape[1]} x {gray.shape[0]} pixels, the camera model has {width} x {height}")
-    return find_tags(gray, settings.family, lens)
+def _blocks(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
+    """Return those of an ObjectInfoArrayStamped; without an area, or outside the image, they have no ray."""
+    found, (width, height) = [], camera.image_size
+    for block in message.objects:
+        u, v, area = int(block.center_x), int(block.center_y), int(block.width) * int(block.height)
+        valid = 0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0
+        found.append(Tag(int(block.signature), area, ray_of(camera, u, v) if valid else None))
+    return found
 
 
-def _apriltags(message: Any, _settings: VisionSettings, lens: Lens) -> list[Tag]:
+def _bearings(message: Any, _settings: VisionSettings, camera: Calibration | None) -> list[Tag]:
+    """Return those of an ObjectBearingArrayStamped, whose vectors point from the target to the camera.
+
+    The authors' node keeps the order of its camera, largest block first. With a camera, distortion was not removed from
+    the pixels of the vectors: then they give back the pixels. Those without length 1 have no ray.
+    """
+    table = np.array([(b.id, b.bearing_x, b.bearing_y, b.bearing_z) for b in message.bearing]).reshape(-1, 4)
+    with np.errstate(all="ignore"):
+        units = -table[:, 1:]
+        lengths = np.linalg.norm(units, axis=-1)
+        there = np.abs(lengths - 1.0) <= UNIT
+        units /= lengths[:, None]
+        if camera is not None:
+            there &= units[:, 2] > 1e-6
+            flat = np.where(there[:, None], units[:, :2] / units[:, 2:], 0.0)
+            pixels = flat * camera.focal_length + np.asarray(camera.principal_point)
+            units, imaged = rays(np.round(pixels, 3), camera)  # of single precision
+            there &= imaged
+    return [Tag(int(n), 0.0, ray if ok else None) for n, ray, ok in zip(table[:, 0], units, there, strict=True)]
+
+
+def _frame(message: Any, settings: VisionSettings, camera: Calibration) -> list[Tag]:
+    """Return the tags, or the blobs of colour, in an Image or CompressedImage."""
+    frame = frame_of(message, "BGR" if settings.colours else "GRAY")
+    if frame.shape[1::-1] != camera.image_size:
+        width, height = camera.image_size
+        raise CoopenvError(f"{frame.shape[1]} x {frame.shape[0]} pixels, the camera model has {width} x {height}")
+    if settings.colours:
+        return find_blobs(frame, settings.colours, camera)
+    return find_tags(frame, settings.family, camera)
+
+
+def _apriltags(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
     """Return those of an AprilTagDetectionArray; its centres are those of the projection."""
     found = [
         (d.id, np.ptp([p.x for p in d.corners]) * np.ptp([p.y for p in d.corners]), d.centre.x, d.centre.y)
         for d in message.detections
     ]
-    return _centred(found, lens)
+    return _centred(found, camera)
 
 
-def _boxes(message: Any, _settings: VisionSettings, lens: Lens) -> list[Tag]:
+def _boxes(message: Any, _settings: VisionSettings, camera: Calibration) -> list[Tag]:
     """Return those of a Detection2DArray: the class of the best hypothesis is the number."""
     found = []
     for detection in message.detections:
@@ -100,19 +146,19 @@ def _boxes(message: Any, _settings: VisionSettings, lens: Lens) -> list[Tag]:
             box = detection.bbox
             place = getattr(box.center, "position", box.center)
             found.append((int(label), box.size_x * box.size_y, place.x, place.y))
-    return _centred(found, lens)
+    return _centred(found, camera)
 
 
-def _centred(found: list[tuple[int, float, float, float]], lens: Lens) -> list[Tag]:
+def _centred(found: list[tuple[int, float, float, float]], camera: Calibration) -> list[Tag]:
     """Return tags of number, size, and centre in pixels."""
     table = np.array(found, dtype=np.float64).reshape(-1, 4)
     with np.errstate(all="ignore"):  # what is not finite is no ray
-        units, there = lens.rays(table[:, 2:])
+        units, there = rays(table[:, 2:], camera)
     rows = zip(found, units, there, strict=True)
     return [Tag(int(n), size, ray if known else None, v if known else None) for (n, size, _, v), ray, known in rows]
 
 
-def _markers(message: Any, _settings: VisionSettings, _lens: Lens) -> list[Tag]:
+def _markers(message: Any, _settings: VisionSettings, _: Calibration) -> list[Tag]:
     """Return those of the authors' ArucoArray, or of a MarkerArray: positions in the camera's optical frame."""
     found = []
     entries: Any = message.arucos if hasattr(message, "arucos") else message.markers
@@ -125,8 +171,10 @@ def _markers(message: Any, _settings: VisionSettings, _lens: Lens) -> list[Tag]:
     return found
 
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+BEARINGS = "pixy_camera/msg/ObjectBearingArrayStamped"
 FINDERS: dict[str, Find] = {
+    "pixy_camera/msg/ObjectInfoArrayStamped": _blocks,
+    BEARINGS: _bearings,
     **dict.fromkeys(IMAGES, _frame),
     "apriltag_msgs/msg/AprilTagDetectionArray": _apriltags,
     "vision_msgs/msg/Detection2DArray": _boxes,
@@ -148,28 +196,29 @@ def opencv() -> Any:
 
 
 ENCODINGS = {
-    **dict.fromkeys(("mono8", "8UC1"), (1, "u1", "")),
-    **dict.fromkeys(("mono16", "16UC1"), (1, "u2", "")),
-    **dict.fromkeys(("bgr8", "8UC3"), (3, "u1", "BGR2GRAY")),
-    **dict.fromkeys(("bgra8", "8UC4"), (4, "u1", "BGRA2GRAY")),
-    "rgb8": (3, "u1", "RGB2GRAY"),
-    "rgba8": (4, "u1", "RGBA2GRAY"),
-    **dict.fromkeys(("yuv422", "uyvy"), (2, "u1", "YUV2GRAY_UYVY")),
-    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "u1", "YUV2GRAY_YUY2")),
-    "bayer_rggb8": (1, "u1", "BayerBG2GRAY"),
-    "bayer_bggr8": (1, "u1", "BayerRG2GRAY"),
-    "bayer_gbrg8": (1, "u1", "BayerGR2GRAY"),
-    "bayer_grbg8": (1, "u1", "BayerGB2GRAY"),
+    **dict.fromkeys(("mono8", "8UC1"), (1, "u1", "GRAY2{}")),
+    **dict.fromkeys(("mono16", "16UC1"), (1, "u2", "GRAY2{}")),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, "u1", "BGR2{}")),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, "u1", "BGRA2{}")),
+    "rgb8": (3, "u1", "RGB2{}"),
+    "rgba8": (4, "u1", "RGBA2{}"),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, "u1", "YUV2{}_UYVY")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "u1", "YUV2{}_YUY2")),
+    "bayer_rggb8": (1, "u1", "BayerBG2{}"),
+    "bayer_bggr8": (1, "u1", "BayerRG2{}"),
+    "bayer_gbrg8": (1, "u1", "BayerGR2{}"),
+    "bayer_grbg8": (1, "u1", "BayerGB2{}"),
 }
-"""Numbers per pixel, their type, and OpenCV's conversion."""
+"""Numbers per pixel, their type, and OpenCV's conversion to what is wanted."""
 
 
-def gray_of(message: Any) -> NDArray[np.uint8]:
-    """Return the frame (height, width) of an Image or CompressedImage in shades of grey."""
+def frame_of(message: Any, wanted: Literal["GRAY", "BGR"] = "GRAY") -> NDArray[np.uint8]:
+    """Return the frame of an Image or CompressedImage: (height, width) shades of grey, or with three colours each."""
     cv2, data = opencv(), np.ascontiguousarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
         try:
-            found = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+            mode = cv2.IMREAD_GRAYSCALE if wanted == "GRAY" else cv2.IMREAD_COLOR
+            found = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
         except cv2.error:  # beyond its limits
             found = None
         if found is None:
@@ -185,9 +234,31 @@ def gray_of(message: Any) -> NDArray[np.uint8]:
         raise CoopenvError(f"data: {len(data)} bytes are no {width} x {height} pixels with a step of {step}")
     frame = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used]).view(dtype)
     if dtype.itemsize == 2:
-        return np.asarray(cv2.normalize(frame.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
+        frame = np.asarray(cv2.normalize(frame.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
     frame = frame if channels == 1 else frame.reshape(height, width, channels)
-    return np.asarray(cv2.cvtColor(frame, getattr(cv2, f"COLOR_{conversion}"))) if conversion else frame
+    code = getattr(cv2, f"COLOR_{conversion.format(wanted)}", None)  # None: it is as wanted
+    return frame if code is None else np.asarray(cv2.cvtColor(frame, code))
+
+
+SATURATED, BRIGHT, FEWEST = 100, 60, 12
+"""Least saturation and brightness (of 255) and number of the pixels of a blob."""
+
+
+def find_blobs(frame: NDArray[np.uint8], colours: Mapping[int, tuple[float, float]], camera: Calibration) -> list[Tag]:
+    """Return the blobs of colours, hues in deg by number, in a frame of blue, green and red.
+
+    The ray is that of the mean of a blob's pixels.
+    """
+    cv2, found = opencv(), list[tuple[int, float, float, float]]()
+    hue, saturation, value = cv2.split(cv2.cvtColor(cv2.GaussianBlur(frame, (0, 0), 1.0), cv2.COLOR_BGR2HSV_FULL))
+    vivid = (saturation >= SATURATED) & (value >= BRIGHT)
+    for number, (first, last) in colours.items():
+        meant = (np.arange(256) * 360.0 / 256.0 - first) % 360.0 <= (last - first) % 360.0
+        mask = (meant[hue] & vivid).astype(np.uint8)
+        _, _, boxes, means = cv2.connectedComponentsWithStats(mask)
+        rows = zip(boxes[1:, cv2.CC_STAT_AREA], means[1:], strict=True)  # the first one is the background
+        found += [(number, area, x, y) for area, (x, y) in rows if area >= FEWEST]
+    return _centred(found, camera)
 
 
 @cache
@@ -207,7 +278,7 @@ def _detector(family: str) -> tuple[Any, int]:
     return aruco.ArucoDetector(dictionary, chosen), int(dictionary.markerSize) + 2
 
 
-def find_tags(gray: NDArray[np.uint8], family: str, lens: Lens) -> list[Tag]:
+def find_tags(gray: NDArray[np.uint8], family: str, camera: Calibration) -> list[Tag]:
     """Return the tags of a family in a frame.
 
     OpenCV finds and reads them. The places of their edges are then measured along normals of the sides, and each side
@@ -220,7 +291,7 @@ def find_tags(gray: NDArray[np.uint8], family: str, lens: Lens) -> list[Tag]:
         return []
     corners = np.array(quads, dtype=np.float64).reshape(-1, 4, 2)
     edges, weights = _edges(gray, corners, cells)
-    units, there = lens.rays(edges.reshape(-1, 2))
+    units, there = rays(edges.reshape(-1, 2), camera)
     units, weights = units.reshape((*edges.shape[:-1], 3)), weights * there.reshape(weights.shape)
     moments = np.einsum("msk,mski,mskj->msij", weights, units, units)
     planes = np.linalg.eigh(moments)[1][..., 0]  # (m, 4, 3) normals

@@ -181,14 +181,14 @@ def health(
     from coopenv.cars.backend.station import BYPASSED, FOREIGN, UNTRIED, neutral_command
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.process import gate_deployment
-    from coopenv.cars.profile import Role
+    from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import UNIX, LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
     topic = fleet.profile.topic_of(car, Role.GATE)
     with closing(open_transport(fleet)) as transport:
-        status = next_status(transport, topic, patience)
+        status = next_message(transport, topic, GATE_TYPES[Role.GATE], patience)
         if status is None:
             unset = not off_board and UNIX not in fleet.gate_connect[0]
             hint = "; with docker/car-zenoh.json5 set [gate] connect" if unset else ""
@@ -207,7 +207,7 @@ def health(
             with closing(open_transport(lab, timeout=1.0)) as outside:
                 outside.publish(*neutral_command(fleet.profile, car), reliable=True)
                 for _ in range(2):  # the first may have been under way
-                    status = next_status(transport, topic, patience) or status
+                    status = next_message(transport, topic, GATE_TYPES[Role.GATE], patience) or status
         except LinkError as error:
             print(f"{car}: not tried from outside: {error}")
             return
@@ -220,22 +220,58 @@ def _count(status: Any, reason: str) -> int:
     return int(dict(zip(status.rejections, status.counts, strict=True)).get(reason, 0))
 
 
-def next_status(transport: "Transport", topic: str, patience: float) -> Any | None:
-    """Return the next message of a gate's topic that is one (None: none within s); whatever else comes is dropped."""
+def next_message(transport: "Transport", topic: str, kind: str, patience: float) -> Any | None:
+    """Return the next message of a topic that is of a type (None: none within s); whatever else comes is dropped."""
     from coopenv.cars.codec import decode
-    from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import Arrival
 
     heard = Queue[Any](1)
 
     def keep(arrival: Arrival) -> None:
         with suppress(CoopenvError, Full):
-            heard.put_nowait(decode(arrival.payload, GATE_TYPES[Role.GATE]))
+            heard.put_nowait(decode(arrival.payload, kind))
 
     transport.subscribe(topic, keep)
     with suppress(Empty):
         return heard.get(timeout=patience)
     return None
+
+
+@svea.command()
+def see(
+    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that the car belongs to.")],
+    car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
+    connect: options.GateConnect = None,
+    off_board: options.OffBoard = False,
+    patience: Annotated[float, typer.Option(min=0.1, help="s to wait for the calibration of its camera.")] = 5.0,
+) -> None:
+    """Find the tags in a car's frames, the topic `detections`, and publish their bearings, until it is interrupted.
+
+    Runs on the car, beside the gate, with its connection. Frames that come faster than they are read are left out. The
+    messages of other detectors are read as well.
+    """
+    from coopenv.base import interrupts
+    from coopenv.cars.gate.process import gate_deployment
+    from coopenv.cars.profile import Role
+    from coopenv.cars.readings import read
+    from coopenv.cars.see import FrameReader
+    from coopenv.cars.transport.zenoh import open_transport
+    from coopenv.cars.vision import Calibration, opencv
+
+    fleet = gate_deployment(car, deployment, connect, off_board)
+    profile, topic = fleet.profile, fleet.profile.topic_of(car, Role.CAMERA_INFO)
+    if profile.sees_frames:
+        opencv()
+    with closing(open_transport(fleet)) as transport:
+        info = next_message(transport, topic, profile.topics[Role.CAMERA_INFO].type, patience)
+        if info is None:
+            raise CoopenvError(f"{car}: no calibration of its camera for {patience:g} s on {topic}")
+        calibration = read(Role.CAMERA_INFO, info, vision=profile.vision)
+        assert isinstance(calibration, Calibration)
+        reader = FrameReader(car, profile, calibration, transport)
+        interrupts.note(f"{car} sees no more")
+        print(f"{car}: see ready at {', '.join(fleet.network.connect)}", flush=True)
+        reader.run()
 
 
 @svea.command()

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.profile import Role
-from coopenv.cars.readings import Calibration, calibration_of, read
-from coopenv.cars.vision import VisionSettings
+from coopenv.cars.profile import Role, VisionSettings
+from coopenv.cars.readings import calibration_of, read
+from coopenv.cars.vision import Calibration
 
 CAMERA = Calibration((640, 480), (450.0, 455.0), (322.0, 236.0), (0.0,) * 5)
 PIXELS = {7: (100.0, 50.0), 3: (500.5, 400.0)}
@@ -66,6 +66,10 @@ def test_a_stamp_is_moved_to_the_exposure_of_the_rows_of_the_tags() -> None:
     vision = VisionSettings(exposure=0.01, row_time=2e-5)
     assert vision.late([100.0, 300.0], 480) == 5_000_000 + 4_000_000
     assert vision.late([], 480) == 5_000_000 + 4_800_000
+    message = Fields(bearing=[Fields(id=3, bearing_x=0.0, bearing_y=0.0, bearing_z=-1.0)])
+    message.__dict__["__msgtype__"] = "pixy_camera/msg/ObjectBearingArrayStamped"
+    bearings: Any = read(Role.BEARINGS, message, CAMERA, vision=vision)
+    assert bearings.markers == (3,) and bearings.late == 0  # they are stamped by who has seen the frame
 
 
 def test_rectified_frames_have_the_projection_of_camera_info() -> None:

@@ -1,98 +1,58 @@
-"""Frames of a camera that looks at tags, by casting rays."""
+"""A node of `coopenv svea see`, and the messages of the camera that it reads."""
 
-from collections.abc import Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from __future__ import annotations
+
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coopenv.cars.readings import Calibration, rays
-from coopenv.cars.vision import dictionary_of, opencv
-from coopenv.estimation.lens import distort
-from coopenv.estimation.poses import Array
+from coopenv.cars.backend.backend import scenario_of
+from coopenv.cars.codec import encode, header, make
+from coopenv.cars.deployment import load_deployment
+from coopenv.cars.transport.base import Transport
+from tests.helpers.processes import COOPENV, ROOT, start, wait_until
 
-SAMPLES = 4
-"""Rays along a side of a pixel."""
-
-WHITE, BLACK, WALL = 220.0, 30.0, 120.0
-"""Shades of tags, and of what is behind them."""
-
-
-class PlacedTag(NamedTuple):
-    """A tag in front of a camera."""
-
-    number: int
-    axes: Array  # (3, 3) columns: to its right, downwards and behind it, as its reader sees it; optical frame
-    place: Array  # (3,) of its centre, optical frame, m
-    side: float  # of its black square, m; a white border of one cell is around it
+FLEET = ROOT / "examples" / "fleet" / "tags.toml"
+CAMERA_INFO, FRAMES, BEARINGS = (
+    f"fleet/svea7/{name}" for name in ("camera/camera_info", "camera/image_raw", "pixy/objects_bearing")
+)
 
 
-@cache
-def pattern(family: str, number: int) -> Array:
-    """Return the shades of the cells of a tag, border included."""
-    dictionary = dictionary_of(family)
-    cells = opencv().aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2)
-    return np.where(np.pad(cells, 1, constant_values=255) > 127, WHITE, BLACK)
+def camera_info() -> bytes:
+    """Return the calibration of the fleet's cameras."""
+    camera = scenario_of(load_deployment(FLEET), None, {}).cameras[0]
+    (fx, fy), (cx, cy), (width, height) = camera.focal_length, camera.principal_point, camera.image_size
+    fields = {"width": width, "height": height, "distortion_model": "plumb_bob", "d": camera.distortion}
+    return encode(make("sensor_msgs/msg/CameraInfo", **fields, k=(fx, 0, cx, 0, fy, cy, 0, 0, 1)))
 
 
-class FrameRenderer:
-    """Renders frames of one camera; pixels have whole numbers in their middle, as in OpenCV."""
+def grey_frame(width: int = 632, height: int = 416, encoding: str = "mono8", stamp: int = 1) -> bytes:
+    """Return a frame without tags."""
+    fields = {"width": width, "height": height, "step": width, "encoding": encoding}
+    data = np.full(width * height, 90, np.uint8)
+    return encode(make("sensor_msgs/msg/Image", header=header(stamp), **fields, data=data))
 
-    def __init__(self, calibration: Calibration, family: str) -> None:
-        """Find the rays of all pixels."""
-        self.calibration, self.family = calibration, family
-        width, height = calibration.image_size
-        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-        units, there = rays(pixels.astype(np.float64), calibration)
-        units[~there] = np.nan  # meets no tag
-        self._rays = (units / units[:, 2:]).reshape(height, width, 3)
-        self._down, self._right, _ = np.gradient(self._rays)  # per pixel: nearly the same all over it
 
-    def render(
-        self, tags: Sequence[PlacedTag], *, blur: float = 0.0, noise: float = 0.0, seed: int = 0
-    ) -> NDArray[np.uint8]:
-        """Return a frame (height, width); blur is in pixels, noise in shades, standard deviations both."""
-        width, height = self.calibration.image_size
-        frame: NDArray[Any] = np.full((height, width), WALL, np.float32)
-        for tag in sorted(tags, key=lambda tag: -float(np.linalg.norm(tag.place))):
-            self._paint(frame, tag)
-        if blur:
-            frame = opencv().GaussianBlur(frame, (0, 0), blur)
-        if noise:
-            frame = frame + np.random.default_rng(seed).normal(0.0, noise, frame.shape)
-        return np.asarray(np.rint(frame).clip(0, 255), dtype=np.uint8)
+@contextmanager
+def seeing(fleet: Path, endpoint: str, camera: Transport) -> Iterator[subprocess.Popen[str]]:
+    """Run the node of svea7, to which a camera gives its calibration, until the block is left."""
+    command = (*COOPENV, "svea", "see", str(fleet), "--car", "svea7", "--connect", endpoint, "--patience", "60")
+    node, lines, info = start(command, ROOT), list[str](), camera_info()
 
-    def _paint(self, frame: NDArray[Any], tag: PlacedTag) -> None:
-        shades = pattern(self.family, tag.number)
-        cells, cell = len(shades), tag.side / (len(shades) - 2)
-        box = self._box(tag, 0.5 * cells * cell)
-        if box is None:
-            return
-        inner = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
-        down = inner[:, None, None, None] * self._down[box][:, None, :, None]
-        right = inner[:, None] * self._right[box][:, None, :, None]
-        seen = self._rays[box][:, None, :, None] + down + right
-        normal = tag.axes[:, 2]
-        with np.errstate(all="ignore"):
-            far = (normal @ tag.place) / (seen @ normal)
-            on = (seen * far[..., None] - tag.place) @ tag.axes[:, :2] / cell + 0.5 * cells
-        hit = (far > 0.0) & ((on >= 0.0) & (on < cells)).all(axis=-1)
-        column, row = np.moveaxis(np.where(hit[..., None], on, 0.0).astype(np.intp), -1, 0)
-        part = frame[box]
-        shown = np.where(hit, shades[row, column], part[:, None, :, None])
-        frame[box] = shown.mean(axis=(1, 3))
+    def is_ready() -> bool:
+        camera.publish(CAMERA_INFO, info, reliable=True)
+        return bool(lines)
 
-    def _box(self, tag: PlacedTag, half: float) -> tuple[slice, slice] | None:
-        """Return rows and columns of the pixels that a tag may cover; None: none."""
-        along = np.linspace(-half, half, 9)
-        rim = np.array([(u, v) for w in (-half, half) for a in along for u, v in ((a, w), (w, a))])
-        points = tag.place + rim @ tag.axes[:, :2].T
-        if (points[:, 2] <= 1e-3).any() or tag.axes[:, 2] @ tag.place <= 0.0:  # behind the camera, or its back
-            return None
-        c = self.calibration
-        pixels = distort(points[:, :2] / points[:, 2:], c.distortion) * c.focal_length + np.array(c.principal_point)
-        low = np.floor(pixels.min(axis=0)).astype(int) - 1
-        high = np.ceil(pixels.max(axis=0)).astype(int) + 2
-        (left, top), (right, bottom) = low.clip(0), np.minimum(high, c.image_size)
-        return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
+    try:
+        assert node.stdout is not None
+        threading.Thread(target=lambda out=node.stdout: lines.append(out.readline()), daemon=True).start()
+        wait_until(is_ready)
+        assert lines == [f"svea7: see ready at {endpoint}\n"], lines
+        yield node
+    finally:
+        node.kill()
+        node.wait()

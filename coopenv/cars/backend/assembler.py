@@ -20,8 +20,9 @@ from coopenv.cars.backend.tracks import FrameQueue, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import VELOCITY, Role
-from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.transport.base import Arrival
+from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import Array
 from coopenv.observers.contract import Message, sealed
 from coopenv.observers.recording import Sensed, Truth, is_due
@@ -70,7 +71,8 @@ class Assembler:
         """Begin with nothing; `binding` are vehicles and markers of the cars."""
         self.binding = binding
         scenario, topics = binding.scenario, binding.profile.topics
-        self._late, self._silent = topics[Role.DETECTIONS].max_age_ns, topics[Role.ODOMETRY].max_age_ns
+        camera = Role.BEARINGS if binding.profile.sees_frames else Role.DETECTIONS
+        self._late, self._silent = topics[camera].max_age_ns, topics[Role.ODOMETRY].max_age_ns
         self._half = round(1e9 / scenario.rates.camera) // 2
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
         self._to_body = [camera.to_body() for camera in scenario.cameras]
@@ -246,12 +248,14 @@ class Intake:
         try:
             message = decode(arrival.payload, self._profile.topics[role].type)
             stamp = stamp_of(message)
-            value = read(role, message, calibration, distorted=self._sensors.distorted)
+            vision, distorted = self._profile.vision, self._sensors.distorted
+            value = read(role, message, calibration, distorted=distorted, vision=vision)
         except CoopenvError:
             self.rejected[car][role.value] += 1
             return
         if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
             value = Twist(value.linear, None)  # the IMU's turn rate alone counts
+        stamp += value.late if isinstance(value, Detections) else 0
         if arrival.topic in self.offsets:
             self.offsets[arrival.topic].put(stamp, arrival.received)
         yield Sample(car, role, stamp, arrival.received, value)

@@ -11,8 +11,9 @@ from coopenv.base.errors import CoopenvError, shown
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
 from coopenv.cars.profile import SVEA, CarProfile, Role
-from coopenv.cars.readings import Calibration, CarStatus, read
+from coopenv.cars.readings import CarStatus, read
 from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.vision import Calibration
 
 ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
 TOLERANCES = {"image_size": 0.5, "focal_length": 2.0, "principal_point": 2.0, "distortion": 0.02}
@@ -94,7 +95,7 @@ class StatusBoard:
         topic = self._profile.topics[role]
         try:
             message = decode(arrival.payload, topic.type)
-            value, stamp = read(role, message), stamp_of(message)
+            value, stamp = read(role, message, vision=self._profile.vision), stamp_of(message)
         except CoopenvError:
             return
         delay = (arrival.received - stamp) * 1e-9

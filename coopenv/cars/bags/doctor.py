@@ -13,9 +13,9 @@ from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import NS, TopicRow, regularity
 from coopenv.cars.bags.topic_map import READ
-from coopenv.cars.profile import VELOCITY, Role
-from coopenv.cars.readings import POSES, READERS, Calibration, read
-from coopenv.cars.vision import IMAGES
+from coopenv.cars.profile import IMAGES, VELOCITY, Role
+from coopenv.cars.readings import POSES, READERS, read
+from coopenv.cars.vision import Calibration
 
 CAPTURE = re.compile(r"qualisys|mocap|vicon|optitrack|vrpn|truth|ground", re.IGNORECASE)
 """In names of topics of motion capture."""

@@ -29,7 +29,8 @@ from coopenv.cars.bags.topic_map import TRUTH, Chosen, MapFrame, TopicMap, selec
 from coopenv.cars.codec import encode, stamp_of
 from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
+from coopenv.cars.vision import Calibration
 from coopenv.scenario.base import rotation_of
 
 NS = 1_000_000_000

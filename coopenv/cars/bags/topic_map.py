@@ -19,10 +19,10 @@ from coopenv.cars.profile import (
     Number,
     Positive,
     Role,
+    VisionSettings,
     load_profile,
 )
 from coopenv.cars.readings import READERS
-from coopenv.cars.vision import VisionSettings
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
     "authors": {role: tuple(f"/{name}" for name in names) for role, names in AUTHORS.items()},
@@ -167,6 +167,7 @@ class TopicMap(Section):
     clocks: ClockSettings = ClockSettings()
     frames: PositionFrames = PositionFrames()
     vision: VisionSettings = VisionSettings()
+    """Frames and tags (default: those of the profile)."""
     make: CarProfile = Field(default=SVEA, exclude=True)
     """Of `names`, or SVEA's; set by `load_map`."""
     path: Path = Field(default=Path("topics.toml"), exclude=True)
@@ -206,7 +207,8 @@ def load_map(path: str | Path) -> TopicMap:
         make = SVEA if made.names in PATTERNS else load_profile(made.names, path.parent)
     except CoopenvError as error:
         raise TopicMapError(f"{path.name}: names: {error}, authors, none") from None
-    return made.model_copy(update={"path": path, "make": make})
+    vision = made.vision if "vision" in made.model_fields_set else make.vision
+    return made.model_copy(update={"path": path, "make": make, "vision": vision})
 
 
 TRUTH = "truth"

@@ -11,8 +11,8 @@ from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
 from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.readings import Calibration, CarPose, Detections, Sample, Twist, rays
-from coopenv.estimation.lens import distort
+from coopenv.cars.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.vision import Calibration, rays
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
 from coopenv.scenario.base import rotation_of
@@ -76,12 +76,6 @@ def averaged(values: NDArray[Any], period: float) -> Any:
     return uniform_filter1d(values, max(1, round(SMOOTH / period)), mode="nearest")
 
 
-def image(ray: Array, lens: Calibration) -> Array:
-    """Return the pixels (n, 2) of rays (n, 3) in the optical frame."""
-    flat = distort(ray[:, :2] / ray[:, 2:], lens.distortion)
-    return np.asarray(flat * lens.focal_length + np.asarray(lens.principal_point))
-
-
 def car_of(
     scenario: Scenario, name: str, vehicle: int, lens: Calibration | None, ray: Array, where: str, **measured: Any
 ) -> CarDrive:
@@ -91,7 +85,7 @@ def car_of(
     a step of the motion: while a car stands, pixels repeat the same rounding. Raises DataError: too few sightings.
     """
     camera, start = scenario.cameras[vehicle], scenario.vehicles[vehicle].initial_pose
-    pixel = np.zeros((len(ray), 2)) if lens is None else np.round(image(ray, lens), 3)
+    pixel = np.zeros((len(ray), 2)) if lens is None else np.round(lens.pixels(ray), 3)
     place: dict[str, Any] = {"mounting": camera.to_body(), "lever": np.array(camera.position), "pixel": pixel}
     measured.setdefault("height", start.position[2] if start is not None and start.position is not None else 0.0)
     car = CarDrive(name=name, vehicle=vehicle, lens=lens, ray=ray, **place, **measured)
@@ -196,7 +190,7 @@ def _of_vehicles(r: "Recording", scenario: Scenario, static: NDArray[np.int64], 
         ray = r.bearings[tick, i, static[target]] @ camera.to_body()
         lens = Calibration.of(camera) if camera.model == "pinhole" else None
         if lens is not None and not camera.undistort:  # bearings of pixels whose distortion was left in
-            ray = rays(image(ray, replace(lens, distortion=(0.0,) * 5)), lens)[0]
+            ray = rays(replace(lens, distortion=(0.0,) * 5).pixels(ray), lens)[0]
         known = np.flatnonzero(r.truth.known[:, i])
         place = r.truth.position[known, i]
         found = {

@@ -12,8 +12,9 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, pose, warm_up
+from coopenv.cars.fake.camera import FakeCamera
 from coopenv.cars.fake.faults import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
-from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, Pixy, SensorPublisher
+from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
 from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
 from coopenv.cars.gate.process import CLOCK, GateConnection
@@ -89,9 +90,8 @@ class Fake:
         self._settings = settings
         self.name, self._clock, self._profile, self._faults = name, clock, binding.profile, CarFaults()
         scenario, self._drives = binding.scenario, name in binding.cars
-        self.world = CarWorld(
-            scenario, len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
-        )
+        agent = len(scenario.landmarks) + binding.cars[name] if self._drives else binding.leaders[name]
+        self.world = CarWorld(scenario, agent, frames=self._profile.sees_frames)
         self._origin = np.array(scenario.map.origin)
         self._wire = Wire(transport, self._faults, clock.steady, seed, settings)
         self._inbox: deque[Callable[[], None]] = deque()
@@ -101,11 +101,11 @@ class Fake:
         self._publisher = SensorPublisher(name, self._profile, self._wire)
         acts: list[tuple[float, Act]] = [(TRUTH_RATE, self._truth)]
         if self._drives:
-            self._pixy = Pixy(self.world, binding, self._others, self._faults, self._publisher)
+            self._camera = FakeCamera(self.world, binding, self._others, self._faults, self._publisher, settings)
             self._sensors = CarSensors(self.world, self._publisher, settings, differential=differential)
             latency = scenario.limits[self.world.vehicle].latency if settings.latency is None else settings.latency
             self._wheels = Actuators(latency, self._profile.command.timeout)
-            acts += [*self._pixy.acts, *self._sensors.acts]
+            acts += [*self._camera.acts, *self._sensors.acts]
         else:
             acts.append((LEADER_RATE, self._leader))
         self.begin(seed)
@@ -134,7 +134,7 @@ class Fake:
         if self._drives:
             self._wheels.clear()
             self._sensors.begin(self._rng)
-            self._pixy.begin(self._rng)
+            self._camera.begin(self._rng)
 
     @property
     def next(self) -> int:

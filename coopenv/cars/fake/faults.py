@@ -42,6 +42,8 @@ class FakeSettings(Section):
     """Velocities of the wheels per second."""
     imu_rate: Positive = 100.0
     """Turn rates per second."""
+    marker: Positive = 0.08
+    """Side of the markers, m: coloured ones, or the black squares of tags."""
     jitter: Share = 0.05
     """Largest deviation from regular times, share of a sensor's period."""
     loss: Share = 0.0

@@ -93,7 +93,7 @@ class Process(subprocess.Popen[bytes]):
 
 @contextmanager
 def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patience: float = READY) -> Iterator[str]:
-    """Run a router on this computer and a fake of every car; yield the router's endpoint, and end them all afterwards.
+    """Run a router on this computer and fakes of all cars; yield the router's endpoint, and end them all afterwards.
 
         with fakes("overtaking.toml") as router:
             env = coopenv.parallel_env(
@@ -114,7 +114,6 @@ def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patien
     fleet = load_deployment(deployment, endpoint)
     if not fleet.fakes:
         raise FakesError(f"{deployment}: fakes = true is missing, these are real cars")
-    given = ("--connect", endpoint, "--seed", str(seed))
     started: list[Process] = []
     until = time.monotonic() + patience
     with tempfile.TemporaryDirectory(prefix="coopenv-fakes-") as place:
@@ -122,8 +121,11 @@ def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patien
             started.append(Process("router", ("svea", "router", "--listen", endpoint), Path(place)))
             started[0].wait_until_ready(until)
             for car in fleet.cars:
-                command = ("svea", "fake", str(deployment), "--car", car.name, *given)
-                started.append(Process(car.name, command, Path(place)))
+                own = (str(deployment), "--car", car.name, "--connect", endpoint)
+                started.append(Process(car.name, ("svea", "fake", *own, "--seed", str(seed)), Path(place)))
+                if fleet.profile.sees_frames and car.landmark is None:
+                    command = ("svea", "see", *own, "--patience", str(patience))
+                    started.append(Process(f"see of {car.name}", command, Path(place)))
             for process in started[1:]:
                 process.wait_until_ready(until)
             yield endpoint

@@ -14,7 +14,8 @@ from coopenv.cars.fake.car import Fake
 from coopenv.cars.fake.faults import FakeSettings
 from coopenv.cars.gate.core import GateClock, write_drive
 from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.readings import READERS, Calibration, CarPose, Sample, read
+from coopenv.cars.readings import READERS, CarPose, Sample, read
+from coopenv.cars.vision import Calibration
 
 Sent = Mapping[Role, Sequence[Sample]]
 """Samples by role in the order of their stamps, by the sender's clock, with times of reception."""
@@ -51,6 +52,6 @@ def replay(
         with suppress(CoopenvError):  # of no use to readers either
             role = roles[topic]
             message = decode(payload, binding.profile.topics[role].type)
-            value = read(role, message, lens, known=binding.targets)
+            value = read(role, message, lens, known=binding.targets, vision=binding.profile.vision)
             found.setdefault(role, []).append(Sample(car, role, stamp_of(message), received, value))
     return {role: sorted(samples, key=lambda sample: sample.stamp) for role, samples in found.items()}

@@ -2,26 +2,21 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make, ros2
-from coopenv.cars.fake.faults import AHEAD, CarFaults, FakeSettings
-from coopenv.cars.fake.world import CarWorld, Neighbours
+from coopenv.cars.fake.faults import FakeSettings
+from coopenv.cars.fake.world import CarWorld
 from coopenv.cars.profile import CarProfile, Role
-from coopenv.cars.readings import Calibration
 from coopenv.cars.transport.base import Transport
-from coopenv.estimation.lens import distort
-from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Noise
 from coopenv.world.random import ODOMETRY_NOISE
 
 TRUTH_RATE, FILTER_RATE = 100.0, 20.0
-LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 60.0, 5.0, 1.0
-"""Hz: motion capture, own filter; poses of a moving landmark, conditions of a car, its calibration."""
+LEADER_RATE, CONDITION_RATE = 60.0, 5.0
+"""Hz: motion capture, own filter; poses of a moving landmark, conditions of a car."""
 
 
 GRAVITY = 9.81  # m/s^2
@@ -145,113 +140,3 @@ def deviation(stated: float, noise: Noise, rate: float) -> float:
     if not noise.enabled:
         return 0.0
     return stated if isinstance(noise.odometry_rate, str) else stated * math.sqrt(rate / noise.odometry_rate)
-
-
-MARKER = 0.08  # m, side of a marker
-OLDEST = 255  # frames that the camera counts
-
-
-class Pixy:
-    """The camera of one car."""
-
-    def __init__(
-        self, world: CarWorld, binding: Binding, others: Neighbours, faults: CarFaults, publisher: SensorPublisher
-    ) -> None:
-        """Put it on the car.
-
-        Args:
-            world: what it looks at.
-            binding: markers of the cars and of landmarks, and those that it identifies.
-            others: the other cars, which are placed for each frame.
-            faults: that it may have.
-            publisher: of its messages.
-        """
-        self._world, self._others, self._faults, self._publisher = world, others, faults, publisher
-        self._markers = {target: marker for marker, target in binding.targets.items()}
-        smallest, largest = binding.profile.markers
-        self._numbers = range(smallest, largest + 1)
-        self._calibration = Calibration.of(world.scenario.cameras[world.vehicle])
-        self.acts: list[tuple[float, Act]] = [
-            (world.scenario.rates.camera, self._camera),
-            (CAMERA_INFO_RATE, self._camera_info),
-        ]
-        """Rates in Hz, and what is published."""
-
-    def begin(self, rng: np.random.Generator) -> None:
-        """Begin an episode: frames count from here, faults draw from `rng`."""
-        self._ages: dict[int, int] = {}
-        self._frames, self._rng = 0, rng
-
-    def _camera(self, due: int, stamp: int) -> None:
-        blocks = self._frame(due)
-        share = self._faults.value("wrong_stamps", due)
-        if share and self._rng.random() < share:
-            stamp += round(AHEAD * 1e9)
-        self._publisher.send(Role.DETECTIONS, stamp, "camera", objects=blocks)
-        self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
-
-    def _camera_info(self, _due: int, stamp: int) -> None:
-        c = self._calibration
-        (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
-        matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
-        fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
-        fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
-        self._publisher.send(Role.CAMERA_INFO, stamp, "camera", **fields)
-
-    def _frame(self, now: int) -> list[Any]:
-        """Take a frame at a time in ns; return its blocks (ObjectInfo), the largest first."""
-        self._others.place()
-        self._frames += 1
-        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
-        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
-        blocks = self._blocks(seen) if seen else []
-        blocks.sort(key=lambda block: -block.width * block.height)
-        return self._with_faults(blocks, now)
-
-    def _blocks(self, seen: dict[int, Array]) -> list[Any]:
-        c, rays = self._calibration, np.array([*seen.values()])
-        flat = distort(rays[:, :2] / rays[:, 2:], c.distortion)
-        pixels = np.rint(flat * c.focal_length + c.principal_point).clip(0, np.array(c.image_size) - 1)
-        blocks = []
-        for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
-            number, near = self._markers[agent], MARKER / max(self._world.distance(agent), MARKER)
-            width, height = (max(1, round(f * near)) for f in c.focal_length)
-            blocks.append(_block(number, x, y, width, height, number - 1, self._ages[agent]))
-        return blocks
-
-    def _with_faults(self, blocks: list[Any], now: int) -> list[Any]:
-        faults, rng, (width, height) = self._faults, self._rng, self._calibration.image_size
-        if faults.value("swapped_signatures", now):
-            numbers = [block.signature for block in blocks]
-            blocks = [replace(b, signature=n) for b, n in zip(blocks, reversed(numbers), strict=True)]
-        if share := faults.value("duplicate_blocks", now):
-            doubled = [block for block in blocks if rng.random() < share]
-            for b in doubled:
-                sides = {"width": max(1, b.width // 2), "height": max(1, b.height // 2)}
-                blocks = [*blocks, replace(b, center_x=min(b.center_x + 3, width - 1), **sides, age=1)]
-        if rate := faults.value("false_blocks", now):
-            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
-                x, y = int(rng.integers(width)), int(rng.integers(height))
-                blocks = [*blocks, _block(int(rng.choice(self._numbers)), x, y, 2, 2)]
-        return blocks
-
-    def _bearings(self, blocks: list[Any]) -> list[Any]:
-        """Return the ObjectBearings of blocks as the authors compute them.
-
-        They are unit vectors from the target to the camera; distortion is not removed.
-        """
-        c, pixels = self._calibration, np.array([(b.center_x, b.center_y) for b in blocks], dtype=np.float64)
-        flat = (np.array(c.principal_point) - pixels.reshape(-1, 2)) / c.focal_length
-        rays = np.concatenate([flat, -np.ones((len(blocks), 1))], axis=-1)
-        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        rows = zip(blocks, rays.tolist(), strict=True)
-        return [
-            make("pixy_camera/msg/ObjectBearing", id=b.signature, bearing_x=x, bearing_y=y, bearing_z=z)
-            for b, (x, y, z) in rows
-        ]
-
-
-def _block(signature: int, x: int, y: int, width: int, height: int, index: int = 0, age: int = 1) -> Any:
-    """Return the block of a marker in the camera's image; `age` is in frames in a row."""
-    sides = {"center_x": x, "center_y": y, "width": width, "height": height}
-    return make("pixy_camera/msg/ObjectInfo", signature=signature, **sides, index=index, age=age)

@@ -49,18 +49,20 @@ def look_once(model: Any, state: Any, frame: wp.array(dtype=wp.int32), vehicle: 
 class CarWorld(World):
     """World of one agent. Poses are in the map, from its origin."""
 
-    def __init__(self, scenario: Scenario, agent: int) -> None:
+    def __init__(self, scenario: Scenario, agent: int, *, frames: bool = False) -> None:
         """Build it.
 
         Args:
             scenario: what it is a world of.
             agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
+            frames: whether cameras take frames, which have noise of their own: sight is exact.
 
         Raises:
             CoopenvError: the scenario limits what vehicles keep.
         """
         if scenario.topology.most_nearby is not None:
             raise CoopenvError("topology.most_nearby: cars keep all; leave it out")
+        self._frames = frames
         super().__init__(scenario, 1, "float64", threads=1)
         self.agent, self.vehicle = agent, agent - self.model.landmarks
         self._acceleration = scenario.limits[self.vehicle].max_acceleration if self.vehicle >= 0 else 0.0
@@ -72,6 +74,8 @@ class CarWorld(World):
         model = super()._build_model()
         camera = model.camera.numpy()  # on the CPU this and the others are views
         camera["quantise"], camera["undistort"] = 0, 1
+        if self._frames:
+            camera["miss"], model.noise.numpy()["bearing"] = 0.0, 0.0
         targets = np.tile(np.arange(model.agents), (model.vehicles, 1))
         for vehicle in range(model.vehicles):
             own = model.landmarks + vehicle

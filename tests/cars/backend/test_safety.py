@@ -21,8 +21,9 @@ from coopenv.cars.deployment import Remote, Safety
 from coopenv.cars.gate.core import Gate, GateClock
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import SVEA, USUAL, Role
-from coopenv.cars.readings import Calibration, CarPose, Sample, Twist
+from coopenv.cars.readings import CarPose, Sample, Twist
 from coopenv.cars.transport.base import Arrival
+from coopenv.cars.vision import Calibration
 from coopenv.estimation.poses import exp_so3
 from tests.cars.backend.test_assembler import binding
 from tests.helpers.hub import Hub

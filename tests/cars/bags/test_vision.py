@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +12,17 @@ from coopenv import CoopenvError
 from coopenv.cars.bags import Bag
 from coopenv.cars.bags.doctor import examined, proposed
 from coopenv.cars.bags.files import BagFile
-from coopenv.cars.readings import Calibration, rays
-from coopenv.cars.vision import Lens, VisionSettings, find_tags, gray_of
+from coopenv.cars.codec import make
+from coopenv.cars.fake.camera import FrameRenderer, PlacedTag
+from coopenv.cars.profile import Role, VisionSettings
+from coopenv.cars.readings import Detections, read
+from coopenv.cars.vision import Calibration, find_tags, frame_of
 from coopenv.estimation.lens import distort, undistort
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA
 from tests.helpers import bags
-from tests.helpers.frames import FrameRenderer, PlacedTag
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra 'vision'")
 
@@ -48,14 +49,11 @@ def test_lenses_are_those_of_opencv(name: str) -> None:
 @pytest.mark.parametrize("name", LENSES)
 def test_bearings_of_oblique_tags(name: str, family: str) -> None:
     calibration = Calibration((640, 480), (450.0, 455.0), (322.3, 236.1), LENSES[name])
-    lens = Lens(calibration.image_size, partial(rays, calibration=calibration))
     renderer, rng = FrameRenderer(calibration, family), np.random.default_rng(1)
     errors, placed = [], 0
-    for k in range(5):
+    for _ in range(5):
         tags = [tag_at(np.array([x, y, 1.0]) * rng.uniform(0.6, 2.0), n, rng) for n, (x, y) in enumerate(PLACES)]
-        found = {
-            tag.number: tag.ray for tag in find_tags(renderer.render(tags, blur=0.5, noise=2.0, seed=k), family, lens)
-        }
+        found = {tag.number: tag.ray for tag in find_tags(renderer.render(tags, 0.5, 2.0, rng), family, calibration)}
         placed += len(tags)
         for tag in tags:
             if (ray := found.get(tag.number)) is not None:
@@ -82,6 +80,7 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
     drive, camera = bags.drive(), load_scenario("crossing_path").cameras[0]
     calibration = Calibration(camera.image_size, camera.focal_length, camera.principal_point, bags.DISTORTION)
     renderer, C = FrameRenderer(calibration, "tag36h11"), ROTATION_OF_CAMERA["forward"]
+    rng = np.random.default_rng(0)
     given = [m for m in bags.messages(drive) if m.topic != bags.AUTHORS["blocks"]]
     width, height = camera.image_size
     for k in range(drive.ticks):
@@ -95,7 +94,7 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
                     bags.NUMBERS[target], np.stack([across, [0, 1, 0], np.cross(across, [0, 1, 0])], -1), place, 0.12
                 )
             )
-        frame, t = renderer.render(tags, noise=2.0, seed=k), round(k * 1e9 * drive.dt)
+        frame, t = renderer.render(tags, 0.0, 2.0, rng), round(k * 1e9 * drive.dt)
         fields = {"width": width, "height": height, "step": width, "encoding": "mono8", "data": frame.ravel()}
         given.append(bags.Message("/camera/image_raw", "sensor_msgs/msg/Image", t, t, fields))
     text = bags.MAP.replace("agent = 8\n", 'agent = 8\n[cars.topics]\ndetections = "/camera/image_raw"\n')
@@ -110,12 +109,39 @@ def test_a_bag_of_images_is_estimated_with(tmp_path: Path) -> None:
     assert result.position_rmse(2.8)[0] < 0.05
 
 
-def test_what_is_wrong_is_one_line() -> None:
-    from coopenv.cars.codec import make
+DISCS = {1: ((255, 40, 20), 100.0, 60.0), 2: ((20, 220, 60), 300.5, 200.0), 3: ((30, 60, 255), 50.0, 300.25)}
+"""Colour (red, green, blue) and centre, pixels, of discs by number."""
+COLOURS = {1: (340.0, 20.0), 2: (100.0, 150.0), 3: (210.0, 250.0), 4: (280.0, 320.0)}
 
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "png"])
+def test_blobs_of_colour(encoding: str) -> None:
+    frame = np.full((360, 480, 3), 128, np.uint8)
+    across, down = np.meshgrid(np.arange(480), np.arange(360))
+    for colour, u, v in DISCS.values():
+        frame[(across - u) ** 2 + (down - v) ** 2 < 15.0**2] = colour
+    frame[10:12, 200:203] = DISCS[2][0]  # smaller than any blob
+    frame[5:25, 400:420] = (40, 20, 20)  # dark red
+    if encoding == "png":
+        data = cv2.imencode(".png", frame[..., ::-1])[1]
+        message = make("sensor_msgs/msg/CompressedImage", format="png", data=data)
+    else:
+        opaque = np.dstack([frame, np.full((360, 480), 255, np.uint8)])
+        part = {"rgb8": frame, "bgr8": frame[..., ::-1], "rgba8": opaque}[encoding]
+        size = {"width": 480, "height": 360, "step": 480 * part.shape[2]}
+        message = make("sensor_msgs/msg/Image", encoding=encoding, data=part, **size)
+    camera = Calibration((480, 360), (400.0, 410.0), (240.0, 180.0), (0.0,) * 5)
+    found = read(Role.DETECTIONS, message, camera, vision=VisionSettings(colours=COLOURS))
+    assert isinstance(found, Detections) and found.markers == (1, 2, 3) and found.dropped == 0
+    for (_, u, v), ray in zip(DISCS.values(), found.bearings, strict=True):
+        exact = np.array([(u - 240.0) / 400.0, (v - 180.0) / 410.0, 1.0])
+        assert np.degrees(np.linalg.norm(ray - unit(exact))) < 0.02
+
+
+def test_what_is_wrong_is_one_line() -> None:
     with pytest.raises(ValueError, match=r"unknown family 'tag36h12'.*tag36h11"):
         VisionSettings(family="tag36h12")
     with pytest.raises(CoopenvError, match="encoding: 'yuv444' is none of mono8"):
-        gray_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
+        frame_of(make("sensor_msgs/msg/Image", width=1, height=1, step=1, encoding="yuv444", data=[0]))
     with pytest.raises(CoopenvError, match="no image that OpenCV reads"):
-        gray_of(make("sensor_msgs/msg/CompressedImage", format="jpeg", data=[1, 2, 3]))
+        frame_of(make("sensor_msgs/msg/CompressedImage", format="jpeg", data=[1, 2, 3]))

@@ -14,7 +14,8 @@ from coopenv.backends.simulated import Simulated
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import Calibration, bearings, detections, read
+from coopenv.cars.readings import Detections, read
+from coopenv.cars.vision import Calibration
 from coopenv.scenario import load_scenario
 from tests.helpers.fakes import CROSSING, EXACT, MARKERS, OVERTAKING, Stage
 
@@ -293,7 +294,8 @@ def test_both_topics_are_read_as_the_same_rays() -> None:
     stage = Stage("svea_overtaking", OVERTAKING)
     put(stage, "svea7", 0.0, -1.0, np.pi / 2)
     blocks, unit = frame(stage, "svea7")
-    a, b = detections(blocks, CALIBRATION, None), bearings(unit, CALIBRATION, None)
+    a, b = read(Role.DETECTIONS, blocks, CALIBRATION), read(Role.BEARINGS, unit, CALIBRATION)
+    assert isinstance(a, Detections) and isinstance(b, Detections)
     assert a.markers == b.markers and len(a.markers) >= 4
     assert_allclose(a.bearings, b.bearings, atol=1e-5)
     for number, ray in zip(a.markers, a.bearings, strict=True):

@@ -29,7 +29,7 @@ from coopenv.cars.profile import RESET_TOPIC, SVEA, Limits, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
-from coopenv.cli.svea import next_status
+from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
 from tests.helpers.hub import Hub
 from tests.helpers.processes import COOPENV, ROOT, mentioning, start, wait_until
@@ -260,7 +260,7 @@ def status_message() -> bytes:
 
 
 def first_status(payloads: Iterator[bytes]) -> Any:
-    return next_status(Crowded(payloads), TOPIC, 0.2)  # type: ignore[arg-type]
+    return next_message(Crowded(payloads), TOPIC, SVEA.topics[Role.GATE].type, 0.2)  # type: ignore[arg-type]
 
 
 def test_the_first_word_of_a_gate_is_found_among_others() -> None:

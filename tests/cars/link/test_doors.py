@@ -25,6 +25,7 @@ from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, end, start_gate
 from tests.helpers.brokers import Authority
+from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing
 from tests.helpers.processes import COOPENV, ROOT, start, wait_until
 from tests.helpers.wire import free_endpoint, free_port, heard_by, running
 
@@ -77,6 +78,18 @@ def test_the_station_drives_through_the_gate_and_a_stranger_does_not_get_past_it
         assert station.count("foreign") == 1
     finally:
         end(gate)
+
+
+def test_bearings_leave_the_car_and_frames_do_not_enter(doors: Doors) -> None:
+    pytest.importorskip("cv2", reason="needs the extra 'vision'")
+    seen = heard_by(doors.stranger, BEARINGS)
+    with seeing(FLEET, doors.inside, doors.wheels) as node:
+        doors.stranger.publish(FRAMES, grey_frame(encoding="forged"), reliable=True)
+        time.sleep(0.3)
+        doors.wheels.publish(FRAMES, grey_frame(), reliable=True)
+        wait_until(lambda: seen)
+        node.terminate()
+        assert node.stderr is not None and "forged" not in node.stderr.read()
 
 
 def test_queries_and_the_administration_get_no_answer(doors: Doors) -> None:

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from coopenv import CoopenvError
 from coopenv.cars import codec
 from coopenv.cars.profile import SVEA, Role
-from coopenv.cars.readings import READERS, Calibration, CarPose, CarStatus, Detections, Twist, rays, read
+from coopenv.cars.readings import READERS, CarPose, CarStatus, Detections, Twist, read
+from coopenv.cars.vision import Calibration, rays
 from coopenv.estimation.lens import distort, largest_radius, undistort
 from coopenv.observers.contract import Message
 from coopenv.world.camera import undistort as simulated
