@@ -170,6 +170,24 @@ def remove_member(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
+def insert_member(memory: Any, world: int, i: int, n: int):
+    """Make room for a member whose error is independent of the others'; those from n on move down."""
+    members = memory.belief[world, i].members
+    for j in range(members - n):
+        m = members - j
+        memory.member[world, i, m] = memory.member[world, i, m - 1]
+        for k in range(members):
+            memory.P[world, i, m, k] = memory.P[world, i, m - 1, k]
+    for j in range(members - n):
+        m = members - j
+        for k in range(members + 1):
+            memory.P[world, i, k, m] = memory.P[world, i, k, m - 1]
+    memory.belief[world, i].members = members + 1
+    for k in range(members + 1):
+        set_block(memory, world, i, n, k, mat66d())
+
+
+@device_function
 def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Note which members are in view."""
     kept = model.kept

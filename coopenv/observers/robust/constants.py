@@ -9,8 +9,8 @@ THIRD = 1.0 / 3.0
 # Risk, numbers and times
 
 RISK = 1e-3  # of a correct measurement outside its gate, and of an error above the protection level
-BEARING_GATE, POSE_GATE = float(chdtri(2, RISK)), float(chdtri(6, RISK))
-"""Gates of a normalised squared error: of a bearing, and of a pose."""
+BEARING_GATE, OFFSET_GATE, POSE_GATE = (float(chdtri(axes, RISK)) for axes in (2, 3, 6))
+"""Gates of a normalised squared error: of a bearing, of a fault, and of a pose."""
 ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite
 SINGLE = 1e-6  # share of a variance that rounding to single precision in messages may change
 MAX_CONDITION = 1.0 / SINGLE**2  # of the information of a frame; from there on it determines no pose
@@ -53,7 +53,7 @@ FAULT_GATE, FAULT_RISK = 35.0, 1e-2
 is excluded is right. Tuned: in honest worlds the largest of all ratios was 34, with 30 % of the messages lost 48."""
 ODDS = -2.0 * math.log(FAULT_RISK)  # difference of such ratios at which one hypothesis is nearly certain
 MONITOR_TIME = 10.0  # s: time constant of the sums of a monitor. Chosen
-ODOMETRY_FAULT = 0.1  # deviation of a fault of the own velocity, as a share of it, and of the gyro, rad/s. Chosen
+OWN_FAULT = 0.1  # deviation of a fault of velocity, as a share of it, gyro, rad/s, and camera, rad. Chosen
 LOST_SHARE, FOUND_SHARE = 0.6, 0.2
 """Share of bearings that fail the gate from which on all bearings count, and share below which the gate counts again
 and the pose is an anchor. Chosen: one wrong association of two does not exceed the first."""

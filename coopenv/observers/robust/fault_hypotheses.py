@@ -12,10 +12,11 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.belief import remove_member, set_block
+from coopenv.observers.robust.belief import apply_error, insert_member, remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
 from coopenv.observers.robust.memory import (
     ERRORS,
+    MOUNTING,
     SENDER_SLOTS,
     SOURCES,
     BearingFrame,
@@ -24,10 +25,13 @@ from coopenv.observers.robust.memory import (
     mat63d,
     mat66d,
     vec3d,
+    vec6d,
 )
 from coopenv.observers.robust.messages import includes
-from coopenv.observers.robust.source_monitor import end_block, restart_gyro
+from coopenv.observers.robust.propagation import begin_calibration, mounting_of
+from coopenv.observers.robust.source_monitor import end_block, restart_fault
 from coopenv.observers.robust.sources import (
+    CAMERA,
     GYRO,
     VELOCITY,
     clear_drift,
@@ -88,20 +92,22 @@ def forget_faults(memory: Any, world: int, i: int):
             memory.source[world, i, c].information = mat33d()
             if is_sender(c):
                 clear_drift(memory, world, i, c)
-            if c == GYRO:
-                restart_gyro(memory, world, i)
+            if c >= CAMERA:
+                restart_fault(memory, world, i, c)
 
 
 @subroutine
 def exclude(memory: Any, world: int, i: int, q: int):
-    """Exclude a source; the own odometry is used on, with an uncertain scale or bias."""
+    """Exclude a source; an own sensor is used on, with an uncertain scale, bias or mounting."""
     memory.source[world, i, q].exclusions += 1
     if is_own(q):
         inflate_by_fault(memory, world, i, q)
         if q == VELOCITY:
             correct_scale(memory, world, i)
-        else:
+        elif q == GYRO:
             correct_bias(memory, world, i)
+        else:
+            correct_mounting(memory, world, i)
         return
     if drifts(memory, world, i, q):
         inflate_by_drift(memory, world, i, q)
@@ -169,7 +175,7 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain.
 
-    Innovations of a wrong pose, while the gate is disabled, show no faults but those of the own odometry.
+    Innovations of a wrong pose, while the gate is disabled, show no faults but those of the own sensors.
     """
     end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
@@ -185,16 +191,29 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
             most = memory.source[world, i, q].ratio
             worst = q
     total = weight_of(gate, most)
+    rivals = total
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
-            total += weight_of(memory.source[world, i, q].ratio, most)
-    certain = worst >= 0 and total < wp.float64(1.0 + constants.FAULT_RISK)
+            w = weight_of(memory.source[world, i, q].ratio, most)
+            total += w
+            if not is_same(q, worst):
+                rivals += w
+    certain = worst >= 0 and rivals < wp.float64(constants.FAULT_RISK)
     if certain and (is_own(worst) or not lost):
-        exclude(memory, world, i, worst)
+        for q in range(SOURCES):
+            likely = weight_of(memory.source[world, i, q].ratio, most) > wp.float64(constants.FAULT_RISK)
+            if likely and is_same(q, worst):
+                exclude(memory, world, i, q)
     if certain or lost:
         forget_faults(memory, world, i)
     elif worst >= 0:
         set_fault_mixture(memory, world, i, most, total)
+
+
+@wp.func
+def is_same(q: int, c: int) -> bool:
+    """Return whether two slots are the same source; all own sensors count as one, because all of them are used on."""
+    return q == c or (is_own(q) and is_own(c))
 
 
 @wp.func
@@ -225,6 +244,19 @@ def correct_bias(memory: Any, world: int, i: int):
     P = memory.P[world, i, ERRORS, ERRORS]
     P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, GYRO].covariance
     memory.P[world, i, ERRORS, ERRORS] = P
+
+
+@device_function
+def correct_mounting(memory: Any, world: int, i: int):
+    """Turn the camera by its estimated fault, and add to the variance of its mounting likewise."""
+    if mounting_of(memory, world, i) == 0:
+        insert_member(memory, world, i, MOUNTING)
+        begin_calibration(memory, world, i, MOUNTING, vec6d())
+    f = memory.source[world, i, CAMERA].offset
+    apply_error(memory, world, i, MOUNTING, vec6d(f[0], f[1], f[2], wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)))
+    P = memory.P[world, i, MOUNTING, MOUNTING]
+    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, CAMERA].covariance
+    memory.P[world, i, MOUNTING, MOUNTING] = P
 
 
 @device_function

@@ -19,7 +19,7 @@ from coopenv.observers.robust.algebra import (
     position_variance,
 )
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.memory import BearingFrame, Derivative, mat26d, mat66d, vec3d
+from coopenv.observers.robust.memory import BearingFrame, Derivative, Pose, mat26d, mat66d, vec3d
 from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
@@ -255,6 +255,7 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
         turn = wp.transpose(own.R) * theirs.R
     a = wp.transpose(own.R) * (z - own.p)
     d = a - frame.lever
+    mounting = Pose(wp.identity(3, wp.float64), vec3d())
     if frame.mounting > 0:
         mounting = memory.member[world, i, frame.mounting].pose
         d = d - mounting.p
@@ -275,11 +276,9 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
         H[:, 3:] = G
         memory.derivative[world, i, n, 1].jacobian = H
     memory.derivative[world, i, n, 2].member = wp.where(frame.mounting > 0, frame.mounting, -1)
-    if frame.mounting > 0:
-        turned = memory.member[world, i, frame.mounting].pose.R
-        H[:, :3] = T * turned * skew(memory.measurement[world, i, n].bearing)
-        H[:, 3:] = -(B * turned)
-        memory.derivative[world, i, n, 2].jacobian = H
+    H[:, :3] = T * mounting.R * skew(memory.measurement[world, i, n].bearing)
+    H[:, 3:] = -(B * mounting.R)
+    memory.derivative[world, i, n, 2].jacobian = H
     memory.measurement[world, i, n].residual = T * bearing
     memory.measurement[world, i, n].distance = distance
     remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)

@@ -268,7 +268,7 @@ ERRORS = 1  # the member that stands for the odometry's errors, where there is o
 MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
 DERIVATIVES = 3  # the most errors that a bearing depends on
 SENDER_SLOTS, LANDMARK_SLOTS = MAX_MEMBERS - 1, 4
-SOURCES = 2 + SENDER_SLOTS + LANDMARK_SLOTS
+SOURCES = 3 + SENDER_SLOTS + LANDMARK_SLOTS
 ROBUST_SIZES = {
     "K": MAX_MEMBERS + MOUNTING,
     "H": MAX_HYPOTHESES + 1,

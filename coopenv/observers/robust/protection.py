@@ -16,7 +16,7 @@ import warp as wp
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import KNOWN_ANGLE_VARIANCE, KNOWN_POSITION_VARIANCE
 from coopenv.observers.robust.memory import SOURCES, vec2d, vec3d, vec6d
-from coopenv.observers.robust.sources import GYRO, is_active
+from coopenv.observers.robust.sources import CAMERA, is_active
 from coopenv.world.warp_internals import subroutine
 
 QUANTILE = NormalDist().inv_cdf(1.0 - 0.5 * constants.RISK)  # of an error along its most uncertain axis
@@ -74,8 +74,8 @@ def protection_level(memory: Any, world: int, i: int):
         if is_active(memory, world, i, q):
             Phi = memory.sensitivity[world, i, q, 0]
             information = wp.trace(memory.source[world, i, q].information)
-            # Before its first block, or since an exclusion; a gyro's fault has the covariance of its prior then.
-            if q != GYRO and information == wp.float64(0.0) and wp.ddot(Phi, Phi) > wp.float64(0.0):
+            # Before its first block, or since an exclusion; gyro and camera have the covariance of a prior then.
+            if q < CAMERA and information == wp.float64(0.0) and wp.ddot(Phi, Phi) > wp.float64(0.0):
                 return vec2d(wp.float64(wp.inf))
             variances = own + fault_variances(up, Phi, memory.source[world, i, q].covariance)
             if not (

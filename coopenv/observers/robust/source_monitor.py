@@ -1,10 +1,10 @@
 """One monitor per source of information: landmarks, senders and the vehicle's own odometry.
 
 A fault of a source is an unknown vector f: the offset of a landmark from its place in the map, or of a sender from its
-reported position (m, map), or the error of the own velocity (m/s, body) or angular velocity (rad/s, body). The own
-error depends on it by a sensitivity Phi, which passes through propagation and correction like the error itself, and an
-innovation r of covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a of M^T S^-1 r are the information on all
-faults.
+reported position (m, map), or the error of the own velocity (m/s, body), angular velocity (rad/s, body) or camera (a
+turn of its mounting, rad). The own error depends on it by a sensitivity Phi, which passes through propagation and
+correction like the error itself, and an innovation r of covariance S by M = H Phi + H_f. The sums A of M^T S^-1 M and a
+of M^T S^-1 r are the information on all faults.
 
 Senders have errors within their covariance without a fault. These are eliminated: with the members' covariance P and
 Pi = (P^-1 + A)^-1, what remains of source q is V = A_qq - A_q Pi A_q^T and v = a_q - A_q Pi a. The fault of q is then
@@ -35,7 +35,8 @@ from coopenv.observers.robust.memory import (
     vec3d,
 )
 from coopenv.observers.robust.sources import (
-    GYRO,
+    CAMERA,
+    VELOCITY,
     clear_drift,
     clear_source,
     gate_locates_fault,
@@ -82,6 +83,8 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
                 M = M + memory.derivative[world, i, n, 2].jacobian * mounting
             if memory.measurement[world, i, n].source == q:
                 M = M - H[:, 3:] * turn
+            if q == CAMERA:
+                M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
             memory.effect[world, i, n, q] = M
             WM = memory.measurement[world, i, n].weight * M
             vector = vector + share_of(frame, memory, world, i, n) * (
@@ -246,19 +249,19 @@ def coupling(memory: Any, world: int, i: int, count: int, q: int, b: int):
 
 
 @device_function
-def restart_gyro(memory: Any, world: int, i: int):
-    """Let a fault of the gyro begin now; the bias state follows one from further back."""
-    clear_source(memory, world, i, GYRO)
-    variance = odometry_fault_variance(memory, world, i, GYRO)
-    memory.source[world, i, GYRO].covariance = variance * wp.identity(3, wp.float64)
-    memory.source[world, i, GYRO].offset = vec3d()
+def restart_fault(memory: Any, world: int, i: int, q: int):
+    """Let a fault of the gyro or the camera begin now; a state follows one from further back."""
+    clear_source(memory, world, i, q)
+    variance = own_fault_variance(memory, world, i, q)
+    memory.source[world, i, q].covariance = variance * wp.identity(3, wp.float64)
+    memory.source[world, i, q].offset = vec3d()
 
 
 @subroutine
 def end_block(memory: Any, world: int, i: int, time: Any):
     """Add the information of a block of a time, s, on each source's fault to its sums; begin the next block.
 
-    While the gate locates a fault, the block tells of the sources that it rejects, and of the gyro.
+    While the gate locates a fault, the block tells of the sources that it rejects, of the camera and the gyro.
     """
     located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
@@ -267,7 +270,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
         if is_active(memory, world, i, q):
             V = mat33d()
             v = vec3d()
-            if is_rejected(memory, world, i, q) or q == GYRO or not located:
+            if is_rejected(memory, world, i, q) or q >= CAMERA or not located:
                 V = memory.information[world, i, q, q]
                 v = memory.source[world, i, q].vector
                 for b in range(count):
@@ -281,7 +284,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].sum = v
             least = wp.float64(constants.ROUNDING) * wp.trace(V) + wp.float64(constants.MIN_VARIANCE)
             if is_own(q):
-                variance = odometry_fault_variance(memory, world, i, q)
+                variance = own_fault_variance(memory, world, i, q)
                 least = wp.float64(1.0) / wp.max(variance, wp.float64(constants.MIN_VARIANCE))
             covariance = wp.inverse(V + least * wp.identity(3, wp.float64))
             memory.source[world, i, q].covariance = covariance
@@ -289,16 +292,16 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
             if is_sender(q):
                 end_drift_block(memory, world, i, q, kept)
-            if q == GYRO and memory.source[world, i, q].ratio < wp.float64(3.0):
-                restart_gyro(memory, world, i)
+            if q >= CAMERA and memory.source[world, i, q].ratio < wp.float64(constants.OFFSET_GATE):
+                restart_fault(memory, world, i, q)
     clear_block(memory, world, i)
 
 
 @device_function
-def odometry_fault_variance(memory: Any, world: int, i: int, q: int):
-    """Return the variance of the fault of the own velocity, (m/s)^2, or angular velocity, (rad/s)^2."""
-    variance = wp.float64(constants.ODOMETRY_FAULT * constants.ODOMETRY_FAULT)
-    return wp.where(q == GYRO, variance, variance * wp.length_sq(memory.belief[world, i].mean_v))
+def own_fault_variance(memory: Any, world: int, i: int, q: int):
+    """Return the variance of the fault of the own velocity, (m/s)^2, angular velocity, (rad/s)^2, or camera, rad^2."""
+    variance = wp.float64(constants.OWN_FAULT * constants.OWN_FAULT)
+    return wp.where(q == VELOCITY, variance * wp.length_sq(memory.belief[world, i].mean_v), variance)
 
 
 @device_function

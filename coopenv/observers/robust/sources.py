@@ -1,4 +1,4 @@
-"""The sources of a vehicle's information: a slot each for its odometry, senders and landmarks, with their monitors."""
+"""The sources of a vehicle's information: a slot each for its sensors, senders and landmarks, with their monitors."""
 
 from typing import Any
 
@@ -21,8 +21,8 @@ from coopenv.observers.robust.memory import (
 )
 from coopenv.world.warp_internals import device_function, subroutine
 
-VELOCITY, GYRO = 0, SOURCES - 1
-"""The slots of the own velocity and angular velocity; between them are those of senders, then those of landmarks."""
+VELOCITY, CAMERA, GYRO = 0, SOURCES - 2, SOURCES - 1
+"""The slots of the own velocity, camera and angular velocity; behind the first are those of senders and landmarks."""
 NO_TARGET = -1
 
 
@@ -34,8 +34,8 @@ def is_sender(q: int) -> bool:
 
 @wp.func
 def is_own(q: int) -> bool:
-    """Return whether a slot is one of the own odometry."""
-    return q <= VELOCITY or q >= GYRO
+    """Return whether a slot is one of the own sensors."""
+    return q <= VELOCITY or q >= CAMERA
 
 
 @device_function
@@ -120,7 +120,7 @@ def take_slot(memory: Any, world: int, i: int, target: int, tick: int, landmark:
     q = slot_of(memory, world, i, target)
     if q < 0:
         first = wp.where(landmark, 1 + SENDER_SLOTS, 1)
-        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, GYRO, 1 + SENDER_SLOTS))
+        q = longest_unseen_slot(memory, world, i, first, wp.where(landmark, CAMERA, 1 + SENDER_SLOTS))
         if landmark and q >= 0 and memory.source[world, i, q].target != NO_TARGET:
             unseen = wp.float64(tick - memory.source[world, i, q].seen_tick) * period
             q = wp.where(unseen > wp.float64(constants.MEAN_TIME), q, -1)

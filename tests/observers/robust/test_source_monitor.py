@@ -13,7 +13,7 @@ from benchmarks.evidence import CHANGES, STEP_AT, changed
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
-from coopenv.observers.robust.sources import GYRO, NO_TARGET, VELOCITY
+from coopenv.observers.robust.sources import CAMERA, GYRO, NO_TARGET, VELOCITY
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers import robust_sources as faults
@@ -126,7 +126,7 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
     A = np.where(lower > 0, information, information.transpose(1, 0, 3, 2))
     V, v = eliminated(A, vector, P * MONITOR_TIME / SHORT_TIME, slots)
     assert all(np.linalg.norm(A[q, slots]) > 0.0 for q in (VELOCITY, 1, 2, 5, 6, 7))
-    kept = slice(GYRO)  # the sums of the gyro begin anew while its ratio is small
+    kept = slice(CAMERA)  # the sums of camera and gyro begin anew while their ratios are small
     assert_allclose(observer.memory.source["information"][kept], V[kept], rtol=1e-6, atol=1e-9 * abs(A).max())
     assert_allclose(observer.memory.source["sum"][kept], v[kept], rtol=1e-6, atol=1e-9 * abs(vector).max())
     for q in (1, 2, 5, 6, 7):
