@@ -86,6 +86,15 @@ def with_gyro_step(recording: Recording, fault: Fault, seed: int) -> Recording:
     return replace(recording, rotation=rotation, angular_velocity=angular_velocity)
 
 
+def with_camera_step(recording: Recording, fault: Fault, seed: int) -> Recording:
+    """Turn cameras on their mountings to the left by an angle, rad, from a time on."""
+    from coopenv.estimation.poses import about_z  # late, as above
+
+    bearings, turn = recording.bearings.copy(), about_z(np.array(fault.value))
+    bearings[_first_tick(recording, fault) :, _on(recording, fault)] @= turn
+    return replace(recording, bearings=bearings)
+
+
 def with_scale_drift(recording: Recording, fault: Fault, seed: int) -> Recording:
     """Let the scale error of odometries grow linearly from a time on, up to its value at the end."""
     start, end = fault.start_in(float(recording.t[-1])), float(recording.t[-1])

@@ -10,9 +10,9 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, symmetric_part
+from coopenv.estimation.linalg import block3, exp_so3, symmetric_part
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.belief import apply_error, insert_member, remove_member, set_block
+from coopenv.observers.robust.belief import insert_member, remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
 from coopenv.observers.robust.memory import (
     ERRORS,
@@ -239,11 +239,8 @@ def correct_scale(memory: Any, world: int, i: int):
 @device_function
 def correct_bias(memory: Any, world: int, i: int):
     """Correct the gyro's bias by the estimated fault of the angular velocity, and add to its variance likewise."""
-    f = memory.source[world, i, GYRO].offset
-    memory.member[world, i, ERRORS].w -= f
-    P = memory.P[world, i, ERRORS, ERRORS]
-    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, GYRO].covariance
-    memory.P[world, i, ERRORS, ERRORS] = P
+    memory.member[world, i, ERRORS].w -= memory.source[world, i, GYRO].offset
+    inflate_turn(memory, world, i, ERRORS, GYRO)
 
 
 @device_function
@@ -252,11 +249,18 @@ def correct_mounting(memory: Any, world: int, i: int):
     if mounting_of(memory, world, i) == 0:
         insert_member(memory, world, i, MOUNTING)
         begin_calibration(memory, world, i, MOUNTING, vec6d())
-    f = memory.source[world, i, CAMERA].offset
-    apply_error(memory, world, i, MOUNTING, vec6d(f[0], f[1], f[2], wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)))
-    P = memory.P[world, i, MOUNTING, MOUNTING]
-    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, CAMERA].covariance
-    memory.P[world, i, MOUNTING, MOUNTING] = P
+    turn = exp_so3(memory.source[world, i, CAMERA].offset)
+    memory.member[world, i, MOUNTING].pose.R = memory.member[world, i, MOUNTING].pose.R * turn
+    inflate_turn(memory, world, i, MOUNTING, CAMERA)
+
+
+@device_function
+def inflate_turn(memory: Any, world: int, i: int, n: int, q: int):
+    """Add to the first three variances of a state the square of an estimated fault and its variance."""
+    f = memory.source[world, i, q].offset
+    P = memory.P[world, i, n, n]
+    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, q].covariance
+    memory.P[world, i, n, n] = P
 
 
 @device_function

@@ -19,7 +19,7 @@ from coopenv.observers.robust.algebra import (
     position_variance,
 )
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.memory import BearingFrame, Derivative, Pose, mat26d, mat66d, vec3d
+from coopenv.observers.robust.memory import MOUNTING, BearingFrame, Derivative, Pose, mat26d, mat66d, vec3d
 from coopenv.observers.robust.messages import is_circular
 from coopenv.observers.robust.propagation import mounting_of, mounting_variances
 from coopenv.observers.robust.sources import is_excluded, slot_of, take_slot
@@ -154,6 +154,8 @@ def set_measurement_of_target(
 ) -> bool:
     """Set the frame's next measurement to the bearing to a target in view; return whether it is usable."""
     b = vec3d(body_bearing(model, state, world, i, entry))
+    if frame.purpose != TRACKING and mounting_of(memory, world, i) > 0:
+        b = memory.member[world, i, MOUNTING].pose.R * b
     target = agent_of(state, model.kept, world, i, entry)
     sender = target - model.landmarks
     if frame.purpose == SEARCH and is_excluded(memory, world, i, slot_of(memory, world, i, target)):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 import coopenv
@@ -290,6 +291,17 @@ def test_a_gyro_is_biased_from_its_step_on() -> None:
     turned = made().rotation[late, 1].swapaxes(-1, -2) @ after.rotation[late, 1]
     assert_allclose(np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), 0.3 * made().dt, atol=1e-12)
     assert differing(after, made()) == {"angular_velocity", "rotation"}
+
+
+def test_a_camera_turns_at_its_step() -> None:
+    """To the left, so that its bearings turn to the right."""
+    after = changed_by("vehicle_2:camera_step=0.3@1")
+    late = made().t >= 1.0 - 1e-9
+    turned = Rotation.from_euler("z", -0.3).apply(made().bearings[late, 1].reshape(-1, 3))
+    assert_allclose(after.bearings[late, 1].reshape(-1, 3), turned, atol=1e-12)
+    assert_array_equal(after.bearings[~late], made().bearings[~late])
+    assert_array_equal(np.delete(after.bearings, 1, axis=1), np.delete(made().bearings, 1, axis=1))
+    assert differing(after, made()) == {"bearings"}
 
 
 def test_the_scale_error_grows_to_its_value() -> None:

@@ -199,6 +199,21 @@ def test_a_step_of_a_gyros_bias_is_located_in_the_gyro() -> None:
     assert np.all(found.run.position_rmse(14.0) < 2.0 * usual(busy, 18.0, 0).run.position_rmse(14.0) + 0.02)
 
 
+@pytest.mark.parametrize(
+    ("make", "vehicle", "angle"), [(busy, 1, 3.0), (busy, 3, -5.0), (fast, 0, 2.0), (fast, 2, -8.0)]
+)
+def test_a_turn_of_a_camera_costs_nothing(make: Callable[..., Recording], vehicle: int, angle: float) -> None:
+    """Own sensors alone are corrected, within 2.5 s, and all others stay as they were."""
+    recording, least = make(18.0, 0), STEP_AT + 2.5
+    fault = f"{recording.setups[vehicle].name}:camera_step={np.radians(angle)}@{STEP_AT}"
+    found = watch(changed(recording, fault, 0))
+    corrected = found.source["exclusions"][np.searchsorted(recording.t, least)] > 0
+    assert corrected[vehicle, CAMERA] and not np.delete(corrected, vehicle, axis=0).any()
+    assert not np.delete(corrected, (CAMERA, GYRO), axis=1).any()
+    assert np.all(found.run.position_rmse(least) < 1.3 * usual(make, 18.0, 0).run.position_rmse(least) + 0.02)
+    assert found.run.anees(least)[vehicle] < 3.0
+
+
 def test_a_landmark_that_is_right_again_is_readmitted() -> None:
     """It is off by 1 m from 3 s on: until 9 s, and for good."""
     landmark, followers = 2, (0, 2, 3, 4)
