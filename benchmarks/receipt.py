@@ -27,7 +27,7 @@ from coopenv.runs.console import Progress
 
 AT = 12.0
 """s, from when on there is a fault, but for some of the map and of the scale."""
-CASES = ("nominal", "landmark", "bias", "random")
+CASES = ("nominal", "landmark", "bias", "camera", "random")
 """In both scenes: busy_intersection_tracking, and the road of `benchmarks.evidence`."""
 LIES = {
     "jump": f"vehicle_2:lie=jump:1@{AT:g}",
@@ -80,7 +80,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
     return {
         "nothing": [],
         "all monitors": [(constants, "FAULT_GATE", 1e30)],
-        "monitors of the own odometry": [(constants, "ODOMETRY_FAULT", 1e-9)],
+        "monitors of the own sensors": [(constants, "OWN_FAULT", 1e-9)],
         "monitors of landmarks": [(measurements, "take_slot", no_landmark)],
         "senders' offsets": [(fault_hypotheses, "end_block", no_offsets)],
         "senders' drifts": [(fault_hypotheses, "exclude_drifting", no_drift)],
@@ -165,6 +165,7 @@ def change_of(case: str) -> Callable[..., Any]:
         "nominal": "",
         "landmark": CHANGES["one landmark of the map off by 3 m"],
         "bias": f"gyro_step={np.radians(1.0)}@{STEP_AT}",
+        "camera": CHANGES["the second camera turns by 3 deg at 12 s"],
         "large bias": f"gyro_step={np.radians(5.0)}@{STEP_AT}",
         "scale": "scale_drift=0.1",
         "random": "random_bearings=0.1",
