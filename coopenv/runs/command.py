@@ -133,7 +133,7 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
         if record is not None and out is not None:
             folder = out.with_name(f"{out.name}_failed")
             with new_folder(folder):
-                record.save(folder / RECORD_FILE, name, str(error))
+                record.save(folder / RECORD_FILE, name, error)
             log.print(f"kept for a report: coopenv bundle {folder}", soft_wrap=True)
         raise
 
