@@ -159,23 +159,15 @@ class FilmOptions(SceneOptions):
         Raises:
             CoopenvError: no such camera or vehicle, or the extra is missing.
         """
-        from coopenv.runs.films import Shot
+        from coopenv.runs.films import Shot, space_film
         from coopenv.runs.live import vehicle_index
         from coopenv.viz.topview import TopView
 
         if not self.space:
             panel = not self.map_only and len(takes) == 1
             return [[Shot(record, TopView(record.scenario, panel=panel), name) for name, record in takes]]
-        from coopenv.viz.film3d import View3d
-
-        cameras = options.words(self.camera)
-        each = self.width // len(takes)
-        size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
         picked = vehicle_index(takes[0][1].scenario, self.vehicle)
-        return [
-            [Shot(record, View3d(record.scenario, size, camera, picked), "" if row else name) for name, record in takes]
-            for row, camera in enumerate(cameras)
-        ]
+        return space_film(takes, self.width, options.words(self.camera), picked)
 
 
 @options.command
