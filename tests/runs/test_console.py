@@ -56,6 +56,12 @@ def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest
         wait_for(text, "drawing: 50 % after 30 s, about 20 s left\n")
 
 
+def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
+    with Progress(Console(file=text, force_terminal=True), "simulating"):
+        wait_for(text, "simulating: ")
+    assert "\r" not in text.getvalue() and "\x1b[2K" not in text.getvalue()
+
+
 def test_time_left_is_not_told_before_there_is_enough_to_go_by(
     text: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
