@@ -14,7 +14,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from coopenv.backends.base import Repeating
 from coopenv.backends.sources import open_backend
 from coopenv.base.columns import Columns, Tabular
-from coopenv.base.errors import CoopenvError, DataError, checked_seed, listed
+from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
@@ -138,6 +138,7 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
         raise
 
 
+@explained
 def run(
     environment: ScenarioLike,
     seed: int = 0,
