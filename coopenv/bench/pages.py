@@ -39,7 +39,7 @@ _IDLE = "zero"  # the driver of a scene without a route
 
 def films(name: str, scenario: Scenario, folder: Path) -> Iterator[str]:
     """Yield the films in a folder and what they show."""
-    views = {"from above": folder / f"{name}.webp", "in space": space_path(name, folder)}
+    views = {"from above": folder / f"{name}.webp", "in 3-D": space_path(name, folder)}
     shown = [f"![Film of {name}, {view}]({path.name})" for view, path in views.items() if path.is_file()]
     if shown:
         _, driver = driver_of(None, scenario, name, _SEED)
@@ -49,20 +49,20 @@ def films(name: str, scenario: Scenario, folder: Path) -> Iterator[str]:
         yield f"The episode of seed {_SEED},{driven}{estimated}, faster than real time: the time stands above the map."
     if len(shown) > 1:
         yield (
-            "In space, solid cars are true and faded ones estimated. A car is lost while it is farther from its "
+            "In 3-D, solid cars are true and faded ones estimated. A car is lost while it is farther from its "
             "estimate than it is long."
         )
 
 
 def space_path(name: str, folder: Path) -> Path:
-    """Return the path of an environment's film in space."""
+    """Return the path of an environment's 3-D film."""
     return folder / f"{name}_3d.webp"
 
 
 def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: Callable[[float], None]) -> None:
     """Film an environment for the page in a folder; where nothing moves there is no film.
 
-    Those that are driven are filmed in space too, behind the vehicle that drives longest, where the extra is installed.
+    Those that are driven are filmed in 3-D too, behind the vehicle that drives longest, where the extra is installed.
     """
     path, space = folder / f"{name}.webp", space_path(name, folder)
     policy, driver = driver_of(None, scenario, name, _SEED)

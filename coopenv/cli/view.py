@@ -116,7 +116,7 @@ class FilmOptions(SceneOptions):
     map_only: Annotated[
         bool, typer.Option("--map-only", help="Leave out the table and the legend of a film from above.")
     ] = False
-    space: Annotated[bool, typer.Option("--3d", help="Film in space, lit and with shadows (extra film3d).")] = False
+    space: Annotated[bool, typer.Option("--3d", help="3-D film, lit and with shadows (extra film3d).")] = False
     camera: Annotated[
         str,
         typer.Option(
@@ -172,7 +172,7 @@ class FilmOptions(SceneOptions):
 
 @options.command
 def film(given: FilmOptions) -> None:
-    """Film an episode, or several side by side, from above or in space: MP4, GIF or WebP."""
+    """Film an episode, or several side by side, from above or in 3-D: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
     from coopenv.runs.films import check_film, write_film

@@ -1,4 +1,4 @@
-"""Films of scenes: from above or in space, one or several side by side, as MP4, GIF or WebP."""
+"""Films of scenes: from above or in 3-D, one or several side by side, as MP4, GIF or WebP."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -115,7 +115,7 @@ def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
 def space_film(
     takes: Sequence[tuple[str, SceneRecord]], width: int, cameras: Sequence[str] = ("overview",), vehicle: int = 0
 ) -> list[list[Shot]]:
-    """Return the film of scenes in space.
+    """Return the 3-D film of scenes.
 
     Args:
         takes: a column of the picture each, with its name (empty: that of the observer).
