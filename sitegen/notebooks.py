@@ -12,7 +12,10 @@ TUTORIALS = "docs/tutorials"
 FOLDER = ROOT / "examples" / "notebooks"
 INSTALL = """```python
 import importlib.util
+import os
 
+if os.path.isdir("../../examples/notebooks"):  # opened in a clone, whose files are named from its root
+    os.chdir("../..")
 if importlib.util.find_spec("coopenv") is None:  # on a machine such as Colab's; a path of a wheel can replace the name
     %pip install --quiet "coopenv{extras}"
 ```"""
@@ -36,7 +39,8 @@ def notebook(markdown: str) -> str:
     """Return the notebook of a tutorial: its programs and commands are cells, files that it shows are written.
 
     Outputs that the page shows are left out, as the notebook makes its own, and so are links, which lead elsewhere.
-    The first cell installs coopenv where it is missing, with the extras that the page names.
+    The first cell installs coopenv where it is missing, with the extras that the page names. In a clone it goes to the
+    root, from which pages name files.
     """
 
     def cell(match: re.Match[str]) -> str:

@@ -34,8 +34,9 @@ def gallery() -> str:
     for name in list_envs():
         page = ROOT / "docs/environments" / name
         title = page.with_suffix(".md").read_text(encoding="utf-8").partition("\n")[0].strip("# ")
-        film = page.with_suffix(".webp")
-        picture = film.name if film.is_file() else f"{name}.png"
+        [picture, *_] = [
+            file for end in ("_3d.webp", ".webp", ".png") if (page.parent / (file := f"{name}{end}")).is_file()
+        ]
         cards.append(f"[![{title}](environments/{picture}){{ loading=lazy }} {title}](environments/{name}.md)")
     return "\n\n".join(["# Gallery", '<div class="gallery" markdown>', *cards, "</div>"]) + "\n"
 

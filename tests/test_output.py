@@ -260,7 +260,7 @@ COMMANDS = {
     "train facade --out agent": "train",
     "dataset facade": "minari",
     "describe highway_intersection": "highway",
-    "describe sumo_crossing": "sumo",
+    "run sumo_crossing": "sumo",
     "bench observers overtaking --observers factor_graph": "bench",
     "bench observers overtaking --engine ray": "ray",
     "svea demo": "svea",

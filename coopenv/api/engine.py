@@ -21,7 +21,7 @@ from coopenv.api.terms.results import MEMORY, results_struct, results_table, ste
 from coopenv.backends.base import Backend, SensingWorld
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
-from coopenv.base.errors import CoopenvError, check_memory, error_text, training_seed, world_keys
+from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
 from coopenv.base.installation import load_reference
 from coopenv.base.notebook import facts_html, one_line, picture_html
 from coopenv.estimation.poses import riccati_covariance
@@ -313,7 +313,7 @@ class Engine:
         self.begun = bool(has_begun(self.view("start_rotation")).all())
 
 
-class Saved:
+class Saved(Explained):
     """What the environments of an engine share: its layout, and states that are saved and restored."""
 
     engine: Engine

@@ -12,12 +12,13 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import ArrayKind, CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, explained
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import with_observer
 from coopenv.scenario import ScenarioLike, scenario_name
 
 
+@explained
 def parallel_env(
     name_or_path: ScenarioLike,
     *,
@@ -88,6 +89,7 @@ def parallel_env(
     )
 
 
+@explained
 def make_vec(
     name_or_path: ScenarioLike,
     *,

@@ -1,5 +1,6 @@
 """The PettingZoo environment: one world, dictionaries keyed by agent; and a wrapper that keeps numeric infos."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -287,7 +288,10 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:
+            warnings.warn("render() shows nothing: make the environment with render_mode='rgb_array'", stacklevel=2)
             return None
+        if not self.engine.begun:
+            raise CoopenvError("render() called before reset()")
         picture = self.engine.picture()
         if self.render_mode == "human":
             self.engine.top_view.show(picture)

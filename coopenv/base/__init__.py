@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from coopenv.base.errors import suggest
+from coopenv.base.errors import listed, suggest
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -23,11 +23,20 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
     def get(name: str) -> Any:
         if name not in module_of:
-            near = suggest(name, module.__all__)
-            raise AttributeError(f"module '{package}' has no attribute '{name}'{near}")
+            near = suggest(name, module.__all__) or f"; known: {listed(module.__all__, 40)}"
+            there = "" if name.startswith("_") else below(name) or near
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{there}")
         value = getattr(import_module(str(module_of[name])), name)
         setattr(module, name, value)
         return value
+
+    def below(name: str) -> str:
+        """Return in which package below this one a public name is."""
+        for file in Path(str(module.__file__)).parent.glob("*/__init__.py"):
+            lists = [n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.Assign)]
+            if any(ast.unparse(n.targets[0]) == "__all__" and name in ast.literal_eval(n.value) for n in lists):
+                return f" (from {package}.{file.parent.name} import {name})"
+        return ""
 
     def public_names() -> list[str]:
         return sorted(module.__all__)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopenv.base.errors import Explained
 from coopenv.base.files import replace_text, replacing_file
 from coopenv.base.installation import install_command, needing
 
@@ -71,7 +72,7 @@ def _cell(value: Any) -> Any:
     return "" if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class Tabular(ABC):
+class Tabular(Explained, ABC):
     """A result that other programs take as a table. Options of the methods are those of `columns`.
 
     Units of numbers stand in the names of columns (`position_rmse_m`) and in the attributes of pandas and xarray:

@@ -8,9 +8,15 @@ in training.
 
 import os
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
+from functools import wraps
 from hashlib import sha256
+from inspect import signature
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 MAX_MESSAGE = 600  # characters of an error, which is to be one line that can be read
 
@@ -150,8 +156,51 @@ def check_one_of(what: str, name: object, valid: Iterable[object], error: type[V
         raise error(f"{what} {shown(name)}{suggest(str(name), names)}; known: {listed(names) or 'none'}")
 
 
+ELSEWHERE = {
+    "config": "overrides",
+    "env": "parallel_env",
+    "make": "parallel_env",
+    "num_envs": "num_worlds",
+    "plot": "figure",
+    "save": "to_csv",
+    "seed": "reset",
+    "set": "overrides",
+    "n_envs": "num_worlds",
+}
+"""Words of other libraries and of the shell, and those for the same here."""
+
+
 def suggest(word: str, valid: Iterable[str]) -> str:
-    """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
+    """Return ` (did you mean 'x'?)` for the nearest valid word, or the one that is called so elsewhere; else ''."""
     known = {name.lower(): name for name in valid}
-    near = get_close_matches(word[:MAX_MESSAGE].lower(), known, n=1)
+    same = [other for other in (ELSEWHERE.get(word, ""),) if other in known]
+    near = same or get_close_matches(word[:MAX_MESSAGE].lower(), known, n=1)
     return f" (did you mean '{known[near[0]]}'?)" if near else ""
+
+
+class Explained:
+    """Has an error that lists what there is where an attribute is missing."""
+
+    if not TYPE_CHECKING:  # which knows the attributes
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise the error."""
+            if hasattr(type(self), name):
+                return object.__getattribute__(self, name)  # an error within a property
+            public = [] if name.startswith("_") else [known for known in dir(self) if not known.startswith("_")]
+            known = f"{suggest(name, public)}; known: {listed(public)}" if public else ""
+            raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}")
+
+
+def explained(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a function whose error for an unknown argument lists those that there are."""
+    known = [*signature(function).parameters]
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name in [name for name in kwargs if name not in known]:
+            there = f"{suggest(name, known)}; known: {listed(known)}; keys of a scenario are given in overrides"
+            raise TypeError(f"{function.__name__}: unknown argument '{name}'{there}")
+        return function(*args, **kwargs)
+
+    return call

@@ -208,11 +208,11 @@ def load_reference(reference: str) -> Any:
 
 
 @contextmanager
-def blamed(subject: str) -> Iterator[None]:
+def blamed(subject: str, kind: type[CoopenvError] = CoopenvError) -> Iterator[None]:
     """Turn exceptions of a user's code into a `CoopenvError` with the subject, the exception and the line.
 
     Raises:
-        CoopenvError: it raises something; its own errors of this kind stay as they are.
+        CoopenvError: of class `kind`; it raises something. Its own errors of this kind stay as they are.
     """
     try:
         yield
@@ -221,7 +221,7 @@ def blamed(subject: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         last = extract_tb(error.__traceback__)[-1]
         where = f"{Path(last.filename).name}:{last.lineno}"
-        raise CoopenvError(f"{subject} failed at {where}: {error_text(error)}") from error
+        raise kind(f"{subject} failed at {where}: {error_text(error)}") from error
 
 
 def _file(place: str, folder: Path | None = None) -> Path:

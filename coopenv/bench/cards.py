@@ -90,7 +90,7 @@ class Contest:
         cls,
         environment: ScenarioLike,
         overrides: Mapping[str, Any],
-        agents: Sequence[str],
+        agents: Sequence[str | Callable[..., Any]],
         worlds: int,
         block: int = 0,
         ideal: bool = False,

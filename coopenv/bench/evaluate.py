@@ -1,12 +1,12 @@
 """`coopenv evaluate`: from the options to tables and files; `coopenv.evaluate`."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import version, versions
@@ -97,9 +97,10 @@ def run(
     return evaluation
 
 
+@explained
 def evaluate(
     environment: ScenarioLike,
-    agents: Iterable[str] = (),
+    agents: Iterable[str | Callable[..., Any]] = (),
     worlds: int = 256,
     *,
     overrides: Mapping[str, Any] | None = None,
@@ -112,7 +113,8 @@ def evaluate(
 
     Args:
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`.
-        agents: names, folders, or import paths (`mine.py:Mine`); none: every shipped agent made for the environment.
+        agents: names, folders, import paths (`mine.py:Mine`), classes or functions; none: every shipped agent made for
+            the environment.
         worlds: how many.
         overrides: dotted scenario keys.
         seed_block: number of the block of held-out seeds.

@@ -4,9 +4,12 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from coopenv.api.engine import Engine
@@ -18,13 +21,13 @@ from coopenv.base.installation import environment_id, list_envs, version
 from coopenv.bench.cards import OVERVIEW, Contest, cells, rendered
 from coopenv.policies import agents_for
 from coopenv.runs import scenario_text
-from coopenv.runs.films import top_view_film, write_film
+from coopenv.runs.films import Shot, space_film, top_view_film, write_film
 from coopenv.runs.scenario_text import drawn, graded
 from coopenv.runs.scenes import driver_of, scene_of
 from coopenv.runs.summary import cell_text, environment_rows, facts, shown_sections
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS
-from coopenv.viz.scene import Origin
+from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.topview import TopView
 
 FORMATS, MOST_BYTES = ((6.0, 448), (3.0, 320), (3.0, 240)), 280_000
@@ -34,19 +37,34 @@ _SEED = 0
 _IDLE = "zero"  # the driver of a scene without a route
 
 
-def film_words(name: str, scenario: Scenario) -> str:
-    """Return what a film shows; empty: nothing moves, so there is no film."""
-    _, driver = driver_of(None, scenario, name, _SEED)
-    if not _moves(scenario, driver):
-        return ""
-    driven = f" driven by `{driver}`," if driver else ""
-    estimated = f" estimated by `{scenario.observer.name}`"
-    return f"The episode of seed {_SEED},{driven}{estimated}, faster than real time: the time stands above the map."
+def films(name: str, scenario: Scenario, folder: Path) -> Iterator[str]:
+    """Yield the films in a folder and what they show."""
+    views = {"from above": folder / f"{name}.webp", "in 3-D": space_path(name, folder)}
+    shown = [f"![Film of {name}, {view}]({path.name})" for view, path in views.items() if path.is_file()]
+    if shown:
+        _, driver = driver_of(None, scenario, name, _SEED)
+        driven = f" driven by `{driver}`," if driver else ""
+        estimated = f" estimated by `{scenario.observer.name}`"
+        yield from shown
+        yield f"The episode of seed {_SEED},{driven}{estimated}, faster than real time: the time stands above the map."
+    if len(shown) > 1:
+        yield (
+            "In 3-D, solid cars are true and faded ones estimated. A car is lost while it is farther from its "
+            "estimate than it is long."
+        )
 
 
-def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Callable[[float], None]) -> None:
-    """Film an environment for the page in a folder; where nothing moves there is no film."""
-    path = folder / f"{name}.webp"
+def space_path(name: str, folder: Path) -> Path:
+    """Return the path of an environment's 3-D film."""
+    return folder / f"{name}_3d.webp"
+
+
+def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: Callable[[float], None]) -> None:
+    """Film an environment for the page in a folder; where nothing moves there is no film.
+
+    Those that are driven are filmed in 3-D too, behind the vehicle that drives longest, where the extra is installed.
+    """
+    path, space = folder / f"{name}.webp", space_path(name, folder)
     policy, driver = driver_of(None, scenario, name, _SEED)
     if not _moves(scenario, driver):
         path.unlink(missing_ok=True)
@@ -54,9 +72,19 @@ def write_page_film(name: str, scenario: Scenario, folder: Path, on_progress: Ca
     with closing(Engine(scenario)) as engine:
         source = Origin.of(name, scenario, policy=driver, seed=_SEED)
         record = scene_of(engine, source, policy, lambda share: on_progress(share / 2))
-    speed = max(1.0, record.length / _LASTS)
+    _write_small(lambda width: top_view_film(record, False), path, record, lambda share: on_progress(0.5 + share / 4))
+    if scenario.driven and find_spec("pyvista"):
+        longest = int(np.isfinite(record.fields["position_error"]).sum(axis=0).argmax())
+        behind = partial(space_film, [("", record)], cameras=("follow",), vehicle=longest)
+        _write_small(behind, space, record, lambda share: on_progress(0.75 + share / 4))
+
+
+def _write_small(
+    film: Callable[[int], list[list[Shot]]], path: Path, record: SceneRecord, on_progress: Callable[[float], None]
+) -> None:
+    """Write the film of a width in the first of the formats that makes no larger file."""
     for fps, width in FORMATS:
-        write_film(top_view_film(record, False), path, fps, speed, width, lambda share: on_progress(0.5 + share / 2))
+        write_film(film(width), path, fps, max(1.0, record.length / _LASTS), width, on_progress)
         if path.stat().st_size <= MOST_BYTES:
             break
 
@@ -211,15 +239,15 @@ def prepare(folder: Path, names: list[str]) -> None:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        for suffix in ("md", "png", "webp", "json"):
-            check_file(folder / f"{name}.{suffix}")
+        for end in (".md", ".png", ".webp", "_3d.webp", ".json"):
+            check_file(folder / f"{name}{end}")
 
 
 def environment_page(name: str, scenario: Scenario, folder: Path) -> str:
     """Return the page of an environment, with the figures and the film that stand in the folder, if any do."""
     value = read_value_of_sensing(folder / f"{name}.json")
-    film = film_words(name, scenario) if (folder / f"{name}.webp").is_file() else ""
-    return page_text(name, scenario, "" if value is None else value_of_sensing_text(name, scenario, value), film)
+    measured = "" if value is None else value_of_sensing_text(name, scenario, value)
+    return page_text(name, scenario, measured, films(name, scenario, folder))
 
 
 def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[float], None] | None = None) -> None:
@@ -236,7 +264,7 @@ def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[f
     """
     read_value_of_sensing(folder / f"{name}.json")  # before anything is drawn
     if on_film is not None:
-        write_page_film(name, scenario, folder, on_film)
+        write_page_films(name, scenario, folder, on_film)
     text = environment_page(name, scenario, folder)
     with closing(Engine(scenario)) as engine, closing(TopView(engine.backend.scenario)) as view:
         engine.reset([world_keys(_SEED)[0]])
@@ -271,31 +299,29 @@ TOLD = {"observation.include", "observation.scales", "observation.centers", "rew
 """Settings that other tables tell, as they tell the weights."""
 
 
-def page_text(name: str, scenario: Scenario, measured: str = "", film: str = "") -> str:
+def page_text(name: str, scenario: Scenario, measured: str = "", films: Iterable[str] = ()) -> str:
     """Return the page of an environment.
 
     Args:
         name: of the environment and of the picture beside the page.
         scenario: the environment.
         measured: a part with measured figures, if there are any.
-        film: caption of the film beside the page, if there is one; it has the name of the picture.
+        films: paragraphs of the films beside the page.
     """
     return (
-        "\n\n".join([*_head(name, scenario, film), *_scene(scenario), *_learning(scenario), *_end(name, measured)])
+        "\n\n".join([*_head(name, scenario, films), *_scene(scenario), *_learning(scenario), *_end(name, measured)])
         + "\n"
     )
 
 
-def _head(name: str, scenario: Scenario, film: str) -> Iterator[str]:
+def _head(name: str, scenario: Scenario, films: Iterable[str]) -> Iterator[str]:
     yield f"# {plain(scenario.title)}"
     for text in (scenario.description, scenario.source and f"Source: {scenario.source}"):
         if text:
             yield plain(text)
     yield f"![Top view of {name}]({name}.png)"
     yield "At the start of the episode of seed 0: true vehicles filled, estimates in outline."
-    if film:
-        yield f"![Film of {name}, from above]({name}.webp)"
-        yield film
+    yield from films
     known_facts = facts(scenario)
     yield table(("", ""), [(subject, known_facts[subject]) for subject in GLANCE])
 

@@ -258,5 +258,5 @@ def root(
     """Cooperative localisation of connected vehicles."""
     if version:
         print(f"coopenv {installed_version()}")
-    elif context.invoked_subcommand is None:
-        print(context.get_help())
+    else:
+        options.print_help(context)

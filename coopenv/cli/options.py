@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import typer
 from typer.core import TyperGroup
 
-from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning, check_one_of
+from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning, listed, shown, suggest
 from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
@@ -254,8 +254,12 @@ class Grouped(TyperGroup):
 
     def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
         """Return the command that the arguments begin with."""
-        if args[0] not in self.commands:
-            check_one_of("no such command:", args[0], self.commands)
+        name = args[0]
+        if name not in self.commands:
+            runs = f"; an environment runs with: coopenv run {name}" if name in list_envs() else ""
+            options = [option for parameter in self.get_params(ctx) for option in parameter.opts]
+            near = f" (did you mean '--{name}'?)" if f"--{name}" in options else suggest(name, self.commands)
+            raise CoopenvError(f"no such command: {shown(name)}{near}; known: {listed([*self.commands], 40)}{runs}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
@@ -268,6 +272,12 @@ class Grouped(TyperGroup):
         for panel, rows in groups.items():
             with formatter.section(panel):
                 formatter.write_dl(rows, col_max=12)
+
+
+def print_help(context: typer.Context) -> None:
+    """Print the help of a group of which no command is named."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:

@@ -103,7 +103,8 @@ def replay(path: Path) -> None:
         raise CoopenvError(f"{path}: another result than that of the file: {'; '.join(differing)}")
     printed.print(f"{path}: {bundle.title}", soft_wrap=True)
     error = bundle.manifest["end"]["error"]
-    printed.print(f"The same error: {error}" if error else "The same figures.", soft_wrap=True)
+    same = "The same figures up to the driver's error" if bundle.by_driver else "The same error"
+    printed.print(f"{same}: {error}" if error else "The same figures.", soft_wrap=True)
 
 
 def bundle(

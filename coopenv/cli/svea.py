@@ -22,7 +22,11 @@ if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
 svea = typer.Typer(
-    cls=options.Grouped, help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None
+    cls=options.Grouped,
+    help="SVEA cars, real ones and fakes.",
+    invoke_without_command=True,
+    callback=options.print_help,
+    rich_markup_mode=None,
 )
 HARMED = 1
 """Exit status of an attack that got through."""

@@ -116,7 +116,7 @@ class FilmOptions(SceneOptions):
     map_only: Annotated[
         bool, typer.Option("--map-only", help="Leave out the table and the legend of a film from above.")
     ] = False
-    space: Annotated[bool, typer.Option("--3d", help="Film in space, lit and with shadows (extra film3d).")] = False
+    space: Annotated[bool, typer.Option("--3d", help="3-D film, lit and with shadows (extra film3d).")] = False
     camera: Annotated[
         str,
         typer.Option(
@@ -159,28 +159,20 @@ class FilmOptions(SceneOptions):
         Raises:
             CoopenvError: no such camera or vehicle, or the extra is missing.
         """
-        from coopenv.runs.films import Shot
+        from coopenv.runs.films import Shot, space_film
         from coopenv.runs.live import vehicle_index
         from coopenv.viz.topview import TopView
 
         if not self.space:
             panel = not self.map_only and len(takes) == 1
             return [[Shot(record, TopView(record.scenario, panel=panel), name) for name, record in takes]]
-        from coopenv.viz.film3d import View3d
-
-        cameras = options.words(self.camera)
-        each = self.width // len(takes)
-        size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
         picked = vehicle_index(takes[0][1].scenario, self.vehicle)
-        return [
-            [Shot(record, View3d(record.scenario, size, camera, picked), "" if row else name) for name, record in takes]
-            for row, camera in enumerate(cameras)
-        ]
+        return space_film(takes, self.width, options.words(self.camera), picked)
 
 
 @options.command
 def film(given: FilmOptions) -> None:
-    """Film an episode, or several side by side, from above or in space: MP4, GIF or WebP."""
+    """Film an episode, or several side by side, from above or in 3-D: MP4, GIF or WebP."""
     from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
     from coopenv.runs.films import check_film, write_film

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from coopenv.base import installation
-from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.errors import ActionError, shown
 
 
 class Policy(Protocol):
@@ -32,21 +32,21 @@ def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarr
     """Return the actions that a policy chooses, (rows, width) in float64, clipped to [-1, 1].
 
     Raises:
-        CoopenvError: the policy raised something, or returned no numbers, another shape or what is not finite.
+        ActionError: the policy raised something, or returned no numbers, another shape or what is not finite.
     """
-    with installation.blamed("the policy"):
+    with installation.blamed("the policy", ActionError):
         returned = policy(observations)
     try:
         actions = np.asarray(returned, dtype=np.float64)
     except (TypeError, ValueError):
-        raise CoopenvError(f"the policy returned no array of numbers, but {shown(returned)}") from None
+        raise ActionError(f"the policy returned no array of numbers, but {shown(returned)}") from None
     if actions.shape != (len(observations), width):
-        raise CoopenvError(
+        raise ActionError(
             f"the policy returned actions of shape {actions.shape}, expected {(len(observations), width)}"
         )
     if not np.isfinite(actions).all():
         row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-        raise CoopenvError(f"the policy returned an action that is not finite for row {row}: {actions[row].tolist()}")
+        raise ActionError(f"the policy returned an action that is not finite for row {row}: {actions[row].tolist()}")
     return np.clip(actions, -1.0, 1.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -99,6 +99,8 @@ class Agent(AgentCard):
     """Of its card."""
     environments: tuple[str, ...] = ()
     """As of its card, with absolute paths."""
+    code: Any = None
+    """The class or function itself, if it is not named."""
     folder: Path | None = None
     """Where its `agent.toml` and its card are; None for an import path."""
 
@@ -108,7 +110,7 @@ class Agent(AgentCard):
         Raises:
             CoopenvError: there is no such code, or it cannot drive this environment.
         """
-        made: Any = installation.load_reference(self.entry)
+        made: Any = installation.load_reference(self.entry) if self.code is None else self.code
         if not isinstance(made, type):
             if self.options or not callable(made):
                 raise CoopenvError(f"agent '{self.name}': {self.entry} is not a class, nor a function without options")
@@ -155,14 +157,17 @@ def _training_anew(folder: Path, training: Any) -> str:
     return shlex.join([*words, "--out", str(folder), "--force"])
 
 
-def find_agent(name_or_place: str | Path) -> Agent:
-    """Return the driver behind a name of `agents/`, a folder, or `file.py:Name` or `package.module:Name`.
+def find_agent(name_or_place: str | Path | Callable[..., Any]) -> Agent:
+    """Return the driver behind a name of `agents/`, a folder, `file.py:Name` or `package.module:Name`, or such code.
 
     An agent is code that runs: name only those that you trust.
 
     Raises:
         CoopenvError: there is none, or its `agent.toml` is not valid.
     """
+    if callable(name_or_place):
+        name = getattr(name_or_place, "__name__", type(name_or_place).__name__)
+        return Agent(name=name, entry=name, code=name_or_place)
     name, names = str(name_or_place), list_agents()
     if name not in names and installation.is_reference(name):
         return Agent(name=name.rpartition(":")[2], entry=installation.absolute_reference(name))

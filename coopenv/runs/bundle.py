@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataError, error_text, listed, shown
+from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed, shown
 from coopenv.base.files import replacing_file
 from coopenv.base.format import json_text
 from coopenv.base.installation import is_reference, versions
@@ -55,14 +55,17 @@ class RunRecord:
         if decision == len(self._actions):
             self._actions.append(self.run.engine.view("actions")[0].copy())
 
-    def save(self, path: Path, environment: str, error: str = "") -> None:
+    def save(self, path: Path, environment: str, error: CoopenvError | None = None) -> None:
         """Write the file of a run of an environment that has ended, with an error or without.
+
+        A driver is not part of it: a run in which the driver failed ends before that.
 
         Raises:
             OutputError: it cannot be written.
         """
         run, world, model = self.run, self.run.engine.world, self.run.engine.world.model
-        if error and self._states:  # in the tick after the last
+        by_driver = isinstance(error, ActionError)
+        if error and self._states and not by_driver:  # in the tick after the last
             self._keep_actions(self.last // model.ticks_per_decision)
         before, state = self._states[0] if self._states else (0, {})
         empty = np.zeros((0, model.vehicles, model.action_size))
@@ -82,11 +85,11 @@ class RunRecord:
             "observer": observer,
             "dtype": world.precision.name,
             "device": world.device,
-            "ticks_planned": run.ticks_planned,
+            "ticks_planned": self.last if by_driver else run.ticks_planned,
             "versions": versions("coopenv", "numpy", "warp-lang"),
             "kernels": kernel_hashes(),
             "state_tick": before,
-            "end": {"tick": self.last, "error": error, "figures": figures_of(run)},
+            "end": {"tick": self.last, "error": str(error or ""), "by_driver": by_driver, "figures": figures_of(run)},
             "parts": {name: sha256(content).hexdigest() for name, content in parts.items()},
         }
         with replacing_file(path) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -159,6 +162,11 @@ class Bundle:
         about = self.manifest
         return f"{about['environment']}, {about['observer']}, seed {about['seed']}, {about['end']['tick']} ticks"
 
+    @property
+    def by_driver(self) -> bool:
+        """Whether the error was the driver's, which is not replayed."""
+        return bool(self.manifest["end"].get("by_driver"))
+
     def other_versions(self) -> list[str]:
         """Return what the run was made with and what is different here."""
         here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest["versions"]
@@ -175,7 +183,8 @@ class Bundle:
         rows = iter(self.arrays["actions"])
         run = Rollout(scenario, about["seed"], None, about["dtype"], about["device"], lambda observations: next(rows))
         expected = (len(scenario.vehicles), run.engine.world.model.action_size)
-        if self.arrays["actions"].shape[1:] != expected:
+        actions = self.arrays["actions"]
+        if actions.shape[1:] != expected or len(actions) * scenario.ticks_per_decision < end["tick"]:
             raise DataError(f"{self.path}: arrays.npz: actions: expected {expected} per decision")
         run.ticks_planned, error, last, differing = about["ticks_planned"], "", 0, []
         try:
@@ -186,7 +195,7 @@ class Bundle:
             error = str(failure)
         if kernels := [n for n, digest in kernel_hashes().items() if about["kernels"].get(n, digest) != digest]:
             differing.append(f"kernels {listed(kernels)}")
-        if (last, error) != (end["tick"], end["error"]):
+        if (last, error) != (end["tick"], "" if self.by_driver else end["error"]):
             differing.append(f"after tick {last}: {error or 'no error'}")
         for name, values in figures_of(run).items():
             if not np.allclose(values, np.array(end["figures"][name], float), rtol=FIGURE_TOLERANCE, equal_nan=True):

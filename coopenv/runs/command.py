@@ -14,7 +14,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from coopenv.backends.base import Repeating
 from coopenv.backends.sources import open_backend
 from coopenv.base.columns import Columns, Tabular
-from coopenv.base.errors import CoopenvError, DataError, checked_seed, listed
+from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
@@ -133,11 +133,12 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
         if record is not None and out is not None:
             folder = out.with_name(f"{out.name}_failed")
             with new_folder(folder):
-                record.save(folder / RECORD_FILE, name, str(error))
+                record.save(folder / RECORD_FILE, name, error)
             log.print(f"kept for a report: coopenv bundle {folder}", soft_wrap=True)
         raise
 
 
+@explained
 def run(
     environment: ScenarioLike,
     seed: int = 0,

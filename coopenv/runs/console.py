@@ -47,6 +47,7 @@ class Progress:
             total: the value of `completed` at the end; None where it is not known.
             rate: how much is completed in a second where that is known, as in real time (None: as it turns out).
         """
+        self._drawn = log.is_terminal and log.file.isatty()  # notebooks ask for colours and are no terminal
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
         self._rate, self._hinted = rate, False
         self._first: tuple[float, float] | None = None
@@ -59,7 +60,7 @@ class Progress:
 
     def __enter__(self) -> Self:
         self._begin = monotonic()
-        if self._log.is_terminal:
+        if self._drawn:
             self._bar.start()
         else:
             self._lines.start()
@@ -67,7 +68,7 @@ class Progress:
 
     def __exit__(self, *exception: object) -> None:
         self._over.set()
-        if self._log.is_terminal:
+        if self._drawn:
             self._bar.stop()
 
     def update(self, completed: float, description: str | None = None) -> None:
@@ -80,7 +81,7 @@ class Progress:
         self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
         if not self._hinted and not isnan(left := self._left()):
             self._hinted = True
-            if left > HINT_FROM and not self._log.is_terminal:
+            if left > HINT_FROM and not self._drawn:
                 self._log.print(self.line(), soft_wrap=True)
 
     def advance(self, description: str | None = None) -> None:

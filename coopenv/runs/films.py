@@ -1,4 +1,4 @@
-"""Films of scenes: from above or in space, one or several side by side, as MP4, GIF or WebP."""
+"""Films of scenes: from above or in 3-D, one or several side by side, as MP4, GIF or WebP."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -112,24 +112,51 @@ def top_view_film(record: SceneRecord, panel: bool = True) -> list[list[Shot]]:
     return [[Shot(record, TopView(record.scenario, panel=panel))]]
 
 
+def space_film(
+    takes: Sequence[tuple[str, SceneRecord]], width: int, cameras: Sequence[str] = ("overview",), vehicle: int = 0
+) -> list[list[Shot]]:
+    """Return the 3-D film of scenes.
+
+    Args:
+        takes: a column of the picture each, with its name (empty: that of the observer).
+        width: of the whole picture, pixels.
+        cameras: a row of the picture each, of `film3d.CAMERAS`.
+        vehicle: index of the one that is followed, or whose camera it is.
+
+    Raises:
+        CoopenvError: no such camera, or the extra is missing.
+    """
+    from coopenv.viz.film3d import View3d
+
+    each = width // len(takes)
+    size = each, each * 9 // 16 if len(takes) == 1 else each * 3 // 4
+
+    def shot(name: str, record: SceneRecord, camera: str) -> Shot:
+        return Shot(record, View3d(record.scenario, size, camera, vehicle), name)
+
+    heading, *rows = cameras
+    first = [shot(name or record.source.observer, record, heading) for name, record in takes]
+    return [first, *([shot("", record, camera) for _, record in takes] for camera in rows)]
+
+
 def _picture(shot: Shot, k: int) -> np.ndarray:
     """Return the picture of frame k of a shot, below its heading."""
     frame = shot.record.frame(k)
     picture = shot.view.paint(frame)
-    return np.vstack([_heading(shot, frame, picture.shape[1]), picture]) if shot.name else picture
+    return np.vstack([_heading(shot, frame, picture.shape[:2]), picture]) if shot.name else picture
 
 
-_BAND = 0.1  # of the width, height of a heading
+_BAND = (2 / 15, 0.1)  # of the height and of the width of a picture, height of its heading at most
 
 
-def _heading(shot: Shot, frame: Frame, width: int) -> np.ndarray:
+def _heading(shot: Shot, frame: Frame, size: tuple[int, int]) -> np.ndarray:
     """Return a band with the name of a shot and how many vehicles are lost, in the colour of success or failure."""
     from coopenv.viz.stage import Stage
     from coopenv.viz.style import GREEN, VERMILION
 
     count, total = int(lost(Stage(shot.record.scenario), frame).sum()), len(frame.nees)
     found = f"{count} of {total} lost" if count and total > 1 else "lost" if count else "found"
-    height = round(_BAND * width)
+    width, height = size[1], round(min(share * edge for share, edge in zip(_BAND, size, strict=True)))
     band = Image.new("RGB", (width, height), VERMILION if count else GREEN)
     draw, middle = ImageDraw.Draw(band), height / 2
     draw.text((middle / 2, middle), shot.name, "white", ImageFont.load_default(0.5 * height), anchor="lm")

@@ -80,7 +80,8 @@ class Route(Section):
         """Its straight lines and turns."""
         leg = np.diff(np.array(self.waypoints), axis=0)
         heading = np.arctan2(leg[:, 1], leg[:, 0])
-        turn = np.pad((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi, 1)
+        turn = np.zeros(len(self.waypoints))
+        turn[1:-1] = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
         turn[np.abs(turn) <= STRAIGHT] = 0.0
         return Shape(np.linalg.norm(leg, axis=1), heading, turn, self.corner_radius * np.tan(np.abs(turn) / 2))
 
@@ -94,6 +95,16 @@ class Route(Section):
         arcs = points[1:] - cut[1:, None] * ahead, heading, curvature, radius * np.abs(turn[1:])
         there = np.stack([lines[3] > 1e-9, cut[1:] > 0.0], axis=1)
         return Pieces(*(np.stack(pair, axis=1)[there] for pair in zip(lines, arcs, strict=True)))
+
+    @cached_property
+    def start_corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (K, 3), m, and rotations (K, 3, 3): the nominal start, then the ends of its spread."""
+        points = route_points(self, np.array(sorted({0.0, self.start_spread})))
+        aside = np.array([0.0, self.lateral_spread, -self.lateral_spread][: 3 if self.lateral_spread else 1])
+        positions = np.zeros((len(points), len(aside), 3))
+        positions[..., :2] = points[:, None, :2] + aside[:, None] * _direction(points[:, 2:] + math.pi / 2)
+        rotations = np.array([rotation_of(heading, None) for heading in points[:, 2]])
+        return positions.reshape(-1, 3), rotations.repeat(len(aside), axis=0)
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
@@ -130,7 +141,9 @@ def even_points(route: Route) -> np.ndarray:
 
 
 def _direction(heading: np.ndarray) -> np.ndarray:
-    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    direction = np.empty((*heading.shape, 2))
+    direction[..., 0], direction[..., 1] = np.cos(heading), np.sin(heading)
+    return direction
 
 
 def _problems(route: Route) -> Iterator[str]:
@@ -287,18 +300,12 @@ def start_of(agent: Landmark | Vehicle, routes: Mapping[str, Route]) -> tuple[np
     if isinstance(agent, Landmark):
         return np.array(agent.position), rotation_of(agent.yaw, None)
     if agent.routes:
-        return _beside(route_points(routes[agent.routes[0]], np.zeros(1))[0], 0.0)
+        positions, rotations = routes[agent.routes[0]].start_corners
+        return positions[0], rotations[0]
     pose = agent.initial_pose
     if pose is None or pose.position is None:  # the backend draws it
         return np.zeros(3), np.eye(3)
     return np.array(pose.position), rotation_of(pose.yaw, pose.quaternion_wxyz)
-
-
-def _beside(point: np.ndarray, aside: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose at a distance (m) to the left of a point of a route, (x, y, heading) in m and rad."""
-    x, y, heading = point
-    position = np.array([x - aside * np.sin(heading), y + aside * np.cos(heading), 0.0])
-    return position, rotation_of(heading, None)
 
 
 class Boxes(NamedTuple):
@@ -351,23 +358,17 @@ def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
 
 def possible_boxes(vehicle: Vehicle, routes: Mapping[str, Route]) -> Boxes:
     """Return the boxes of a vehicle at its nominal start, which comes first, and at the corners of its spread."""
-    nominal = [start_of(vehicle, routes)]
-    for route in [routes[name] for name in vehicle.routes]:
-        spread = {0.0, route.lateral_spread, -route.lateral_spread}
-        points = route_points(route, np.array([*{0.0, route.start_spread}]))
-        nominal += [_beside(point, aside) for point in points for aside in spread]
-    parts = [_spread_boxes(vehicle, *pose) for pose in nominal]
-    return Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-
-
-def _spread_boxes(vehicle: Vehicle, position: np.ndarray, rotation: np.ndarray) -> Boxes:
+    if vehicle.routes:
+        starts = [routes[name].start_corners for name in vehicle.routes]
+        positions, rotations = (np.concatenate(part) for part in zip(*starts, strict=True))
+    else:
+        positions, rotations = (part[None] for part in start_of(vehicle, routes))
     pose = vehicle.initial_pose
-    spread = np.array(pose.position_spread if pose else (0.0, 0.0, 0.0))
-    turn = pose.yaw_spread if pose else 0.0
-    corners = [(0, 0, 0, 0), *(product((-1, 1), repeat=4) if spread.any() or turn else ())]
-    signs = np.array(corners, dtype=float)
-    turned = {sign: rotation @ rotation_of(sign * turn, None) for sign in (-1.0, 0.0, 1.0)}
-    rotations = np.array([turned[sign] for sign in signs[:, 3]])
-    positions = position + (signs[:, :3] * spread) @ rotation.T
+    if pose and (any(pose.position_spread) or pose.yaw_spread):
+        signs = np.array([(0, 0, 0, 0), *product((-1, 1), repeat=4)], dtype=float)
+        moved = signs[:, :3] * np.array(pose.position_spread)
+        turned = np.array([rotation_of(sign * pose.yaw_spread, None) for sign in signs[:, 3]])
+        positions = (positions[:, None] + moved @ np.swapaxes(rotations, 1, 2)).reshape(-1, 3)
+        rotations = (rotations[:, None] @ turned).reshape(-1, 3, 3)
     center, size = (vehicle.body.center, vehicle.body.size) if vehicle.body else (np.zeros(3), np.zeros(3))
-    return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(signs), 1)))
+    return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(positions), 1)))

@@ -1,4 +1,4 @@
-"""Pictures of a scene in space, lit and with shadows, for films; drawn by VTK without a display. Extra `film3d`."""
+"""3-D pictures of a scene, lit and with shadows, for films; drawn by VTK without a display. Extra `film3d`."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ class View3d:
             CoopenvError: no such camera, or the extra is not installed.
         """
         check_one_of("unknown camera of a film", camera, CAMERAS)
-        with needing(f"films in space need an extra: {install_command('film3d')}"):
+        with needing(f"3-D films need an extra: {install_command('film3d')}"):
             import pyvista
         self._pv: Any = pyvista
         self._camera, self._picked = camera, vehicle

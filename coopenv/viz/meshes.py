@@ -1,4 +1,4 @@
-"""Meshes and colours that the views in space share: cars, landmarks, ellipsoids, and what lies flat on the ground."""
+"""Meshes and colours that the 3-D views share: cars, landmarks, ellipsoids, and what lies flat on the ground."""
 
 import numpy as np
 

@@ -17,6 +17,7 @@ from pettingzoo.utils import BaseParallelWrapper, aec_to_parallel, parallel_to_a
 
 import coopenv
 from coopenv.api.arguments import Info
+from coopenv.base.errors import Explained
 from coopenv.cli import main
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
@@ -155,6 +156,98 @@ def test_a_mistake_is_one_line(mistake: str) -> None:
     with pytest.raises(coopenv.CoopenvError, match=words) as caught:
         attempt()
     assert "\n" not in str(caught.value)
+
+
+UNKNOWN: dict[str, tuple[Callable[[], Any], str]] = {
+    "a keyword of Gymnasium": (
+        lambda: coopenv.make_vec(ENV, num_envs=2),  # type: ignore[call-arg]
+        r"^make_vec: unknown argument 'num_envs' \(did you mean 'num_worlds'\?\); known: name_or_path, num_worlds, .*",
+    ),
+    "a key of the scenario": (
+        lambda: coopenv.parallel_env(ENV, horizon=3.0),  # type: ignore[call-arg]
+        r"'horizon'; known: name_or_path, .*; keys of a scenario are given in overrides$",
+    ),
+    "an option of the shell": (lambda: coopenv.run(ENV, set={}), r"^run: .*'set' \(did you mean 'overrides'\?\)"),  # type: ignore[call-arg]
+    "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run: .*'seeds' \(did you mean 'seed'\?\)"),  # type: ignore[call-arg]
+    "through Gymnasium": (lambda: gymnasium.make("coopenv/Facade-v0", observr="mekf"), r"did you mean 'observer'\?"),
+}
+
+
+@pytest.mark.parametrize("mistake", UNKNOWN)
+def test_an_unknown_argument_is_one_line(mistake: str) -> None:
+    attempt, words = UNKNOWN[mistake]
+    with pytest.raises(TypeError, match=words) as caught:
+        attempt()
+    assert "\n" not in str(caught.value)
+
+
+ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
+    "make": (lambda: coopenv.make, r"^module 'coopenv' has no attribute 'make' \(did you mean 'parallel_env'\?\)$"),
+    "below": (lambda: coopenv.rollout, r"no attribute 'rollout' \(from coopenv\.runs import rollout\)$"),
+    "nothing near": (lambda: coopenv.cuda, r"'cuda'; known: EVALUATION_SEEDS, .*, run$"),
+    "seed": (
+        lambda: coopenv.parallel_env(ENV).seed(3),
+        r"no attribute 'seed' \(did you mean 'reset'\?\); known: action_space,",
+    ),
+    "plot": (
+        lambda: coopenv.run(ENV, overrides={"horizon": 0.3}).plot(),  # type: ignore[attr-defined]
+        r"^Results has no attribute 'plot' \(did you mean 'figure'\?\); known: columns, .*trajectory$",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ABSENT)
+def test_an_attribute_that_is_not_there_is_one_line(name: str) -> None:
+    attempt, words = ABSENT[name]
+    with pytest.raises(AttributeError, match=words) as caught:
+        attempt()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_within_a_property_stays_its_own() -> None:
+    class Broken(Explained):
+        @property
+        def size(self) -> int:
+            return self.missing  # type: ignore[attr-defined, no-any-return]
+
+        other = 1
+
+    with pytest.raises(AttributeError, match=r"^Broken has no attribute 'missing'; known: other, size$"):
+        Broken().size  # noqa: B018
+    assert not hasattr(Broken(), "_hidden") and copy.deepcopy(Broken()).other == 1
+
+
+def test_rendering_says_why_there_is_no_picture() -> None:
+    env = coopenv.parallel_env(ENV)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert env.render() is None
+    with pytest.raises(coopenv.CoopenvError, match=r"^render\(\) called before reset\(\)$"):
+        coopenv.parallel_env(ENV, render_mode="rgb_array").render()
+
+
+def test_classes_and_functions_are_agents() -> None:
+    class Straight:
+        def __init__(self, scenario: Scenario) -> None:
+            assert scenario.driven
+
+        def __call__(self, observations: np.ndarray) -> np.ndarray:
+            return np.zeros((len(observations), 2))
+
+    def still(observations: np.ndarray) -> np.ndarray:
+        return np.zeros((len(observations), 2))
+
+    found = coopenv.evaluate(ENV, [Straight, still], worlds=2, overrides={"horizon": 1.0})
+    assert [*found.episodes] == ["Straight", "still"]
+    first, second = found.episodes.values()
+    np.testing.assert_array_equal(first.position, second.position)
+
+
+def test_groups_print_their_help_and_options_are_no_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    for group in ("bench", "svea"):
+        assert main([group]) == 0 and f"{group} [OPTIONS] COMMAND" in capsys.readouterr().out
+    assert "no such command: 'version' (did you mean '--version'?)" in refused("version")
+    assert "; an environment runs with: coopenv run facade" in refused("facade")
 
 
 def test_names_that_do_not_exist() -> None:

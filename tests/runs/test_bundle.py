@@ -31,6 +31,18 @@ class Late:
         return Message()
 """
 
+DRIVER = """
+import numpy as np
+
+calls = []
+
+def drive(observations):
+    calls.append(0)
+    if len(calls) > 25:
+        VERDICT
+    return np.full((len(observations), 2), 0.1)
+"""
+
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -83,6 +95,21 @@ def test_a_failed_run_is_kept_and_fails_again(
     assert "Late' of vehicle_1" in (printed := capsys.readouterr().out) and reason in printed
     (folder / "mine.py").write_text(OBSERVER.replace("VERDICT", "pass"))
     assert "report.zip: needs its observer.py here as mine.py" in refused("run", "report.zip")
+
+
+@pytest.mark.parametrize("verdict", ["raise ValueError('late')", "return observations[:, :2] + np.nan"])
+def test_a_run_whose_driver_fails_is_replayed_up_to_there(
+    folder: Path, capsys: pytest.CaptureFixture[str], verdict: str
+) -> None:
+    """The driver is not in the file, and need not be there."""
+    (folder / "mine.py").write_text(DRIVER.replace("VERDICT", verdict))
+    assert main(["run", "facade", "--no-figures", "--policy", "mine.py:drive", "--out", "run"]) == 2
+    error = capsys.readouterr().err.rpartition("error: ")[2]
+    (folder / "mine.py").unlink()
+    assert main(["bundle", "run_failed"]) == 0 and main(["run", "run_failed.zip"]) == 0
+    assert capsys.readouterr().out.endswith(f"seed 0, 75 ticks\nThe same figures up to the driver's error: {error}")
+    few = edited(folder / "run_failed.zip", lambda parts: arrays(parts, actions=np.zeros((24, 1, 2))))
+    assert "actions: expected (1, 2) per decision" in refused("run", few)
 
 
 def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

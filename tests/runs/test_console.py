@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import io
 import json
+import os
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -56,6 +58,12 @@ def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest
         wait_for(text, "drawing: 50 % after 30 s, about 20 s left\n")
 
 
+def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
+    with Progress(Console(file=text, force_terminal=True), "simulating"):
+        wait_for(text, "simulating: ")
+    assert "\r" not in text.getvalue() and "\x1b[2K" not in text.getvalue()
+
+
 def test_time_left_is_not_told_before_there_is_enough_to_go_by(
     text: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,12 +109,19 @@ def test_quick_work_says_nothing_where_there_is_no_terminal() -> None:
     assert text.getvalue() == ""
 
 
-def test_a_terminal_has_a_bar_that_vanishes(text: io.StringIO) -> None:
-    with Progress(Console(file=text, force_terminal=True, width=80), "simulating", total=2) as progress:
+def test_a_terminal_has_a_bar_that_vanishes() -> None:
+    master, slave = os.openpty()
+    stream = os.fdopen(slave, "w")
+    with stream, Progress(Console(file=stream, force_terminal=True, width=80), "simulating", total=2) as progress:
         progress.update(1)
-        wait_for(text, "simulating")
-    assert " % after" not in text.getvalue()
-    assert text.getvalue().endswith("\x1b[2K")
+    parts = []
+    with suppress(OSError):  # of Linux, where the other end is closed
+        while part := os.read(master, 4096):
+            parts.append(part)
+    os.close(master)
+    text = b"".join(parts).decode()
+    assert "simulating" in text and " % after" not in text
+    assert text.endswith("\x1b[2K")
 
 
 def test_an_error_ends_the_lines(text: io.StringIO) -> None:

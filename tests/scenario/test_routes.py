@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from coopenv.scenario.routes import (
     overlapping_pairs,
     path_heading,
     point_count,
+    possible_boxes,
     route_length,
     route_points,
 )
@@ -142,6 +144,33 @@ def test_a_route_must_not_begin_in_a_building() -> None:
     for spread in ({"lateral_spread": 0.6}, {"lateral_spread": 0.6, "start_spread": 1.0}):
         with pytest.raises(ScenarioError, match="vehicle_1 starts inside obstacle 'wall'"):
             scenario([car], routes=[{**LEFT_TURN, **spread}], obstacles=[wall])
+
+
+def test_the_boxes_of_a_start_are_at_every_corner_of_its_spread() -> None:
+    """Each corner alone, by SciPy's rotations, from routes that begin straight."""
+    pose, body = (
+        {"position_spread": [0.2, 0.1, 0.05], "yaw_spread": 0.3},
+        {"size": [0.5, 0.3, 0.2], "center": [0.1, 0, 0]},
+    )
+    right = {"name": "right", "waypoints": [[3.0, 4.0], [3.0, 9.0]]}
+    routes = [{**LEFT_TURN, "lateral_spread": 0.6, "start_spread": 1.0}, right]
+    made = scenario(
+        [{"routes": ["left", "right"], "motion": DRIVEN, "initial_pose": pose, "body": body}], routes=routes
+    )
+    boxes = possible_boxes(made.vehicles[0], {r.name: r for r in made.routes})
+    begins = [(-6.0 + s, -0.5 + aside, 0.0) for s in (0.0, 1.0) for aside in (0.0, 0.6, -0.6)] + [(3.0, 4.0, np.pi / 2)]
+    expected = []
+    for (x, y, heading), signs in product(begins, [(0, 0, 0, 0), *product((-1, 1), repeat=4)]):
+        outer = Rotation.from_rotvec([0.0, 0.0, heading])
+        turned = outer * Rotation.from_rotvec([0.0, 0.0, 0.3 * signs[3]])
+        place = outer.apply(np.multiply(signs[:3], [0.2, 0.1, 0.05])) + turned.apply([0.1, 0.0, 0.0]) + [x, y, 0.0]
+        expected.append(np.concatenate([place, turned.as_matrix().ravel(), [0.25, 0.15, 0.1]]))
+    found = np.column_stack([boxes.center, boxes.rotation.reshape(-1, 9), boxes.half])
+    assert_allclose(found[0, :3], [-5.9, -0.5, 0.0], atol=1e-12)  # the nominal start is the first
+    assert len(found) == len(expected)
+    distance = np.abs(found[:, None] - np.array(expected)).max(axis=-1)
+    assert distance.min(axis=0).max() < 1e-12
+    assert distance.min(axis=1).max() < 1e-12
 
 
 def test_defaults_may_give_the_spreads() -> None:

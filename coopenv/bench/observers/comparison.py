@@ -12,7 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 from coopenv.base.columns import Columns, Tabular, written
-from coopenv.base.errors import CoopenvError, check_one_of, checked_seed
+from coopenv.base.errors import CoopenvError, check_one_of, checked_seed, explained
 from coopenv.base.notebook import one_line, picture_html, terminal_html
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
@@ -147,6 +147,7 @@ class Comparison(Leaderboard, Tabular):
         return variant
 
 
+@explained
 def compare(
     observers: Iterable[str | Factory] | None,
     environment: ScenarioLike,
