@@ -98,7 +98,7 @@ LINES_AND_FILES = {
     "policies": (1740, 10),
     "runs": (3360, 13),
     "scenario": (3755, 15),
-    "training": (1385, 5),
+    "training": (1525, 6),
     "viz": (4800, 19),
     "world": (5420, 20),
 }

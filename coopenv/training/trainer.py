@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -24,6 +23,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.evaluation.metrics import SETTLED_FROM
 from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
+from coopenv.training.ppo import LeanPpo, TanhPolicy, differentiate, outputs
 from coopenv.training.settings import Clone, Ppo, TrainingPlan
 
 EPISODES = 200
@@ -277,6 +277,8 @@ class DivergedError(CoopenvError):
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
+    algorithm, policy = LeanPpo, TanhPolicy
+
     def __init__(self, plan: TrainingPlan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
 
@@ -298,8 +300,8 @@ class Trainer:
         self._rollout = ppo.decisions * self.env.num_envs
         self._share, self.seconds, self.cpu_seconds = 0.0, 0.0, 0.0
         widths = list(ppo.hidden)
-        self.model = PPO(
-            "MlpPolicy",
+        self.model = self.algorithm(
+            self.policy,
             self.env,
             learning_rate=lambda _: ppo.learning_rate * (1.0 - self._share),
             n_steps=ppo.decisions,
@@ -316,7 +318,7 @@ class Trainer:
             policy_kwargs={
                 "net_arch": {"pi": widths, "vf": widths},
                 "log_std_init": math.log(ppo.initial_std),
-                "optimizer_kwargs": {"eps": 1e-5},
+                "optimizer_kwargs": {"eps": 1e-5, "fused": True},
             },
             seed=plan.seed,
             device="cpu",
@@ -330,6 +332,7 @@ class Trainer:
             self._imitate(self.plan.settings.clone, report)
         self.env.start()
 
+    @torch.no_grad()
     def _imitate(self, clone: Clone, report: Callable[[str], None]) -> None:
         """Fit the mean action to a driver's actions, and the value to the discounted rewards that follow.
 
@@ -348,19 +351,17 @@ class Trainer:
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
         self.env.spread.update(returns)
-        values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32))
+        values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32)).unsqueeze(1)
         optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
         shuffle = torch.Generator().manual_seed(seed)
         for epoch in range(clone.epochs):
             optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
             report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
             for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
-                latent_policy, latent_value = policy.mlp_extractor(observations[rows])
-                action_error = policy.action_net(latent_policy) - targets[rows]
-                value_error = policy.value_net(latent_value).squeeze(-1) - values[rows]
-                loss = (action_error**2).mean() + (value_error**2).mean()
-                optimiser.zero_grad()
-                loss.backward()
+                for layers, aims in zip(policy.layers(), (targets[rows], values[rows]), strict=True):
+                    found = outputs(layers, observations[rows])
+                    excess = found[-1] - aims
+                    differentiate(layers, found, 2.0 / excess.numel() * excess)
                 optimiser.step()
 
     def update(self) -> Status:

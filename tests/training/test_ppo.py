@@ -1,0 +1,128 @@
+"""The closed-form update beside the one that Stable-Baselines3 differentiates itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+import coopenv
+from coopenv.training.ppo import TanhPolicy, differentiate, outputs, product
+from coopenv.training.settings import Ppo, Settings, TrainingPlan
+from coopenv.training.trainer import Trainer
+from tests.helpers.four_way import FOUR_WAY
+
+pytestmark = pytest.mark.train
+torch.set_num_threads(1)
+
+
+class Original(Trainer):
+    """The same training with SB3's own classes."""
+
+    algorithm, policy = PPO, ActorCriticPolicy
+
+
+class Figures(Logger):
+    """Keeps the last figures that were recorded."""
+
+    def __init__(self) -> None:
+        super().__init__(None, [])
+        self.kept: dict[str, Any] = {}
+
+    def record(self, key: str, value: Any, exclude: Any = None) -> None:
+        self.kept[key] = value
+
+
+def trained(kind: type[Trainer], updates: int, **ppo: Any) -> tuple[Trainer, dict[str, Any]]:
+    """Return a training after some updates, with the figures of the last one."""
+    small = {"vehicles": 16, "decisions": 16, "minibatches": 2, "epochs": 2, **ppo}
+    trainer = kind(TrainingPlan(FOUR_WAY, Settings(ppo=Ppo(**small)), seed=3), coopenv.load_scenario(FOUR_WAY), 1)
+    figures = Figures()
+    trainer.model.set_logger(figures)
+    trainer.begin()
+    for _ in range(updates):
+        trainer.update()
+    return trainer, figures.kept
+
+
+@pytest.mark.parametrize(
+    "ppo",
+    [
+        {},
+        {"hidden": (32,), "entropy": 0.02, "value_weight": 0.7},
+        {"hidden": (24, 16, 8), "clip": 0.001, "max_gradient": 0.01},  # most ratios and all gradients are clipped
+        {"minibatches": 256},  # of a row or two
+    ],
+)
+def test_an_update_is_that_of_sb3(ppo: dict[str, Any]) -> None:
+    """From the same seed, weights, moments of Adam, rollout and logged figures are the same after two updates."""
+    (lean, found), (original, expected) = trained(Trainer, 2, **ppo), trained(Original, 2, **ppo)
+    start = trained(Original, 0, **ppo)[0].model.policy.state_dict()
+    assert type(lean.model) is not type(original.model)
+    for name in ("actions", "values", "log_probs", "advantages"):
+        ours, theirs = (getattr(trainer.model.rollout_buffer, name) for trainer in (lean, original))
+        assert ours == pytest.approx(theirs, abs=2e-4), name
+    for name, theirs in original.model.policy.state_dict().items():
+        change = float((theirs - start[name]).abs().max())
+        assert change > 1e-4, name
+        assert lean.model.policy.state_dict()[name].numpy() == pytest.approx(theirs.numpy(), abs=0.01 * change), name
+    ours, theirs = (trainer.model.policy.optimizer.state_dict()["state"] for trainer in (lean, original))
+    assert ours.keys() == theirs.keys()
+    for index, moments in theirs.items():
+        for name, values in moments.items():
+            scale = float(values.abs().max())
+            assert ours[index][name].numpy() == pytest.approx(values.numpy(), abs=0.01 * scale), (index, name)
+    assert found.keys() == expected.keys()
+    for name in (name for name in expected if name.startswith("train/")):
+        assert found[name] == pytest.approx(expected[name], rel=5e-3, abs=1e-4), name
+
+
+def test_gradients_of_a_network_are_those_of_autograd() -> None:
+    generator = torch.Generator().manual_seed(0)
+    layers = [nn.Linear(7, 5), nn.Linear(5, 6), nn.Linear(6, 2)]
+    rows = torch.randn(11, 7, generator=generator)
+    plain = nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
+    (plain(rows) ** 3).sum().backward()
+    expected = [each.grad for layer in layers for each in (layer.weight, layer.bias)]
+    with torch.no_grad():
+        found = outputs(layers, rows)
+        differentiate(layers, found, 3.0 * found[-1] ** 2)
+    assert found[-1].numpy() == pytest.approx(plain(rows).detach().numpy(), abs=1e-6)
+    for layer, (weight, bias) in zip(layers, zip(expected[::2], expected[1::2], strict=True), strict=True):
+        assert layer.weight.grad.numpy() == pytest.approx(weight.numpy(), rel=1e-4, abs=1e-5)
+        assert layer.bias.grad.numpy() == pytest.approx(bias.numpy(), rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("available", [True, False])
+def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of transposed views as well, with oneDNN and without."""
+    if available and not torch.backends.mkldnn.is_available():
+        pytest.skip("this torch has no oneDNN")
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: available)
+    rng = np.random.default_rng(1)
+    rows, weight, bias = (torch.from_numpy(rng.normal(size=n).astype(np.float32)) for n in ((300, 40), (9, 40), 9))
+    exact = rows.double() @ weight.double().t()
+    assert product(rows, weight, bias).numpy() == pytest.approx((exact + bias).numpy(), abs=1e-4)
+    turned = weight.t().contiguous().t(), rows.t().contiguous().t()
+    assert product(turned[1], turned[0]).numpy() == pytest.approx(exact.numpy(), abs=1e-4)
+
+
+def test_values_and_mean_actions_are_those_of_sb3() -> None:
+    trainer, _ = trained(Trainer, 1)
+    policy = trainer.model.policy
+    assert isinstance(policy, TanhPolicy)
+    rows = torch.from_numpy(np.random.default_rng(2).normal(size=(50, 132)).astype(np.float32))
+    with torch.no_grad():
+        actions, values, densities = policy(rows, deterministic=True)
+        expected, expected_values, expected_densities = ActorCriticPolicy.forward(policy, rows, deterministic=True)
+    for ours, theirs in ((actions, expected), (values, expected_values), (densities, expected_densities)):
+        assert ours.numpy() == pytest.approx(theirs.numpy(), abs=1e-5)
