@@ -22,18 +22,22 @@ GAP, SPACING = 3.0, 15.0
 """m between vehicles that follow one another, and between those on a grid."""
 WORLDS = 64
 """Worlds while vehicles or landmarks grow: enough for the arithmetic to outweigh the call."""
+NEARBY_VEHICLES = 64
+"""Held while the landmarks of one world grow."""
 RANGE, MOST_NEARBY = 30.0, 64
 """m of cameras and radio, and the vehicles and landmarks within it at most, where vehicles keep those nearby alone."""
 SIZES: dict[str, tuple[int, ...]] = {
     "vehicles": (2, 4, 8, 16, 32, 64),
     "nearby": (64, 128, 256, 512, 1024, 2048, 4096),
     "landmarks": (3, 6, 12, 24, 48, 64),
+    "map": (64, 256, 1024, 4096, 10_000),
     "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384, 65536),
 }
 QUICK_SIZES: dict[str, tuple[int, ...]] = {
     "vehicles": (2, 8, 32),
     "nearby": (64, 256),
     "landmarks": (3, 12, 48),
+    "map": (64, 1024),
     "worlds": (1, 64, 4096),
 }
 
@@ -64,11 +68,12 @@ class Sweep:
         """Return one case per size, on one thread."""
         cases = []
         for size in self.sizes:
-            shape = {"vehicles": VEHICLES, "landmarks": LANDMARKS, "worlds": WORLDS, self.quantity: size}
-            worlds = 1 if self.nearby else shape.pop("worlds")
-            options: dict[str, dict[str, object]] = {"growth": {**shape, "sensed": self.sensed}}
+            shape = {"vehicles": VEHICLES, "landmarks": LANDMARKS, "worlds": WORLDS}
             if self.nearby:
-                options = {"growth": {"vehicles": size, "landmarks": size, "sensed": True, "nearby": True}}
+                shape = {"vehicles": NEARBY_VEHICLES, "landmarks": size, "worlds": 1}
+            shape[self.quantity] = size
+            worlds = shape.pop("worlds")
+            options = {"growth": {**shape, "sensed": self.sensed, "nearby": self.nearby}}
             cases.append(Case(self.label, COOPENV.name, worlds, shape["vehicles"], options=options))
         return cases
 
@@ -81,8 +86,15 @@ def sweeps(quick: bool = False) -> list[Sweep]:
         Sweep("vehicles", False, sizes["vehicles"]),
         Sweep("vehicles", True, sizes["nearby"], nearby=True),
         Sweep("landmarks", True, sizes["landmarks"]),
+        Sweep("landmarks", True, sizes["map"], nearby=True),
         Sweep("worlds", True, sizes["worlds"]),
     ]
+
+
+def grid(count: int) -> list[tuple[float, float]]:
+    """Return the places of a square grid about the origin, m."""
+    columns = math.ceil(math.sqrt(count))
+    return [(SPACING * (i % columns - columns // 2), SPACING * (i // columns - columns // 2)) for i in range(count)]
 
 
 def growth_scenario(vehicles: int, landmarks: int, sensed: bool, nearby: bool = False) -> Scenario:
@@ -116,10 +128,9 @@ def growth_scenario(vehicles: int, landmarks: int, sensed: bool, nearby: bool = 
     if nearby:
         raw["topology"] |= {"most_nearby": MOST_NEARBY, "acyclic": False}
         raw["camera"]["range"], raw["v2x"] = RANGE, {"range": RANGE, "delay": 1}
-        columns = math.ceil(math.sqrt(vehicles))
-        for i, (mark, vehicle) in enumerate(zip(raw["landmarks"], raw["vehicles"], strict=True)):
-            x, y = SPACING * (i % columns - columns // 2), SPACING * (i // columns - columns // 2)
+        for mark, (x, y) in zip(raw["landmarks"], grid(landmarks), strict=True):
             mark["position"] = [x + SPACING / 2, y + SPACING / 2, 3.0]
+        for i, (vehicle, (x, y)) in enumerate(zip(raw["vehicles"], grid(vehicles), strict=True)):
             vehicle["initial_pose"] = {"position": [x, y, 0.5], "yaw": 2.4 * i % 6.0 - 3.0}
             vehicle["initial_estimate"] = {"position": [x + 0.5, y, 0.5]}
             vehicle["motion"] = {"kind": "constant", "linear": [1.0, 0.0, 0.0], "angular": [0.0, 0.0, 0.5]}
