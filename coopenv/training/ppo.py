@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples, Schedule
 from stable_baselines3.common.utils import explained_variance
 from torch import Tensor, nn
 
+ONEDNN = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
 LOG_DENSITY = 0.5 * math.log(2.0 * math.pi)  # of a standard normal number at 0, negated
 
 
@@ -24,8 +25,8 @@ def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
     Torch's own products are MKL's, which on AMD use half the width of the vector unit; oneDNN's use all of it.
     """
-    if torch.backends.mkldnn.is_available():
-        return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")  # type: ignore[no-any-return]
+    if ONEDNN is not None and torch.backends.mkldnn.is_available():
+        return ONEDNN(rows, weight, bias, "none", [], "")  # type: ignore[no-any-return]
     return nn.functional.linear(rows, weight, bias)
 
 
