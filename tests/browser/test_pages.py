@@ -126,6 +126,8 @@ def test_the_live_view_can_be_worked(
     page.get_by_text("its estimate").wait_for()
     checked(watched)
     page.get_by_role("tab", name="Errors").click()
+    row = page.get_by_text("Time [s]", exact=True).locator("xpath=ancestor::*[.//input[@inputmode]][1]")
+    row.locator("input[inputmode]").fill("10")  # the same picture on a slow machine
     box = page.get_by_label("Observer", exact=True)
     box.click()
     page.get_by_role("option", name="dead_reckoning").click()

@@ -126,6 +126,14 @@ def test_switches_change_what_is_shown_and_the_view_goes_along_with_the_picked_v
     assert not any(node.visible for node in (*picture._labels._cars, *picture._views))
 
 
+def test_names_state_the_errors_of_another_observer_at_the_same_time(viewer: Viewer) -> None:
+    wish(viewer, ("play", None), ("seek", 3.0))
+    before = [label.text for label in viewer._picture._labels._cars]
+    wish(viewer, ("observer", "dead_reckoning"))
+    texts = [label.text for label in viewer._picture._labels._cars]
+    assert texts == [f"f{i + 1}  {error:.2f} m" for i, error in enumerate(viewer._frame.position_error)] != before
+
+
 def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame that is shown twice costs nothing but the time, and while playing every other name and view waits."""
     from viser.infra._async_message_buffer import AsyncMessageBuffer

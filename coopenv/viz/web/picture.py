@@ -283,7 +283,7 @@ class Labels:
     def place(self, frame: Frame, time: float, look: Look, turn: int | None = None) -> None:
         """Move the names; with a `turn` those of some vehicles, as in `Picture.show`."""
         stage, side, shown = self._stage, self._stage.side, look.names
-        if not 0.0 <= time - self._said < _OFTEN - 1e-9:
+        if turn is None or not 0.0 <= time - self._said < _OFTEN - 1e-9:
             self._said = time
             for i, label in enumerate(self._cars if shown else ()):
                 label.text = self._text(frame, i)
