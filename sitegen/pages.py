@@ -30,8 +30,8 @@ def generated() -> Iterator[tuple[str, str]]:
 
 def gallery() -> str:
     """Return the page with the film of every environment, or its picture, which leads to its page."""
-    cards = []
-    for name in list_envs():
+    cards, in_3d = [], [name for name in list_envs() if (ROOT / f"docs/environments/{name}_3d.webp").is_file()]
+    for name in [*in_3d, *(name for name in list_envs() if name not in in_3d)]:  # pictures of one height side by side
         page = ROOT / "docs/environments" / name
         title = page.with_suffix(".md").read_text(encoding="utf-8").partition("\n")[0].strip("# ")
         [picture, *_] = [
