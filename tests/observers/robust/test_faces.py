@@ -82,7 +82,8 @@ def started(name: str) -> Engine:
     scenario = load_scenario(name)
     if scenario.backend == "highway":
         pytest.importorskip("highway_env", reason="needs the extra highway")
-    engine = Engine(scenario, {"highway": 24, "sumo": 6}.get(scenario.backend, 256), "float64")
+    many = 24 if len(scenario.vehicles) > 50 else 256
+    engine = Engine(scenario, {"highway": 24, "sumo": 6}.get(scenario.backend, many), "float64")
     engine.reset(range(engine.world.worlds))
     return engine
 
