@@ -16,7 +16,7 @@ from coopenv.estimation.poses import log_so3
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
 from tests.oracles.continuous import left_jacobian
 
 BEGIN = 1_700_000_000_000_000_000  # ns
@@ -111,12 +111,17 @@ def of_vehicle(
     return found
 
 
+@cache
+def lens() -> Camera:
+    """Return the camera of the drives, without distortion."""
+    return load_scenario("crossing_path").cameras[0]
+
+
 def blocks(
     r: Recording, k: int, i: int, numbers: dict[int, int], distortion: tuple[float, ...]
 ) -> list[dict[str, int]]:
     """Return the blocks of a frame, an unwanted small one of every marker among them."""
-    camera = load_scenario("crossing_path").cameras[0]
-    found = []
+    camera, found = lens(), []
     for target in np.flatnonzero(r.visible[k, i]).tolist():
         ray = ROTATION_OF_CAMERA["forward"].T @ r.bearings[k, i, target]
         flat = distort((ray[:2] / ray[2])[None], distortion)[0]

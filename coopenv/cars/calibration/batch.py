@@ -121,11 +121,7 @@ class Batch:
         """Prepare it; `truth`: whether motion capture counts. Raises DataError: odometry or geometry is lacking."""
         self.drive, self.places = drive, drive.places
         self.truth = [truth and len(car.truth_time) > 1 for car in drive.cars]
-        none: dict[str, Any] = {
-            "truth_time": np.zeros(0),
-            "truth": np.zeros(0, dtype=complex),
-            "truth_yaw": np.zeros(0),
-        }
+        none: dict[str, Any] = dict.fromkeys(("truth_time", "truth", "truth_yaw"), np.zeros(0))
         self.cars = [car if has else replace(car, **none) for car, has in zip(drive.cars, self.truth, strict=True)]
         self.kinds = [
             *(
@@ -172,6 +168,7 @@ class Batch:
                 mine[LENS] = *lens.focal_length, *lens.principal_point, *lens.distortion
         self.base[self.markers : self.frame] = self.places.ravel()
         self.slow = [averaged(car.wheel, float(np.median(np.diff(car.wheel_time)))) for car in self.cars]
+        self.paths: dict[int, tuple[tuple[float, ...], Path]] = {}  # the last one of each car, with its constants
 
     def own(self, c: int) -> slice:
         """Return where the constants of a car are."""
@@ -184,6 +181,9 @@ class Batch:
     def path(self, c: int, x: Array) -> Path:
         """Return the dead reckoning of a car; the offset of its wheels acts on averaged speeds."""
         car, own = self.cars[c], x[self.own(c)]
+        given = own[BIAS], own[SCALE], own[WHEEL_TIME]
+        if c in self.paths and self.paths[c][0] == given:  # most derivatives and trials leave it as it is
+            return self.paths[c][1]
         time = np.arange(self.keys[c][0] - 1.0, self.keys[c][-1] + 1.0, GRID)
         rate = np.interp(time, car.gyro_time, car.gyro) - own[BIAS]
         speed = np.interp(time, car.wheel_time, car.wheel)
@@ -193,7 +193,8 @@ class Batch:
         speed /= 1.0 + own[SCALE]
         yaw = cumulative_trapezoid(rate, dx=GRID, initial=0.0)
         place = cumulative_trapezoid(speed * np.exp(1j * yaw), dx=GRID, initial=0.0)
-        return Path(time, yaw, place, averaged(rate, GRID), averaged(speed, GRID))
+        self.paths[c] = given, Path(time, yaw, place, averaged(rate, GRID), averaged(speed, GRID))
+        return self.paths[c][1]
 
     def residuals(self, c: int, x: Array, pose: Array, near: Array | None = None) -> tuple[Array, Array, Array]:
         """Return those of sightings (n, 2), odometry (M - 1, 3) and motion capture (T, 3), px or rad, m, rad.

@@ -192,18 +192,24 @@ def pattern(family: str, number: int) -> Array:
     return np.where(np.pad(cells, 1, constant_values=255) > 127, WHITE, BLACK)
 
 
+@cache
+def pixel_rays(calibration: Calibration) -> tuple[Array, Array, Array]:
+    """Return the rays (height, width, 3) of all pixels, at depth 1, and their changes downwards and to the right."""
+    width, height = calibration.image_size
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    units, there = rays(pixels.astype(np.float64), calibration)
+    units[~there] = np.nan  # meets no tag
+    found = (units / units[:, 2:]).reshape(height, width, 3)
+    return found, *np.gradient(found)[:2]  # per pixel: nearly the same all over it
+
+
 class FrameRenderer:
     """Renders frames of one camera; pixels have whole numbers in their middle, as in OpenCV."""
 
     def __init__(self, calibration: Calibration, family: str) -> None:
         """Find the rays of all pixels."""
         self.calibration, self.family = calibration, family
-        width, height = calibration.image_size
-        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-        units, there = rays(pixels.astype(np.float64), calibration)
-        units[~there] = np.nan  # meets no tag
-        self._rays = (units / units[:, 2:]).reshape(height, width, 3)
-        self._down, self._right, _ = np.gradient(self._rays)  # per pixel: nearly the same all over it
+        self._rays, self._down, self._right = pixel_rays(calibration)
 
     def render(
         self, tags: Sequence[PlacedTag], blur: float, noise: float, rng: np.random.Generator, behind: Any = WALL

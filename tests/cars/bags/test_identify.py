@@ -101,14 +101,12 @@ marker = 3
 """
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of a fake with other settings, and its map."""
-    folder = tmp_path_factory.mktemp("identify")
+def driven(folder: Path, seconds: float) -> Path:
+    """Write a bag of a fake with other settings, and its map; return the folder."""
     stage = Stage("svea_crossing", CROSSING, OVERRIDES, settings=SETTINGS)
     arrived: list[tuple[str, bytes, int]] = []
     stage.network.subscribe("**", lambda a: arrived.append((a.topic, a.payload, stage.wall + stage.now)))
-    for _, speed, steering in commands(25.0, 9).tolist():
+    for _, speed, steering in commands(seconds, 9).tolist():
         stage.drive("svea7", speed, steering, 0.05)
     kinds = {SVEA.topic_of(car.name, role): topic.type for role, topic in SVEA.topics.items() for car in CROSSING}
     bags.write_raw(folder / "bag", arrived, kinds)
@@ -117,7 +115,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_fake_becomes_the_car(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fake_becomes_the_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = driven(tmp_path, 25.0)
     out = folder / "identified.toml"
     assert main(["identify", str(folder / "bag"), "--map", str(folder / "map.toml"), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -136,7 +135,8 @@ def test_a_fake_becomes_the_car(folder: Path, capsys: pytest.CaptureFixture[str]
     assert made.fake.latency == pytest.approx(0.09, abs=0.003) and "dynamics.dead_band" in made.overrides
 
 
-def test_what_is_missing_is_one_line(folder: Path) -> None:
+def test_what_is_missing_is_one_line(tmp_path: Path) -> None:
+    folder = driven(tmp_path, 2.0)
     (folder / "names.toml").write_text(MAP + 'topics = { manual = "/nowhere" }\n', encoding="utf-8")
     bag = str(folder / "bag")
     line = ["identify", bag, "--out", str(folder / "none.toml"), "--map"]

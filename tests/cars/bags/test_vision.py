@@ -45,8 +45,10 @@ def test_lenses_are_those_of_opencv(name: str) -> None:
     np.testing.assert_allclose(found, flat, atol=1e-9)
 
 
-@pytest.mark.parametrize("family", ["tag36h11", "tag16h5", "DICT_4X4_50", "DICT_6X6_250"])
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize(
+    ("name", "family"),
+    [*((name, "tag36h11") for name in LENSES), *(("plumb_bob", f) for f in ("tag16h5", "DICT_4X4_50", "DICT_6X6_250"))],
+)
 def test_bearings_of_oblique_tags(name: str, family: str) -> None:
     calibration = Calibration((640, 480), (450.0, 455.0), (322.3, 236.1), LENSES[name])
     renderer, rng = FrameRenderer(calibration, family), np.random.default_rng(1)
