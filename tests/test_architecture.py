@@ -95,10 +95,10 @@ LINES_AND_FILES = {
     "estimation": (1810, 8),
     "evaluation": (495, 3),
     "observers": (11820, 47),
-    "policies": (1730, 10),
+    "policies": (1875, 11),
     "runs": (3320, 13),
     "scenario": (3750, 15),
-    "training": (1385, 5),
+    "training": (1580, 6),
     "viz": (4800, 19),
     "world": (5420, 20),
 }
