@@ -95,10 +95,10 @@ LINES_AND_FILES = {
     "estimation": (1810, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
-    "policies": (1740, 10),
+    "policies": (1885, 11),
     "runs": (3360, 13),
     "scenario": (3755, 15),
-    "training": (1525, 6),
+    "training": (1720, 7),
     "viz": (4800, 19),
     "world": (5420, 20),
 }

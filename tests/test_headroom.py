@@ -121,6 +121,14 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
     assert unseen[2] > 0.8 * unseen[0]
 
 
+@pytest.mark.slow
+def test_one_driver_drives_where_it_never_learnt() -> None:
+    """The agent learnt in eight environments without this one."""
+    driver, lookout = (figures("open_square", agent, times=4) for agent in ("open_square_general", "peek"))
+    assert driver["arrival_rate"][0] >= 0.95 and driver["collision_rate"][0] <= 0.03
+    assert driver["e95_m"][0] <= lookout["e95_m"][0]
+
+
 LEAST = {"facade": 0.95, "behind_truck": 0.95, "open_square": 0.75}
 """Share of arrivals in each kind of worlds; a vehicle that lies is not among them."""
 

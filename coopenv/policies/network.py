@@ -87,7 +87,8 @@ class Network:
         if network.layout != layout_hash(network.observation, network.action, network.settings):
             raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
         self._clip = np.float32(network.clip)
-        tensors = _load(path, network.sha256)
+        tensors = load_weights(path, network.sha256)
+        _check_names(path, tensors)
         self._mean, self._std = tensors.pop("observation.mean"), tensors.pop("observation.std")
         depth = len([name for name in tensors if name.endswith(".weight")])
         self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
@@ -139,7 +140,12 @@ def _compare(what: str, trained: Mapping[str, NetworkColumn], here: Mapping[str,
                 raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")
 
 
-def _load(path: Path, digest: str) -> dict[str, np.ndarray]:
+def load_weights(path: Path, digest: str) -> dict[str, np.ndarray]:
+    """Return the tensors of a file of weights, float32.
+
+    Raises:
+        CoopenvError: it cannot be read, has another SHA-256 than `digest`, or holds anything but finite numbers.
+    """
     try:
         data = path.read_bytes()
         tensors: dict[str, np.ndarray] = load(data)
@@ -149,14 +155,17 @@ def _load(path: Path, digest: str) -> dict[str, np.ndarray]:
         raise CoopenvError(f"{path}: damaged, or no weights: {error}") from None
     if sha256(data).hexdigest() != digest:
         raise CoopenvError(f"{path}: not the weights that agent.toml was written with (another SHA-256)")
+    if not all(values.dtype == np.float32 and np.isfinite(values).all() for values in tensors.values()):
+        raise CoopenvError(f"{path}: weights are not finite numbers in float32")
+    return tensors
+
+
+def _check_names(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
     names = {"observation.mean", "observation.std", "log_std"}
     depth = (len(tensors) - len(names)) // 2
     expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
     if set(tensors) != expected or depth < 1:
         raise CoopenvError(f"{path}: not the weights of a policy: {', '.join(sorted(set(tensors) ^ expected))[:80]}")
-    if not all(values.dtype == np.float32 and np.isfinite(values).all() for values in tensors.values()):
-        raise CoopenvError(f"{path}: weights are not finite numbers in float32")
-    return tensors
 
 
 def _check_shapes(path: Path, inputs: int, outputs: int, mean: Any, std: Any, layers: list[Any]) -> None:

@@ -31,6 +31,7 @@ from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.training.export import EXPORTED, check_onnx, export
+from coopenv.training.sets import SetTrainer
 from coopenv.training.settings import TrainingPlan, check_settings, environment_file
 from coopenv.training.trainer import DivergedError, Status, Trainer
 
@@ -79,7 +80,7 @@ def possible(plan: TrainingPlan) -> Scenario:
     scenario = open_simulation(plan.environment, plan.all_overrides)
     if not any(scenario.acting):
         raise CoopenvError(f"{plan.environment}: all motion is prescribed or has a driver, there is nothing to learn")
-    for each, _ in plan.scenarios():
+    for each, _ in (pair for own in plan.watched() for pair in own.scenarios()):
         if plan.settings.clone is not None:
             load_agent(plan.settings.clone.agent, each)
     return scenario
@@ -131,7 +132,14 @@ def train(
         raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
     check_settings(out, plan, environment)
     if onnx:
-        check_onnx()
+        check_onnx(plan.settings)
+    if plan.settings.network and plan.settings.clone:
+        cloned = SetTrainer(plan, scenario, plan.settings.clone, threads)
+        cloned.begin(report.cloning)
+        results = _judge(cloned, threads, report, held_out_seeds(0, plan.settings.evaluation.final_worlds))
+        with replacing_folder(out, (*NAMES, environment.name, *environment.code)) as folder:
+            export(folder, out, cloned, environment, results, [])
+        return results
     curve = kept.curve if kept is not None else []
     with closing(Trainer(plan, scenario, threads)) as trainer:
         judge = partial(_judge, trainer, threads, report)
@@ -178,7 +186,7 @@ def _learn(
             keep()
 
 
-def _judge(trainer: Trainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
+def _judge(trainer: Trainer | SetTrainer, threads: int | None, report: Reports, seeds: list[int]) -> list[Result]:
     """Return how the mean action drives in held-out worlds."""
     with closing(Engine(trainer.scenario, len(seeds), threads=threads)) as engine:
         results = score(drive(engine, trainer.mean_action, seeds))

@@ -14,13 +14,16 @@ from safetensors.numpy import save
 from torch import nn
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
+from coopenv.base.errors import CoopenvError
 from coopenv.base.files import writing
 from coopenv.base.installation import install_command, needing, version, versions
 from coopenv.evaluation import Result
+from coopenv.policies import sets
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
-from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, settings_digest, write_settings
+from coopenv.training.sets import SetTrainer
+from coopenv.training.settings import SETTINGS_FILE, EnvironmentFile, Settings, settings_digest, write_settings
 from coopenv.training.trainer import Trainer
 
 WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
@@ -32,7 +35,7 @@ PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
 def export(
     folder: Path,
     old: Path,
-    trainer: Trainer,
+    trainer: Trainer | SetTrainer,
     environment: EnvironmentFile,
     results: Sequence[Result],
     curve: list[dict[str, float]],
@@ -53,7 +56,7 @@ def export(
         OutputError: it cannot be written, or see `check_settings`.
     """
     write_settings(folder, old, trainer.plan, environment)
-    tensors = network_of(trainer)
+    tensors = trainer.tensors if isinstance(trainer, SetTrainer) else network_of(trainer)
     weights = save(tensors)
     with writing(folder):
         (folder / WEIGHTS_FILE).write_bytes(weights)
@@ -91,15 +94,14 @@ def scenario_digest(scenario: Scenario) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
-    plan = trainer.plan
+def _network(trainer: Trainer, digest: str) -> NetworkCard:
     observation, action = layout_tables(observation_layout(trainer.scenario))
     settings = settings_of_meaning(trainer.scenario, observation)
-    card = NetworkCard(
+    return NetworkCard(
         weights=WEIGHTS_FILE,
         sha256=digest,
         layout=layout_hash(observation, action, settings),
-        clip=plan.settings.ppo.observation_clip,
+        clip=trainer.plan.settings.ppo.observation_clip,
         observation=observation,
         action=action,
         settings=settings,
@@ -109,13 +111,30 @@ def _card(trainer: Trainer, environment: EnvironmentFile, results: Sequence[Resu
             if name != "time_left"  # goes on for vehicles that have arrived
         },
     )
+
+
+def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: Sequence[Result], digest: str) -> str:
+    plan = trainer.plan
+    if isinstance(trainer, SetTrainer):
+        card = NetworkCard(
+            weights=WEIGHTS_FILE,
+            sha256=digest,
+            layout=layout_hash({}, {}, {}),  # it reads any
+            clip=plan.settings.ppo.observation_clip,
+            observation={},
+            action={},
+            settings={},
+            seen=trainer.seen,
+        )
+    else:
+        card = _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
     begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
     document = {
         "title": f"Learned driver of {environment.title}",
         "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
         "kind": "learned",
-        "entry": ENTRY,
+        "entry": sets.ENTRY if isinstance(trainer, SetTrainer) else ENTRY,
         "environments": [environment.name],
         "network": _with_rows(card.model_dump(mode="json"), "observation", "action"),
         "training": {
@@ -162,8 +181,14 @@ def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:
     return rows
 
 
-def check_onnx() -> None:
-    """Find out before any work whether ONNX models can be written. Raises CoopenvError: the package is missing."""
+def check_onnx(settings: Settings) -> None:
+    """Find out before any work whether ONNX models can be written.
+
+    Raises:
+        CoopenvError: the package is missing, or the settings are of another network.
+    """
+    if settings.network:
+        raise CoopenvError(f"--onnx: not with network = '{settings.network}'")
     with needing(f"--onnx needs the package onnx: {install_command('onnx')}"):
         import_module("onnx")
 

@@ -7,7 +7,7 @@ import shutil
 import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -97,6 +97,8 @@ class Clone(Section):
     """Learning rate of Adam."""
     noise: NonNegative = 0.1
     """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
+    elsewhere: tuple[str, ...] | None = None
+    """With a network over sets: environments where it is watched in place of the trained one, which is left out."""
 
 
 class Variation(Section):
@@ -135,6 +137,16 @@ class Settings(Section):
     ppo: Ppo = Ppo()
     evaluation: EvaluationSettings = EvaluationSettings()
     clone: Clone | None = None
+    network: Literal["sets"] | None = None
+    """`sets`: a driver for any environment steers by sets of landmarks and cars; a clone alone, `steps = 0`."""
+
+    @model_validator(mode="after")
+    def _check_network(self) -> "Settings":
+        if self.network and (self.steps != 0 or self.clone is None):
+            raise ValueError(f"network: '{self.network}' learns by a clone alone: set clone.agent and steps = 0")
+        if not self.network and self.clone is not None and self.clone.elsewhere is not None:
+            raise ValueError("clone.elsewhere: only with network = 'sets', since observations differ")
+        return self
 
     @property
     def budget(self) -> tuple[int | None, float | None]:
@@ -159,6 +171,11 @@ class TrainingPlan:
     def all_overrides(self) -> dict[str, Any]:
         """Every override of the scenario by its dotted key."""
         return {**self.settings.scenario, **(self.overrides or {})}
+
+    def watched(self) -> "list[TrainingPlan]":
+        """Return the plan in each environment whose worlds are learnt in."""
+        elsewhere = self.settings.clone.elsewhere if self.settings.clone else None
+        return [replace(self, environment=name) for name in elsewhere or () if name != self.environment] or [self]
 
     def scenarios(self, worlds: int = 1) -> list[tuple[Scenario, int]]:
         """Return of which scenarios so many worlds to learn in are, and how many of each.

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnvWrapper
+from torch import nn
 
 from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
@@ -242,8 +243,8 @@ def watch(
     seed: int,
     threads: int,
     report: Callable[[str], None],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return observations (rows, D), the driver's actions (rows, A), discounted returns and vehicles (rows,)."""
     env = CooperativeVectorEnv(scenario, "clone", num_worlds=worlds, autoreset="disabled", threads=threads)
     driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
@@ -263,7 +264,28 @@ def watch(
     returns, following = np.zeros_like(rewards), np.zeros(env.num_envs)
     for t in reversed(range(len(rewards))):
         returns[t] = following = rewards[t] + gamma * following
-    return observations[acted], actions[acted], returns[acted]
+    vehicle = np.nonzero(acted)[1] % len(scenario.vehicles)
+    return observations[acted], actions[acted], returns[acted], vehicle
+
+
+def regress(
+    parameters: Iterable[nn.Parameter],
+    count: int,
+    clone: Clone,
+    seed: int,
+    slopes: Callable[[torch.Tensor], None],
+    report: Callable[[str], None],
+) -> None:
+    """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives for some rows, by index, into `grad`."""
+    optimiser = torch.optim.Adam(parameters, clone.learning_rate)
+    shuffle = torch.Generator().manual_seed(seed)
+    for epoch in range(clone.epochs):
+        optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
+        report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
+        for rows in torch.randperm(count, generator=shuffle).split(BATCH):
+            optimiser.zero_grad()
+            slopes(rows)
+            optimiser.step()
 
 
 TORCH_REFUSES = "Expected parameter"
@@ -345,24 +367,21 @@ class Trainer:
         for place, (each, count) in enumerate(self._scenarios):
             worlds, start = max(1, clone.episodes * count // all_worlds), seed + APART * place
             watched.append(watch(each, worlds, clone, ppo.gamma, start, threads, report))
-        raw, actions, returns = (np.concatenate(column) for column in zip(*watched, strict=True))
+        raw, actions, returns, _ = (np.concatenate(column) for column in zip(*watched, strict=True))
         self.env.statistics.update(raw)
         self.env.looked_at.append(raw)
         observations = torch.from_numpy(self.env.normalise(raw))
         targets = torch.from_numpy(actions.astype(np.float32))
         self.env.spread.update(returns)
         values = torch.from_numpy((self.env.reward_scale * returns).astype(np.float32)).unsqueeze(1)
-        optimiser = torch.optim.Adam(policy.parameters(), clone.learning_rate)
-        shuffle = torch.Generator().manual_seed(seed)
-        for epoch in range(clone.epochs):
-            optimiser.param_groups[0]["lr"] = clone.learning_rate * (1.0 - epoch / clone.epochs)
-            report(f"learning from {clone.agent}: pass {epoch + 1} of {clone.epochs}")
-            for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
-                for layers, aims in zip(policy.layers(), (targets[rows], values[rows]), strict=True):
-                    found = outputs(layers, observations[rows])
-                    excess = found[-1] - aims
-                    differentiate(layers, found, 2.0 / excess.numel() * excess)
-                optimiser.step()
+
+        def slopes(rows: torch.Tensor) -> None:
+            for layers, aims in zip(policy.layers(), (targets[rows], values[rows]), strict=True):
+                found = outputs(layers, observations[rows])
+                excess = found[-1] - aims
+                differentiate(layers, found, 2.0 / excess.numel() * excess)
+
+        regress(policy.parameters(), len(observations), clone, seed, slopes, report)
 
     def update(self) -> Status:
         """Collect one rollout and learn from it.

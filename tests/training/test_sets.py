@@ -1,0 +1,152 @@
+"""A network over sets: the same in NumPy and torch, any number of rows in any order, a driver for many environments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+
+import torch
+
+from coopenv import load_scenario
+from coopenv.api.engine import Engine
+from coopenv.base.errors import AgentWarning, CoopenvError
+from coopenv.policies import find_agent, load_agent
+from coopenv.policies.loader import read_card
+from coopenv.policies.sets import CONSTANTS, Inputs, SavedSetDriver, SetDriver
+from coopenv.training.command import train
+from coopenv.training.sets import SetNetwork
+from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, read_settings
+
+pytestmark = pytest.mark.train
+EVERYWHERE = ("facade", "behind_truck", "lighthouse")
+ALONE, COLUMNS = 18, (7, 11)
+SETTINGS = Settings(
+    network="sets",
+    steps=0,
+    ppo=Ppo(hidden=(32, 32)),
+    clone=Clone(agent="look_ahead", episodes=2, epochs=2, elsewhere=EVERYWHERE),
+    evaluation=EvaluationSettings(final_worlds=2),
+)
+PLAN = TrainingPlan("facade", SETTINGS, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("sets") / "agent"
+    assert {result.metric for result in train(PLAN, out)} >= {"arrival_rate", "e95_m"}
+    return out
+
+
+@pytest.fixture
+def drawn() -> tuple[SetDriver, Inputs, torch.Tensor]:
+    """Return a driver with drawn weights, drawn inputs, and torch's steering angles for them."""
+    generator = np.random.default_rng(0)
+    torch.manual_seed(0)
+    network = SetNetwork(ALONE, COLUMNS, 16)
+    scales = {"mean": generator.normal(size=ALONE), "std": generator.uniform(0.5, 2.0, ALONE)}
+    weights = {**scales, **{name: values.numpy() for name, values in network.state_dict().items()}}
+    alone = generator.normal(size=(50, ALONE))
+    sets = [generator.normal(size=(50, count, width)) for count, width in zip((5, 3), COLUMNS, strict=True)]
+    for rows in sets:
+        rows[..., 0] = 1.0
+        rows[generator.uniform(size=rows.shape[:2]) < 0.4] = 0.0
+    normal = (alone - scales["mean"]) / scales["std"]
+    with torch.no_grad():
+        expected = network(*(torch.from_numpy(values).float() for values in (normal, *sets)))
+    return SetDriver(load_scenario("facade"), weights), (alone, sets[0], sets[1]), expected
+
+
+def test_numpy_agrees_with_torch(drawn: tuple[SetDriver, Inputs, torch.Tensor]) -> None:
+    driver, inputs, expected = drawn
+    assert driver.steer(inputs) == pytest.approx(expected.numpy(), abs=1e-5)
+    assert np.ptp(expected.numpy()) > 0.05
+
+
+def test_neither_order_nor_absent_rows_matter(drawn: tuple[SetDriver, Inputs, torch.Tensor]) -> None:
+    driver, (alone, landmarks, cars), _ = drawn
+    more = np.concatenate([np.zeros((50, 4, COLUMNS[1])), cars[:, ::-1]], axis=1)
+    assert driver.steer((alone, landmarks[:, ::-1], more)) == pytest.approx(driver.steer((alone, landmarks, cars)))
+
+
+def inputs_at_start(**overrides: object) -> Inputs:
+    scenario = load_scenario("open_square", {name.replace("__", "."): value for name, value in overrides.items()})
+    engine = Engine(scenario, 4)
+    engine.reset([1, 2, 3, 4])
+    rows = engine.view("observation").reshape(16, -1)
+    return SetDriver(scenario, {}).inputs(rows, np.arange(16) % 4)
+
+
+def test_inputs_have_units_whatever_the_scales() -> None:
+    usual, other = inputs_at_start(), inputs_at_start(observation__map_scale=11.0, observation__scales={})
+    for before, after in zip(usual, other, strict=True):
+        np.testing.assert_allclose(after, before, atol=1e-5)
+    alone, landmarks, cars = usual
+    assert (alone.shape, landmarks.shape, cars.shape) == ((16, ALONE), (16, 6, 7), (16, 3, 11))
+    np.testing.assert_allclose(np.linalg.norm(landmarks[..., 1:3], axis=-1), landmarks[..., 3], atol=1e-6)
+    assert alone[:, -len(CONSTANTS)] == pytest.approx(1.0)  # m/s, the top speed
+    assert (cars[::4, :, 0] == 0.0).all()  # the first vehicle has the right of way over all
+
+
+def test_the_trained_environment_is_left_out() -> None:
+    assert [plan.environment for plan in PLAN.watched()] == ["behind_truck", "lighthouse"]
+    assert [plan.environment for plan in replace(PLAN, environment="open_square").watched()] == [*EVERYWHERE]
+
+
+@pytest.mark.parametrize(
+    ("environment", "overrides"),
+    [("facade", {}), ("lighthouse", {"observation.map_size": 9}), ("open_square", {"observation.map_scale": 20.0})],
+)
+def test_it_drives_anywhere(folder: Path, environment: str, overrides: dict[str, object]) -> None:
+    scenario = load_scenario(environment, overrides)
+    policy, engine = load_agent(folder, scenario), Engine(scenario, 3)
+    engine.reset([1, 2, 3])
+    rows = engine.view("observation").reshape(3 * len(scenario.vehicles), -1)
+    actions = policy(rows)
+    assert actions.shape == (len(rows), 2) and np.isfinite(actions).all()
+    assert len({round(float(angle), 6) for angle in actions[:, 1]}) > 1
+
+
+def test_warns_beyond_the_constants_of_its_training(folder: Path) -> None:
+    with pytest.warns(AgentWarning, match=r"agent agent: 'range' is 19 to 19 here, and was 4\.75 to 5\.7 in its tra"):
+        load_agent(folder, load_scenario("facade", {"camera.range": 20.0}))
+
+
+def test_other_weights_are_refused(folder: Path) -> None:
+    card = read_card(folder).network
+    foreign = find_agent("take_turns_team")
+    assert card and foreign.folder and foreign.network
+    other = card.model_copy(update={"sha256": foreign.network.sha256})
+    with pytest.raises(CoopenvError, match=r"weights\.safetensors: not the weights of a network over sets: 'mean'"):
+        SavedSetDriver(load_scenario("facade"), folder=foreign.folder, network=other)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("network = 'sets'", r"'sets' learns by a clone alone: set clone\.agent and steps = 0"),
+        ("network = 'sets'\nsteps = 9\nclone.agent = 'peek'", r"'sets' learns by a clone alone"),
+        ("steps = 0\nclone = { agent = 'peek', elsewhere = ['facade'] }", r"clone\.elsewhere: only with network = 'se"),
+        ("network = 'graph'", r"network: .*'sets'"),
+    ],
+)
+def test_settings_are_refused_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "train.toml").write_text(text)
+    with pytest.raises(CoopenvError, match=expected) as caught:
+        read_settings(tmp_path / "train.toml")
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_possible_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CoopenvError, match=r"--onnx: not with network = 'sets'"):
+        train(PLAN, tmp_path / "agent", onnx=True)
+    clone = Clone(agent="look_ahead", elsewhere=("nowhere",))
+    with pytest.raises(CoopenvError, match=r"network: the observation lacks last_action"):
+        train(replace(PLAN, overrides={"observation.exclude": ["last_action"]}), tmp_path / "agent")
+    with pytest.raises(CoopenvError, match="nowhere"):
+        train(replace(PLAN, settings=SETTINGS.model_copy(update={"clone": clone})), tmp_path / "agent")
+    assert not [*tmp_path.iterdir()]
