@@ -276,7 +276,7 @@ def regress(
     slopes: Callable[[torch.Tensor], None],
     report: Callable[[str], None],
 ) -> None:
-    """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives for some rows, by index, into `grad`."""
+    """Minimise a loss over `count` recorded rows; `slopes` writes its derivatives, for rows by index, into `grad`."""
     optimiser = torch.optim.Adam(parameters, clone.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
     for epoch in range(clone.epochs):
