@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 import typer
 
+import coopenv
 from coopenv.api.arguments import FIELDS, OTHERS, Step
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.cli import app
-from coopenv.policies import load_agent
+from coopenv.policies import act, load_agent
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.training.settings import Clone, read_settings
 from tests.helpers import mrclam_files
@@ -102,8 +103,9 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(DOCS / "agents.md", "class Mine")
-    lines = [line for line in capsys.readouterr().out.splitlines() if "route_follower" in line or "peek" in line]
-    assert len(lines) >= 2 and all("[" in line for line in lines[:2]), lines  # figures with intervals
+    lines = capsys.readouterr().out.splitlines()
+    arrivals = [line for line in lines if "'arrival_rate'" in line]
+    assert ["peek" in line for line in arrivals] == [False, True]
     (tmp_path / "mine.py").write_text(python_blocks(DOCS / "agents.md")[1], encoding="utf-8")
     scenario = load_scenario("urban_crossing")
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
@@ -240,20 +242,19 @@ def test_the_settings_of_training(tmp_path: Path) -> None:
 
 @pytest.mark.train
 @pytest.mark.slow
-def test_the_page_trains_with_stable_baselines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_page_trains_with_stable_baselines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As long as one rollout: what the page's two million steps give is in nobody's patience."""
     pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
     monkeypatch.chdir(tmp_path)
-    train, drive = (block for block in python_blocks(DOCS / "trainers.md") if "stable_baselines3" in block)
+    (train,) = (block for block in python_blocks(DOCS / "trainers.md") if "stable_baselines3" in block)
     assert train.count("2_000_000") == 1
-    exec(compile(train.replace("2_000_000", "16_384"), "trainers.md", "exec"), {"__name__": "__main__"})
-    capsys.readouterr()
-    program: dict[str, Any] = {}
-    exec(compile(drive, "trainers.md", "exec"), program)
-    ends = capsys.readouterr().out.splitlines()
-    assert {line.partition(":")[0] for line in ends} <= set(program["env"].possible_agents) and ends
+    program: dict[str, Any] = {"__name__": "__main__"}
+    exec(compile(train.replace("2_000_000", "16_384"), "trainers.md", "exec"), program)
+    (drive,) = re.findall(r"`(lambda rows: model\.predict.*)`", (DOCS / "trainers.md").read_text(encoding="utf-8"))
+    env = coopenv.parallel_env("urban_crossing")
+    observations, _ = env.reset(seed=5)
+    actions = act(eval(drive, program), observations)
+    assert all(env.action_space(agent).contains(action) for agent, action in actions.items()) and actions
 
 
 @pytest.mark.slow
