@@ -148,9 +148,9 @@ def test_a_bag_that_does_not_exist_is_told_so(command: str, name: str, capsys: p
 
 def test_a_scenario_goes_where_a_name_goes() -> None:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
-    env = coopenv.parallel_env(scenario, overrides={"noise.enabled": False}, observer="dead_reckoning")
+    env = coopenv.parallel_env(scenario, overrides={"noise.enabled": False}, observer="robust")
     made = env.engine.backend.scenario
-    assert made.observer.name == "dead_reckoning" and not made.noise.enabled
+    assert made.observer.name == "robust" and not made.noise.enabled
     assert env.metadata["name"] == f"{scenario.title}_v0"
     assert len(rollout(scenario, steps=2).t) == len(rollout("overtaking", steps=2).t)
     batch = coopenv.make_vec(scenario, num_worlds=2, overrides={"horizon": 0.5})

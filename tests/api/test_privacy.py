@@ -14,13 +14,14 @@ from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.scenario.terms import GROUPS
+from tests.helpers.env_suite import SHIPPED
 from tests.helpers.four_way import FOUR_WAY
 
 OBSERVERS = ("riccati", "robust")
-MOVABLE = [name for name in coopenv.list_envs() if load_scenario(name).backend == "simulated" and name != "city"]
+MOVABLE = [name for name, scenario in SHIPPED.items() if scenario.backend == "simulated" and name != "city"]
 """Environments whose vehicles a saved state can put elsewhere; highway-env puts its own back where it has them, and the
 traffic of the city drives by the truth."""
-ON_HIGHWAY = [name for name in coopenv.list_envs() if load_scenario(name).backend == "highway"]
+ON_HIGHWAY = [name for name, scenario in SHIPPED.items() if scenario.backend == "highway"]
 ESTIMATED = (
     *("estimate_position", "estimate_rotation", "covariance"),
     *("log_determinant", "position_std", "targets_in_view"),

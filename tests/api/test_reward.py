@@ -20,7 +20,7 @@ from coopenv.policies import load_agent
 from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
-from tests.helpers.env_suite import largest_slow
+from tests.helpers.env_suite import SHIPPED, largest_slow
 from tests.helpers.four_way import FOUR_WAY
 
 SHORT = {"horizon": 0.5, "observation.include": ["estimate", "quality"]}
@@ -162,10 +162,9 @@ def test_what_is_no_function_is_refused_and_a_gpu_has_no_arrays_for_one() -> Non
         check_function(minus_error, "cuda:0")
 
 
-KNOWN = {name: load_scenario(name) for name in coopenv.list_envs()}
 ENVIRONMENTS = [
     name
-    for name, s in KNOWN.items()
+    for name, s in SHIPPED.items()
     if s.driven and s.backend == "simulated" and s.observer.name == "robust" and has_value_of_sensing(name)
 ]
 """Not the laboratory's experiments: hardly anything varies in them, which are there to be driven by cars."""
@@ -216,7 +215,7 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 @cache
 def run(name: str, driver: str, times: int = 1) -> Run:
     """Drive all vehicles in 16 worlds or `times` as many."""
-    vehicles = len(KNOWN[name].vehicles)
+    vehicles = len(SHIPPED[name].vehicles)
     worlds = times * (16 if vehicles <= 4 else 32 // vehicles)
     envs = coopenv.make_vec(name, num_worlds=worlds, autoreset="disabled")
     engine, policy = envs.engine, drivers(envs.scenario)[driver]

@@ -72,8 +72,8 @@ class Crashes(Fine):
 '''
 REASONS = {
     "Fine": "",
-    "Loops": "with seed 0: more than 4 s on one record (--seconds)",
-    "Waits": "with seed 0: more than 4 s on one record (--seconds)",
+    "Loops": "with seed 0: more than 2 s on one record (--seconds)",
+    "Waits": "with seed 0: more than 2 s on one record (--seconds)",
     "Allocates": "with seed 0: more than 400 MiB of memory (--memory)",
     "Delegates": "with seed 0: more than 400 MiB of memory (--memory)",
     "Raises": "of vehicle_1 at 0.083 s: ValueError: on purpose (mine.py:",
@@ -99,7 +99,7 @@ def board(folder: Path, monkeypatch: pytest.MonkeyPatch, names: list[str], *more
         "--windows",
         "none",
     ]
-    assert main([*command, "--seconds", "4", "--memory", "400", "--out", "board", *more]) == 0
+    assert main([*command, "--seconds", "2", "--memory", "400", "--out", "board", *more]) == 0
     rows = json.loads((folder / "board" / "leaderboard.json").read_text())["rows"]
     whole = [row for row in rows if row["observer"] in ("dead_reckoning", "Fine")]
     assert len(whole) == 2 * (1 + ("Fine" in names)) and all(row["position_rmse_m"] > 0.0 for row in whole)

@@ -20,6 +20,9 @@ Env = coopenv.CooperativeLocalisationEnv
 Make = Callable[..., Env]
 """Makes one and the same environment with options of `coopenv.parallel_env`: observation, dtype, render_mode."""
 
+SHIPPED = {name: coopenv.load_scenario(name) for name in coopenv.list_envs()}
+"""All environments: loaded once, however many files have a test of each."""
+
 STEPS = 25
 CHECKS: list[Callable[[Make], None]] = []
 """All checks that hold for environments of any backend."""

@@ -44,8 +44,8 @@ def test_another_observer_sees_the_same_episode() -> None:
     reel = reel_of("busy_intersection")
     run_to(reel, 20)
     before = reel.frames
-    reel.change(observer="dead_reckoning")
-    assert reel.source.observer == "dead_reckoning" and reel.source.honest
+    reel.change(observer="robust")
+    assert reel.source.observer == "robust" and reel.source.honest
     assert [frame.tick for frame in reel.frames] == [frame.tick for frame in before]
     for old, new in zip(before, reel.frames, strict=True):
         np.testing.assert_array_equal(old.position, new.position)
@@ -53,7 +53,7 @@ def test_another_observer_sees_the_same_episode() -> None:
     before = reel.frames
     with pytest.raises(CoopenvError, match="unknown observer"):
         reel.change(observer="nobody")
-    assert reel.frames is before and reel.source.observer == "dead_reckoning" and reel.more()
+    assert reel.frames is before and reel.source.observer == "robust" and reel.more()
     reel.close()
 
 
@@ -270,15 +270,15 @@ def test_any_error_of_a_wish_is_told_and_the_view_goes_on(viewer: Viewer, monkey
 
     with monkeypatch.context() as patched:
         patched.setattr(EngineReel, "more", fail)
-        wish(viewer, ("observer", "dead_reckoning"))
+        wish(viewer, ("observer", "riccati"))
     assert "That cannot be: RuntimeError: the observer fails" in viewer._panel._status.content.replace("\\", "")
     assert viewer._reel.frames is kept and viewer._reel.source.observer == "robust"
     before = len(kept)
     wish(viewer, ("seek", 2.0), ("observer", "nobody"))
     assert len(viewer._reel.frames) > before
     assert "That cannot be: unknown observer" in viewer._panel._status.content
-    wish(viewer, ("observer", "dead_reckoning"))
-    assert "observer dead" in viewer._panel._head.content and not viewer._panel._status.visible
+    wish(viewer, ("observer", "riccati"))
+    assert "observer riccati" in viewer._panel._head.content and not viewer._panel._status.visible
 
 
 def test_the_end_is_told(viewer: Viewer) -> None:

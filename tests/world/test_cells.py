@@ -89,17 +89,19 @@ def test_sights_and_contacts_are_those_of_all_pairs(
         for target in {*range(L + vehicles)} - {own}:
             ends = position[own], marker[target]
             distance, reach = np.linalg.norm(ends[1] - ends[0]), description.cameras[i].range
-            others = [a for a in range(L + vehicles) if a not in (own, target)]
-            of_walls = geometry.depth_by_enumeration(*ends, *walls).max()
-            of_bodies = geometry.depth_by_enumeration(*ends, center[others], R[others], half[others]).max()
-            if min(abs(of_walls), abs(of_bodies), abs(distance - reach)) < 1e-9:
+            depths = [reach - distance]
+            if distance < reach + 1e-9:
+                others = [a for a in range(L + vehicles) if a not in (own, target)]
+                depths.append(geometry.depth_by_enumeration(*ends, *walls).max())
+                depths.append(geometry.depth_by_enumeration(*ends, center[others], R[others], half[others]).max())
+            if np.abs(depths).min() < 1e-9:
                 continue
             expected = Sight.VISIBLE
             if distance > reach:
                 expected = Sight.OUT_OF_VIEW
-            elif of_walls > 0.0:
+            elif depths[1] > 0.0:
                 expected = Sight.OCCLUDED_BY_BUILDING
-            elif of_bodies > 0.0:
+            elif depths[2] > 0.0:
                 expected = Sight.OCCLUDED_BY_BODY
             assert sight[target] == expected, (i, target)
             met.add(expected)

@@ -120,7 +120,7 @@ def test_cars_of_a_city_do_not_touch(seed: int) -> None:
         "vehicles.1.count": 10,
         "observer.name": "dead_reckoning",
     }
-    world = start(coopenv.load_scenario("city", overrides), seed, "float32")
+    world = start(coopenv.load_scenario("city", overrides), seed)
     touched, there = np.zeros(30, bool), []
     for _ in range(600):
         world.advance(3)
