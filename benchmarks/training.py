@@ -36,7 +36,7 @@ ENVIRONMENTS = ("open_square", "facade", "urban_crossing")
 class OriginalTrainer(Trainer):
     """The same training with SB3's own classes."""
 
-    algorithm, policy = PPO, ActorCriticPolicy  # type: ignore[assignment]
+    algorithm, policy = PPO, ActorCriticPolicy
 
 
 def updates(kind: type[Trainer], plan: TrainingPlan) -> Iterator[tuple[float, float]]:

@@ -299,7 +299,8 @@ class DivergedError(CoopenvError):
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
-    algorithm, policy = LeanPpo, TanhPolicy
+    algorithm: Any = LeanPpo
+    policy: Any = TanhPolicy
 
     def __init__(self, plan: TrainingPlan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
