@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -136,3 +139,17 @@ def test_a_worker_that_gets_no_task_ends_in_silence(capfd: pytest.CaptureFixture
     process.join(DEADLOCK)
     assert process.exitcode == 0
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
+def test_the_first_worker_is_deaf_to_ctrl_c(tmp_path: Path) -> None:
+    """In a fresh process, in which nothing of `multiprocessing` runs yet."""
+    (tmp_path / "first.py").write_text(
+        "from coopenv.bench.watched import _Worker\n"
+        "if __name__ == '__main__':\n"
+        "    worker = _Worker()\n"
+        "    print(open(f'/proc/{worker.process.pid}/status').read().split('SigBlk:')[1].split()[0])\n"
+        "    worker.end()\n"
+    )
+    found = subprocess.run([sys.executable, tmp_path / "first.py"], capture_output=True, text=True, check=True)
+    assert int(found.stdout, 16) & 1 << (signal.SIGINT - 1)
