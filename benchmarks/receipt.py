@@ -87,7 +87,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         "covariance of likely faults": [(fault_hypotheses, "set_fault_mixture", no_mixture)],
         "readmission": [(observer, "test_excluded", no_readmission)],
         "all bearings when lost": [(constants, "LOST_SHARE", 2.0)],
-        "gyro bias": [(constants, "GYRO_BIAS", 1e-6)],
+        "gyro bias": [(constants, "GYRO_BIAS", 1e-6), (constants, "GYRO_BIAS_WALK", 1e-6)],
         "senders' increments": [(correlated_fusion, "apply_sender_increment", no_increment)],
         "linearisation variance": [
             (constants, "LINEARISATION_TIME", 0.0),
@@ -101,7 +101,7 @@ def numbers() -> list[str]:
     """Return the names of the observer's numbers that are no counts or bounds of rounding."""
     from coopenv.observers.robust import constants
 
-    return [n for n, value in vars(constants).items() if n.isupper() and isinstance(value, float) and n != "THIRD"]
+    return [n for n, value in vars(constants).items() if n.isupper() and isinstance(value, float)]
 
 
 def leave_out(variant: str) -> None:

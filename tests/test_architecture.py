@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2565, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
-    "observers": (11880, 47),
+    "observers": (11885, 47),
     "policies": (1885, 11),
     "runs": (3360, 13),
     "scenario": (3755, 15),

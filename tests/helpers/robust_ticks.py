@@ -61,7 +61,7 @@ TARGETS = np.arange(len(LANDMARKS) + VEHICLES)
 PERIOD = 1.0 / 60.0
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=PERIOD, bearing=0.003)
 STILL: Pose = (np.eye(3), np.zeros(3))
-BIAS = WALK = 0.1 * NOISE.angular_velocity
+BIAS, WALK = 1e-3, 1e-4
 """rad/s, of the gyro where no larger one is declared; and its walk in a second."""
 CALIBRATION = np.diag([BIAS**2] * 3 + [1e-14, 1.0, 1.0])
 """The covariance of the calibration state of odometry: bias, scale, and two entries without a meaning."""

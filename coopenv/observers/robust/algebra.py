@@ -22,6 +22,7 @@ from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = constants.KNOWN_POSITION**2
+THIRD = 1.0 / 3.0
 QUARTER = 0.25 / constants.MAX_ACCELERATION**2
 BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
 
@@ -197,7 +198,7 @@ def averaging_time(model: Any, i: int):
 
     Over a time t noise of density q has the variance q / (2 t), and the lag is a t: their sum is least at this one.
     """
-    return wp.pow(odometry_noise(model, i, wp.float64(1.0))[1] * wp.float64(QUARTER), wp.float64(constants.THIRD))
+    return wp.pow(odometry_noise(model, i, wp.float64(1.0))[1] * wp.float64(QUARTER), wp.float64(THIRD))
 
 
 @wp.func

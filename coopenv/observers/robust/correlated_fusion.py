@@ -184,7 +184,7 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     spread = algebra.position_variance(before)
     grown = algebra.position_variance(P) - spread
     if grown > wp.float64(constants.RESET_GROWTH) * spread:
-        inflate_dependents(memory, world, i, n, wp.float64(constants.THIRD) * grown)
+        inflate_dependents(memory, world, i, n, wp.float64(algebra.THIRD) * grown)
     if dt > wp.float64(constants.SHORT_TIME):
         estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
         if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.POSE_GATE):

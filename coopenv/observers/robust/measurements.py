@@ -11,6 +11,7 @@ from coopenv.estimation.linalg import block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
+    THIRD,
     averaging_time,
     between,
     by_rows,
@@ -29,7 +30,7 @@ from coopenv.world.v2x import fresh
 from coopenv.world.warp_internals import device_function, subroutine
 
 HALF_ACCELERATION = 0.5 * constants.MAX_ACCELERATION
-UNIFORM_VARIANCE = constants.THIRD
+UNIFORM_VARIANCE = THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
@@ -93,7 +94,7 @@ def received_variance(model: Any, memory: Any, world: int, i: int, box: int, fra
 
     Hypotheses are tracked through many frames, in all of which that error is nearly the same.
     """
-    variance = position_variance(memory.inbox[world, i, box].P) * wp.float64(constants.THIRD)
+    variance = position_variance(memory.inbox[world, i, box].P) * wp.float64(THIRD)
     age = wp.float64(frame.tick - memory.inbox[world, i, box].tick) * model.camera_period
     gone = possible_speed(memory, world, i) * age
     factor = wp.float64(constants.SQUARED_MARGIN)

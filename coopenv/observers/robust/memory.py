@@ -248,6 +248,7 @@ class RobustMemory:
     information: array("WNQQ", mat33d)  # on faults, below the diagonal
     fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
     effect: array("WLXQ", mat23d)  # of an innovation by the fault of a source
+    weighted_effect: array("WLXQ", mat23d)  # times the weight of the bearing
     block_scratch: array("WLKK", mat33d)  # blocks of the covariance of senders' errors or faults
     block_member: array("WLK", wp.int32)  # the members to which they belong
     hypothesis: array("WNH", Hypothesis)

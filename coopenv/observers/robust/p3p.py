@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array
-from coopenv.observers.robust.constants import THIRD
+from coopenv.observers.robust.algebra import THIRD
 from coopenv.observers.robust.memory import mat33d, vec2d, vec3d
 from coopenv.world import launch
 from coopenv.world.launch import kernel, start_warp

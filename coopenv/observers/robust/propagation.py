@@ -73,7 +73,7 @@ def calibration_variances(model: Any, i: int):
 @device_function
 def walk_variances(model: Any, i: int):
     """Return the growth of these variances per second."""
-    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS)))
+    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS_WALK)))
     errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
     return wp.cw_mul(errors, errors)
 

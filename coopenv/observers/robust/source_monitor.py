@@ -85,11 +85,11 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
                 M = M - H[:, 3:] * turn
             if q == CAMERA:
                 M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
-            memory.effect[world, i, n, q] = M
             WM = memory.measurement[world, i, n].weight * M
-            vector = vector + share_of(frame, memory, world, i, n) * (
-                wp.transpose(WM) * memory.measurement[world, i, n].innovation
-            )
+            weighted = share_of(frame, memory, world, i, n) * WM
+            memory.effect[world, i, n, q] = M
+            memory.weighted_effect[world, i, n, q] = weighted
+            vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
             if fits == 1:
                 own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
                 errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
@@ -150,6 +150,16 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
         memory.source[world, i, q].drift_information = kept * V
 
 
+@device_function
+def add_information(frame: BearingFrame, memory: Any, world: int, i: int, q: int, c: int):
+    """Add the information of a frame on the faults of two sources."""
+    A = memory.information[world, i, q, c]
+    for n in range(frame.bearings):
+        if memory.measurement[world, i, n].fits != 0:
+            A = A + wp.transpose(memory.weighted_effect[world, i, n, q]) * memory.effect[world, i, n, c]
+    memory.information[world, i, q, c] = A
+
+
 @subroutine
 def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
     """Add the innovations of a correction to the information on all faults, and correct the sensitivities."""
@@ -164,16 +174,11 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
         q = memory.measurement[world, i, n].source
         if q >= 0 and memory.measurement[world, i, n].fits == -1:
             memory.source[world, i, q].rejected += weight
-    for n in range(frame.bearings):
-        if memory.measurement[world, i, n].fits != 0:
-            W = share_of(frame, memory, world, i, n) * memory.measurement[world, i, n].weight
-            for q in range(SOURCES):
-                if is_active(memory, world, i, q):
-                    MW = wp.transpose(memory.effect[world, i, n, q]) * W
-                    for c in range(q + 1):
-                        if is_active(memory, world, i, c) and (c == q or is_sender(q) or is_sender(c)):
-                            A = memory.information[world, i, q, c] + MW * memory.effect[world, i, n, c]
-                            memory.information[world, i, q, c] = A
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            for c in range(q + 1):
+                if (c == q or is_sender(q) or is_sender(c)) and is_active(memory, world, i, c):
+                    add_information(frame, memory, world, i, q, c)
 
 
 @wp.func
