@@ -15,11 +15,10 @@ from tests.helpers.synthetic import make_trajectory
 
 @pytest.fixture(autouse=True)
 def no_warnings() -> Iterator[None]:
-    """Turn warnings into errors, except those of other code and of scenes with blind vehicles."""
+    """Turn warnings into errors, except those of Matplotlib's own code and of scenes with blind vehicles."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="matplotlib|pyparsing")
-        warnings.filterwarnings("ignore", category=ResourceWarning)  # garbage of earlier tests, collected here
         warnings.filterwarnings("ignore", "vehicle_.* fewer than three neighbours")  # in some shipped environments
         yield
 

@@ -69,7 +69,9 @@ class _Timed(xmlrpc.client.Transport):
         self._timeout = timeout
 
     def make_connection(self, host: Any) -> HTTPConnection:
-        return HTTPConnection(host, timeout=self._timeout)
+        connection = super().make_connection(host)  # which is closed when a question fails
+        connection.timeout = self._timeout
+        return connection
 
 
 def join(address: Address, timeout: float) -> Master:
