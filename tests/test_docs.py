@@ -262,7 +262,6 @@ def test_the_page_trains_with_stable_baselines(tmp_path: Path, monkeypatch: pyte
     ("package", "word"),
     [
         pytest.param("ray", "CooperativeRows", marks=pytest.mark.rllib),
-        pytest.param("torchrl", "PettingZooWrapper", marks=pytest.mark.torchrl),
         pytest.param("torchrl", "batched_env", marks=pytest.mark.torchrl),
         pytest.param("benchmarl", "benchmarl", marks=pytest.mark.benchmarl),
     ],

@@ -311,7 +311,7 @@ def test_one_line_names_the_extra(command: str, done: dict[str, tuple[int, str, 
         ("coopenv.api.trainers.sb3", "stable_baselines3.common.vec_env", "train"),
         ("coopenv.api.trainers.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
         ("coopenv.api.trainers.torchrl", "torchrl.envs", "torchrl"),
-        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.pettingzoo.common", "benchmarl"),
+        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.vmas.common", "benchmarl"),
     ],
 )
 def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:

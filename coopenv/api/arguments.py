@@ -1,4 +1,4 @@
-"""What users give and read on the host: options of a reset, the results of a step, and a reward in Python."""
+"""What users give and read on the host: options of a reset, results of a step, state for critics, reward in Python."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NotRequired, TypedDict
@@ -9,6 +9,8 @@ from coopenv.base.errors import ActionError, CoopenvError, check_one_of, error_t
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import LEVELS, PARAMETERS
+from coopenv.world.reset import ABSENT
+from coopenv.world.state import LASTING_ERRORS
 
 SETTINGS = ("parameters", "difficulty")
 """Options that hold until they are given again."""
@@ -204,6 +206,54 @@ class Step:
 
     def __iter__(self) -> Iterator[str]:
         return iter((*FIELDS, *OTHERS))
+
+
+STATE_LIMIT = 10.0
+"""Largest entry of a state; most are below 1."""
+LASTING_SCALE = 0.1
+"""What lasting errors of sensors are divided by in a state; rad, rad/s, m, or a share."""
+
+
+def world_states(view: Callable[[str], np.ndarray], scenario: Scenario) -> np.ndarray:
+    """Return the state of every world for a central critic, (W, S) float32, scaled; what cannot change is left out.
+
+    - Of every vehicle: its observation (0 if absent); true position / `position_scale`, forward axis and velocity in
+      the body frame / `velocity_scale` (with `observation.planar` forwards only, else with the left axis); error of the
+      estimated position (m, map frame) and orientation (rad); log10 of the standard deviation of the position, as in
+      `position_std`; rest of the way / `position_scale`; 1 if under way; 1 if it has arrived.
+    - Of landmarks that are drawn or move: true position / `position_scale`, and 1 if present; velocity of those that
+      move.
+    - The share of the horizon that has passed; with lasting errors of sensors those of every vehicle / 0.1: odometry
+      scale, gyro bias (3), slip (2), turn and shift of the camera (6). Truth that a recording lacks reads 0.
+    """
+    scales, axes = scenario.observation, 2 if scenario.observation.planar else 3
+    vehicles, ended = slice(len(scenario.landmarks), None), view("ended")[..., None]
+    p, v = view("position")[..., :axes], view("velocity")[..., : 2 * axes - 3]  # on a plane wheels roll forwards only
+    R = view("rotation")[:, vehicles, :axes]
+    estimated = np.matmul(view("estimate_rotation"), view("estimate_position")[..., None])[..., :axes, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = (np.log10(view("position_std")) + 1.25) / 1.5
+    own = [
+        np.where(ended == ABSENT, 0.0, view("observation")),
+        p[:, vehicles] / scales.position_scale,
+        *(R[..., column] for column in range(axes - 1)),
+        v[:, vehicles] / scales.velocity_scale,
+        estimated - p[:, vehicles],
+        *(each[..., None] for each in (np.radians(view("orientation_error")), spread)),
+        view("last_remaining")[..., None] / scales.position_scale,
+        ended == Outcome.UNDER_WAY,
+        ended == Outcome.ARRIVED,
+    ]
+    moving = [i for i, each in enumerate(scenario.landmarks) if each.motion.kind != "static"]
+    changing = [i for i, each in enumerate(scenario.landmarks) if each.is_drawn or i in moving]
+    rest = [
+        *(p[:, changing] / scales.position_scale, v[:, moving] / scales.velocity_scale, view("present")[:, changing]),
+        view("tick") / (scenario.horizon * scenario.rates.camera),
+        *(view(name) / LASTING_SCALE for name in (LASTING_ERRORS if scenario.has_lasting_errors else ())),
+    ]
+    parts = [np.concatenate(own, axis=2), *rest]
+    flat = np.concatenate([part.reshape(len(ended), -1) for part in parts], axis=1, dtype=np.float32)
+    return np.asarray(np.nan_to_num(flat.clip(-STATE_LIMIT, STATE_LIMIT), nan=0.0))
 
 
 RewardFunction = Callable[[Step], Any]

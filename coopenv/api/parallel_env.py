@@ -13,12 +13,14 @@ from pettingzoo.utils import BaseParallelWrapper
 from coopenv.api.arguments import (
     QUALITIES,
     SETTINGS,
+    STATE_LIMIT,
     Info,
     RewardFunction,
     Step,
     checked_options,
     outcome_words,
     world_parameters,
+    world_states,
 )
 from coopenv.api.engine import Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
@@ -33,8 +35,6 @@ Observations = dict[str, Any]
 Infos = dict[str, Info]
 
 RENDER_MODES = ("rgb_array", "human")
-LIMIT = 1e6
-"""m and m/s, far beyond any scene."""
 
 
 class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
@@ -94,7 +94,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         space = observation_space(self.engine.layout, observation)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
-        self.state_space = spaces.Box(-LIMIT, LIMIT, shape=self.state().shape, dtype=np.float32)
+        self.state_space = spaces.Box(-STATE_LIMIT, STATE_LIMIT, shape=self.state().shape, dtype=np.float32)
         self._step, self._outcomes = Step(self.engine.view, scenario), outcome_words(scenario)
         self._targets = scenario.target_names  # made once, as every step needs both
         self._notes = backend.notes if isinstance(backend, Broadcasting) else None
@@ -266,24 +266,8 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         return self.engine.backend.health
 
     def state(self) -> np.ndarray:
-        """Return every agent's truth (landmarks first), every vehicle's estimate, and the share of the episode.
-
-        Of every agent: position (3), first two columns of R (6), linear velocity (3). Of every vehicle: estimated
-        position (3) and first two columns of Rhat (6). Where the scenario has lasting errors of sensors, those of every
-        vehicle come last: scale (1), gyro bias (3), slip (2), turn and shift of the camera (6). Truth that a recording
-        does not know reads 0.
-        """
-        view = self.engine.view
-        R, position, velocity = (view(name)[0] for name in ("rotation", "position", "velocity"))
-        R_hat, p_hat = view("estimate_rotation")[0], view("estimate_position")[0]
-        position_hat = np.einsum("nij,nj->ni", R_hat, p_hat)
-        truth = np.hstack([position, R[:, :, 0], R[:, :, 1], velocity])
-        estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
-        share = view("tick")[:1] / self.engine.world.model.horizon_ticks
-        lasting = [view(name)[0] for name in LASTING_ERRORS] if self.scenario.has_lasting_errors else []
-        errors = np.hstack([np.zeros((len(p_hat), 0)), *(part.reshape(len(p_hat), -1) for part in lasting)])
-        whole = np.concatenate([truth.ravel(), estimate.ravel(), share, errors.ravel()]).astype(np.float32)
-        return np.asarray(np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0))
+        """Return the state for a central critic, (S,), with the truth; see `coopenv.api.arguments.world_states`."""
+        return np.asarray(world_states(self.engine.view, self.scenario)[0])
 
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
@@ -326,28 +310,15 @@ class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
     keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
     """
 
-    def __init__(self, env: CooperativeLocalisationEnv, with_absent: bool = False) -> None:
-        """Wrap a world.
-
-        Args:
-            env: the world.
-            with_absent: whether a reset also returns zeros for vehicles that are absent in the episode, which are in
-                `possible_agents` and not in `agents`. TorchRL's wrapper asks for them.
-        """
+    def __init__(self, env: CooperativeLocalisationEnv) -> None:
+        """Wrap a world."""
         super().__init__(env)
         self.state_space = env.state_space
-        self.with_absent = with_absent
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the world."""
         observations, infos = self.env.reset(seed=seed, options=options)
-        infos = self._numbers(infos)
-        for agent in self.possible_agents if self.with_absent else ():
-            if agent not in infos:
-                space = self.observation_space(agent)
-                observations[agent] = spaces.unflatten(space, np.zeros(spaces.flatdim(space), dtype=np.float32))
-                infos[agent] = dict.fromkeys(NUMBERS, 0.0)
-        return observations, infos
+        return observations, self._numbers(infos)
 
     def step(self, actions: dict[str, np.ndarray]) -> Any:
         """Step the world."""

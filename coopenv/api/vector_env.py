@@ -20,6 +20,7 @@ from coopenv.api.arguments import (
     checked_options,
     host_actions,
     world_parameters,
+    world_states,
 )
 from coopenv.api.engine import Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
@@ -164,6 +165,10 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             flags, infos = self._restart_at_once(flags, infos)
         return self._observations(), flags[0], flags[1], flags[2], infos
+
+    def state(self) -> np.ndarray:
+        """Return the states of the worlds for a central critic, (num_worlds, S); see `world_states`."""
+        return world_states(self.engine.view, self.scenario)
 
     def _observations(self) -> Any:
         """Return the rows, or a dictionary of their parts by field."""

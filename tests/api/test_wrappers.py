@@ -264,30 +264,6 @@ def test_events_show_once_and_actions_of_the_dead_are_dropped() -> None:
     assert set(collided.values()) == {1.0}
 
 
-def absent_at(env: PlainInfos) -> int:
-    """Return a seed at which the first vehicle is absent."""
-    for seed in range(100):
-        env.reset(seed=seed)
-        if "vehicle_1" not in env.agents:
-            return seed
-    raise AssertionError("the first vehicle is never absent")
-
-
-@pytest.mark.parametrize("observation", ["flat", "dict"])
-def test_a_reset_has_absent_vehicles_on_request(observation: str) -> None:
-    plain, full = (
-        PlainInfos(coopenv.parallel_env("urban_crossing", observation=observation), with_absent=with_absent)
-        for with_absent in (False, True)
-    )
-    seed = absent_at(plain)
-    expected, (observations, infos) = plain.reset(seed=seed), full.reset(seed=seed)
-    assert set(observations) == set(infos) == set(full.possible_agents)
-    assert full.agents == plain.agents and set(expected[0]) == set(plain.agents)
-    np.testing.assert_equal({agent: observations[agent] for agent in plain.agents}, expected[0])
-    assert full.observation_space("vehicle_1").contains(observations["vehicle_1"])
-    assert tuple(infos["vehicle_1"]) == NUMBERS and not any(infos["vehicle_1"].values())
-
-
 def test_conforms() -> None:
     env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
     parallel_api_test(env, num_cycles=100)

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from coopenv.api.arguments import LASTING_SCALE
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.estimation.outcomes import Sight
 from coopenv.world.state import LASTING_ERRORS
@@ -319,5 +320,5 @@ def test_truth_of_them_is_told_as_such() -> None:
     truth, state = infos["vehicle_1"]["truth"], env.state()
     assert env.state_space.contains(state)
     told = np.concatenate([np.ravel(truth[name]) for name in LASTING_ERRORS])
-    assert_allclose(state[-12:], told, atol=1e-6)
+    assert_allclose(state[-12:], told / LASTING_SCALE, atol=1e-5)
     assert np.count_nonzero(told) == 10  # no slip yet

@@ -1,52 +1,58 @@
-"""BenchMARL: every environment as a task. Needs the extra `benchmarl`."""
+"""BenchMARL: every environment as a task, batched. Needs the extra `benchmarl`."""
 
-from collections.abc import Callable, Iterator
-from itertools import count, repeat
 from typing import Any
 
-from coopenv.api.make import parallel_env
-from coopenv.api.parallel_env import NUMBERS, PlainInfos
 from coopenv.base.installation import install_command
 from coopenv.scenario import ScenarioLike, scenario_name
 
 try:
-    from benchmarl.environments.pettingzoo.common import PettingZooClass
-    from torchrl.envs import EnvBase
-    from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+    from benchmarl.environments.vmas.common import VmasClass
+    from tensordict import TensorDictBase
+    from torchrl.data import Composite
+    from torchrl.envs import EnvBase, Transform
+
+    from coopenv.api.trainers.torchrl import EVENTS, GROUP, QUALITIES, batched_env
 except ImportError as error:
     raise ImportError(f"coopenv.api.trainers.benchmarl needs BenchMARL: {install_command('benchmarl')}") from error
 
 
-class CooperativeTask(PettingZooClass):
-    """One world per environment, all vehicles in the group `vehicle`; `task(name, **options)` builds it."""
+class ActingRows(Transform):
+    """Takes the rows of vehicles that did not act out of the losses of PPO: no advantage, no error of the critic."""
 
-    def get_env_fun(
-        self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
-    ) -> Callable[[], EnvBase]:
-        """Return a maker of worlds, each with the next seed; BenchMARL makes `num_envs` and runs them in turn."""
-        options = {k: v for k, v in self.config.items() if k != "env"}
-        seeds: Iterator[int | None] = repeat(None) if seed is None else count(seed)
-        return lambda: PettingZooWrapper(
-            PlainInfos(parallel_env(self.config["env"], **options), with_absent=True),
-            done_on_any=False,
-            use_mask=True,
-            return_state=True,
-            seed=next(seeds),
-            device=device,
-        )
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Change a sample of the replay buffer; one without advantages stays."""
+        rows, mask = tensordict[GROUP], tensordict[GROUP, "mask"].unsqueeze(-1)
+        if rows.get("advantage", None) is not None:
+            rows["advantage"] = rows["advantage"] * mask
+            rows["value_target"] = rows["value_target"].where(mask, rows["state_value"])
+        return tensordict
 
-    def supports_continuous_actions(self) -> bool:
-        return True
+
+class CooperativeTask(VmasClass):
+    """Worlds in a batch, like those of VMAS; `task(name, ...)` builds it."""
+
+    def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Any:
+        """Return a maker of `num_envs` worlds in a batch."""
+        return lambda: batched_env(num_worlds=num_envs, seed=seed, device=str(device), **self.config)
 
     def supports_discrete_actions(self) -> bool:
         return False
 
     def max_steps(self, env: EnvBase) -> int:
-        scenario = env.unwrapped.scenario
-        return round(float(scenario.horizon * scenario.rates.decision))
+        return round(float(env.scenario.horizon * env.scenario.rates.decision))
 
     def has_render(self, env: EnvBase) -> bool:
-        return bool(env.unwrapped.render_mode == "rgb_array")
+        return bool(env.batch.render_mode == "rgb_array")
+
+    def observation_spec(self, env: EnvBase) -> Composite:
+        spec = env.full_observation_spec_unbatched[GROUP]
+        return Composite({GROUP: Composite({"observation": spec["observation"].clone()}, shape=spec.shape)})
+
+    def state_spec(self, env: EnvBase) -> Composite:
+        return Composite({"state": env.full_observation_spec_unbatched["state"].clone()})
+
+    def get_replay_buffer_transforms(self, env: EnvBase, group: str) -> list[Transform]:
+        return [ActingRows()]
 
     @staticmethod
     def env_name() -> str:
@@ -55,13 +61,10 @@ class CooperativeTask(PettingZooClass):
     @staticmethod
     def log_info(batch: Any) -> dict[str, float]:
         """Return means over the vehicles under way, and how many arrived and collided."""
-        alive = batch["vehicle", "mask"]
-        info = batch["next", "vehicle", "info"]
-        events = ("arrived", "collided")
-        return {
-            f"collection/{name}": float(info[name][alive].sum() if name in events else info[name][alive].mean())
-            for name in NUMBERS
-        }
+        alive, info = batch[GROUP, "mask"], batch["next", GROUP, "info"]
+        means = {name: info[name][alive].mean() for name in QUALITIES}
+        sums = {name: info[name].sum() for name in EVENTS}
+        return {f"collection/{name}": float(value) for name, value in {**means, **sums}.items()}
 
 
 def task(name_or_path: ScenarioLike, **options: Any) -> CooperativeTask:
@@ -69,6 +72,7 @@ def task(name_or_path: ScenarioLike, **options: Any) -> CooperativeTask:
 
     Args:
         name_or_path: for example "urban_crossing".
-        options: those of `coopenv.parallel_env`.
+        options: those of `coopenv.make_vec` but `num_worlds`, `device`, `autoreset`, `arrays` and `observation`.
+            `render_mode="rgb_array"` and `ExperimentConfig.render` make films of evaluations.
     """
-    return CooperativeTask(name=scenario_name(name_or_path), config={"env": name_or_path, **options})
+    return CooperativeTask(name=scenario_name(name_or_path), config={"name_or_path": name_or_path, **options})

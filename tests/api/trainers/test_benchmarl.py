@@ -1,16 +1,19 @@
-"""BenchMARL really trains on the task. Runs where the extra `benchmarl` is installed."""
+"""BenchMARL really trains on the batched task. Runs where the extra `benchmarl` is installed."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("benchmarl", reason="needs the extra 'benchmarl'")
 
 import torch
-from benchmarl.algorithms import IppoConfig, MappoConfig
-from benchmarl.experiment import Experiment, ExperimentConfig
+from benchmarl.algorithms import IppoConfig, MaddpgConfig, MappoConfig
+from benchmarl.experiment import Callback, Experiment, ExperimentConfig
+from benchmarl.models import GruConfig
 from benchmarl.models.mlp import MlpConfig
 
 from coopenv.api.trainers.benchmarl import task
@@ -19,54 +22,114 @@ from tests.helpers.four_way import FOUR_WAY
 pytestmark = [pytest.mark.benchmarl, pytest.mark.filterwarnings("ignore")]
 torch.set_num_threads(1)
 
+LAYERS = {"activation_class": torch.nn.Tanh, "layer_class": torch.nn.Linear}
+MLP = MlpConfig(num_cells=[64, 64], **LAYERS)
+GRU = GruConfig.get_from_yaml()
 
-def configuration(folder: Path) -> ExperimentConfig:
-    """Return two short iterations in this process that write nothing but into `folder`."""
-    config = ExperimentConfig.get_from_yaml()
+
+class Samples(Callback):
+    """Keeps what BenchMARL hands to callbacks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.batches: list[Any] = []
+        self.samples: list[Any] = []
+        self.rollouts: list[Any] = []
+
+    def on_batch_collected(self, batch: Any) -> None:
+        self.batches.append(batch)
+
+    def on_train_step(self, batch: Any, group: str) -> None:
+        self.samples.append(batch.clone())
+
+    def on_evaluation_end(self, rollouts: Any) -> None:
+        self.rollouts.append(rollouts)
+
+
+def experiment(
+    folder: Path, algorithm: Any, model: Any = MLP, horizon: float = 10.0, **options: Any
+) -> tuple[Experiment, Samples]:
+    """Return one of two short iterations, ten worlds at once, that writes into `folder` alone; and what it hands on."""
+    config, samples = ExperimentConfig.get_from_yaml(), Samples()
     config.max_n_iters, config.max_n_frames = 2, None
-    config.on_policy_collected_frames_per_batch = 400
-    config.on_policy_n_envs_per_worker = 2
-    config.on_policy_n_minibatch_iters = 2
-    config.on_policy_minibatch_size = 100
-    config.evaluation_interval, config.evaluation_episodes = 400, 1
-    config.loggers, config.create_json, config.render = [], False, False
+    for policy in ("on", "off"):
+        setattr(config, f"{policy}_policy_collected_frames_per_batch", 800)
+        setattr(config, f"{policy}_policy_n_envs_per_worker", 10)
+    config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 2, 200
+    config.off_policy_n_optimizer_steps = 2
+    config.evaluation_interval, config.evaluation_episodes = 800, 3
+    config.loggers, config.create_json, config.render = [], True, True
     config.save_folder = str(folder)
-    return config
+    crossing = task(FOUR_WAY, overrides={"horizon": horizon}, **options)
+    algorithm = algorithm.get_from_yaml()
+    return Experiment(crossing, algorithm, model, 0, config, critic_model_config=model, callbacks=[samples]), samples
 
 
-@pytest.mark.parametrize("algorithm", [MappoConfig, IppoConfig])
-def test_trains(algorithm: type[MappoConfig], tmp_path: Path) -> None:
-    model = MlpConfig(num_cells=[64, 64], activation_class=torch.nn.Tanh, layer_class=torch.nn.Linear)
-    experiment = Experiment(
-        task=task(FOUR_WAY, overrides={"horizon": 10.0}),
-        algorithm_config=algorithm.get_from_yaml(),
-        model_config=model,
-        critic_model_config=model,
-        seed=0,
-        config=configuration(tmp_path),
-    )
-    before = [parameter.detach().clone() for parameter in experiment.policy.parameters()]
-    experiment.run()
-    assert experiment.total_frames == 800
-    after = list(experiment.policy.parameters())
+@pytest.mark.parametrize(
+    ("algorithm", "model"), [(MappoConfig, MLP), (IppoConfig, MLP), (MappoConfig, GRU), (MaddpgConfig, MLP)]
+)
+def test_trains(algorithm: Any, model: Any, tmp_path: Path) -> None:
+    trained, samples = experiment(tmp_path, algorithm, model)
+    before = [parameter.detach().clone() for parameter in trained.policy.parameters()]
+    trained.run()
+    assert trained.total_frames == 1600
+    after = list(trained.policy.parameters())
     assert all(torch.isfinite(parameter).all() for parameter in after)
     assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert [len(rollouts) for rollouts in samples.rollouts] == [3, 3]
+
+
+def test_rows_that_did_not_act_are_not_learned_from(tmp_path: Path) -> None:
+    trained, samples = experiment(tmp_path, MappoConfig)
+    trained.run()
+    rows = torch.cat(
+        [sample["vehicle"].select("mask", "advantage", "value_target", "state_value") for sample in samples.samples]
+    )
+    acted = rows["mask"]
+    assert 0.02 < (~acted).float().mean() < 0.9
+    assert not rows["advantage"][~acted].any()
+    assert torch.equal(rows["value_target"][~acted], rows["state_value"][~acted])
+    assert (rows["advantage"][acted] != 0).float().mean() > 0.99
+    assert not torch.allclose(rows["value_target"][acted], rows["state_value"][acted], atol=1e-3)
+
+
+def test_log_info_is_of_vehicles_under_way(tmp_path: Path) -> None:
+    trained, samples = experiment(tmp_path, MappoConfig)
+    trained.run()
+    batch = samples.batches[0]
+    told = trained.task.log_info(batch)
+    rows = [row for world in batch for row in world]
+    acting = [(row, i) for row in rows for i in range(4) if row["vehicle", "mask"][i]]
+    errors = [row["next", "vehicle", "info", "position_error"][i].item() for row, i in acting]
+    ends = sum(bool(row["next", "vehicle", "terminated"][i]) for row, i in acting)
+    assert told["collection/position_error"] == pytest.approx(np.mean(errors), rel=1e-4)
+    assert told["collection/arrived"] + told["collection/collided"] == ends > 0
 
 
 def test_specs() -> None:
     crossing = task(FOUR_WAY)
-    env = crossing.get_env_fun(num_envs=1, continuous_actions=True, seed=0, device="cpu")()
+    env = crossing.get_env_fun(num_envs=5, continuous_actions=True, seed=0, device="cpu")()
+    assert env.batch_size == torch.Size([5])
     assert crossing.group_map(env) == {"vehicle": [f"vehicle_{i}" for i in range(1, 5)]}
     assert crossing.max_steps(env) == 400
     assert crossing.observation_spec(env)["vehicle", "observation"].shape == (4, 132)
     assert list(crossing.observation_spec(env)["vehicle"].keys()) == ["observation"]
-    assert crossing.state_spec(env)["state"].shape == env.unwrapped.state_space.shape
+    assert crossing.state_spec(env)["state"].shape == env.batch.state()[0].shape
     assert crossing.action_spec(env)["vehicle", "action"].shape == (4, 2)
+    assert not crossing.has_render(env)
 
 
 def test_every_world_has_a_seed_of_its_own() -> None:
     make = task(FOUR_WAY).get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
-    first, second = (make().reset()["vehicle", "observation"] for _ in range(2))
-    assert not torch.equal(first, second)
-    again = task(FOUR_WAY).get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
-    assert torch.equal(first, again().reset()["vehicle", "observation"])
+    first = make().reset()["vehicle", "observation"]
+    assert not torch.equal(first[0], first[1])
+    assert torch.equal(first, make().reset()["vehicle", "observation"])
+
+
+def test_pictures_of_an_evaluation(tmp_path: Path) -> None:
+    trained, _ = experiment(tmp_path, MappoConfig, horizon=1.0, render_mode="rgb_array")
+    assert trained.task.has_render(trained.test_env)
+    trained.test_env.reset()
+    frame = trained.task.render_callback(trained, trained.test_env, None)
+    assert frame.dtype == np.uint8 and frame.shape[-1] == 3
+    trained.evaluate()

@@ -1,6 +1,6 @@
-"""TorchRL's `PettingZooWrapper` rolls out over deaths and trains; a batch is one environment.
+"""A batch as one environment of TorchRL: against `parallel_env` and `make_vec`, and PPO on it.
 
-Runs where the extra `torchrl` is installed.
+Runs where the extra `torchrl` or `benchmarl` is installed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
-from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
@@ -25,113 +25,177 @@ from torchrl.objectives.value import GAE
 import coopenv
 from coopenv.api.parallel_env import PlainInfos
 from coopenv.api.trainers.torchrl import batched_env
-from coopenv.api.vector_env import RecordVehicleEpisodes
+from coopenv.api.vector_env import TrueEnds
 from tests.helpers.four_way import FOUR_WAY
 
-pytestmark = [pytest.mark.torchrl, pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")]
+pytestmark = pytest.mark.torchrl
 torch.set_num_threads(1)
 
-
-def crossing(**overrides: Any) -> PettingZooWrapper:
-    world = PlainInfos(coopenv.parallel_env(FOUR_WAY, overrides=overrides))
-    return PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True)
-
-
-def test_vehicles_may_be_absent() -> None:
-    """In `urban_crossing` they are, in some episodes; their rows are masked."""
-    world = PlainInfos(coopenv.parallel_env("urban_crossing"), with_absent=True)
-    absent = 0
-    for seed in range(4):
-        env = PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True, seed=seed)
-        first = env.reset()["vehicle", "mask"]
-        assert first.tolist() == [agent in world.agents for agent in world.possible_agents]
-        absent += int((~first).sum())
-        assert env.rollout(5).batch_size == (5,)
-    assert absent > 0
+TEAM = {"reward.team": "mean", "horizon": 6.0}
+DRIVEN = {"vehicles.vehicle_2.motion.driver": "route_follower", "horizon": 6.0}
+STEPS = 150
 
 
-def actor(env: PettingZooWrapper) -> ProbabilisticActor:
-    size = env.observation_spec["vehicle", "observation"].shape[-1]
-    network = torch.nn.Sequential(MLP(size, 4, num_cells=[64, 64]), NormalParamExtractor())
-    parameters = TensorDictModule(network, [("vehicle", "observation")], [("vehicle", "loc"), ("vehicle", "scale")])
-    return ProbabilisticActor(
-        parameters,
-        spec=env.full_action_spec,
-        in_keys=[("vehicle", "loc"), ("vehicle", "scale")],
-        out_keys=[("vehicle", "action")],
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": -1.0, "high": 1.0},
-        return_log_prob=True,
-        log_prob_key=("vehicle", "sample_log_prob"),
+@pytest.mark.parametrize("name", [FOUR_WAY, "urban_crossing", "take_turns"])
+def test_specs(name: str) -> None:
+    env = batched_env(name, num_worlds=3, seed=0)
+    assert env.batch_size == torch.Size([3])
+    check_env_specs(env)
+
+
+def turning(worlds: int, vehicles: int) -> np.ndarray:
+    """Return wide turns that end against walls or at the horizon, (worlds, vehicles, 2)."""
+    steering = np.linspace(0.0, 0.5, worlds * vehicles).reshape(worlds, vehicles)
+    return np.stack([np.ones_like(steering), steering], axis=-1).astype(np.float32)
+
+
+def rolled_out(env: EnvBase, actions: np.ndarray) -> TensorDict:
+    """Return a rollout over the ends of worlds, (worlds, steps)."""
+    always = torch.from_numpy(actions)
+    policy = TensorDictModule(lambda state: always.clone(), ["state"], [("vehicle", "action")])
+    return env.rollout(STEPS, policy, break_when_any_done=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [(FOUR_WAY, {"horizon": 6.0}), ("urban_crossing", {"horizon": 7.0}), (FOUR_WAY, TEAM), (FOUR_WAY, DRIVEN)],
+)
+def test_each_world_is_a_parallel_env(name: str, overrides: dict[str, Any]) -> None:
+    """Observations, rewards, ends, masks, states and infos of all episodes, the later ones included."""
+    env = batched_env(name, num_worlds=3, seed=5, overrides=overrides)
+    agents = env.group_map["vehicle"]
+    actions = turning(3, len(agents))
+    rollout = rolled_out(env, actions)
+    for w in range(3):
+        world, got = PlainInfos(coopenv.parallel_env(name, overrides=overrides)), rollout[w]
+        assert world.possible_agents == agents
+        observations, _ = world.reset(seed=5, options={"world": w})
+        for t in range(STEPS):
+            now, then = got[t], got[t]["next"]
+            acting = [agent in world.agents for agent in agents]
+            assert now["vehicle", "mask"].tolist() == acting
+            assert np.array_equal(now["state"], world.state())
+            observations, rewards, terminated, truncated, infos = world.step(dict(zip(agents, actions[w], strict=True)))
+            for i, agent in enumerate(agents):
+                row = then["vehicle"][i]
+                flags = [bool(row[flag]) for flag in ("terminated", "truncated", "done")]
+                if acting[i]:
+                    assert np.array_equal(row["observation"], observations[agent])
+                    assert row["reward"].item() == rewards[agent]
+                    assert flags == [terminated[agent], truncated[agent], agent not in world.agents]
+                    for number in ("position_error", "orientation_error", "nees"):
+                        assert row["info", number].item() == pytest.approx(infos[agent][number], rel=1e-6)
+                else:
+                    assert flags == [True, False, True]
+                    assert not row["observation"].any() and not row["reward"].any()
+                assert bool(row["mask"]) == (agent in world.agents)
+            assert bool(then["done"]) == (not world.agents) == bool(then["terminated"] | then["truncated"])
+            assert bool(then["terminated"]) == bool(then["vehicle", "terminated"].all())
+            assert np.array_equal(then["state"], world.state())
+            if not world.agents:
+                world.reset()
+    assert rollout["next", "done"].sum(dim=1).min() >= 2  # so partial resets have happened
+
+
+def test_rows_are_those_of_the_batch() -> None:
+    actions = turning(3, 4)
+    rollout = rolled_out(batched_env(FOUR_WAY, num_worlds=3, seed=0, overrides={"horizon": 6.0}), actions)
+    batch = TrueEnds(coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 6.0}, autoreset="disabled"))
+    batch.reset(seed=0)
+    for t in range(STEPS):
+        _, rewards, terminated, truncated, infos = batch.step(actions.reshape(12, 2))
+        then = rollout[:, t]["next"]
+        assert np.array_equal(then["vehicle", "reward"].flatten(), rewards)
+        assert np.array_equal(then["vehicle", "truncated"].flatten(), truncated)
+        for event, code in (("arrived", 1), ("collided", 2)):
+            happened = terminated & (infos["ended"] == code)
+            assert np.array_equal(then["vehicle", "info", event].flatten().bool(), happened)
+        over = batch.unwrapped.engine.view("over") != 0
+        assert np.array_equal(then["done"].flatten(), over)
+        if over.any():
+            batch.reset(options={"reset_mask": over})
+
+
+def test_one_world_is_reset_and_no_other() -> None:
+    env = batched_env(FOUR_WAY, num_worlds=3, seed=0)
+    data = env.rollout(12)[:, -1]["next"].exclude("reward")
+    before = data.clone()
+    data["_reset"] = torch.tensor([[False], [True], [False]])
+    after = env.reset(data)
+    for world in (0, 2):
+        assert torch.equal(after[world]["state"], before[world]["state"])
+        assert torch.equal(after[world]["vehicle", "observation"], before[world]["vehicle", "observation"])
+    assert after[1]["state"][-1] == 0.0 < before[1]["state"][-1]
+    assert not torch.equal(after[1]["vehicle", "observation"], before[1]["vehicle", "observation"])
+    step = env.rand_step(after)
+    shares = step["next", "state"][:, -1]
+    assert shares[0] == shares[2] > 12 * shares[1] > 0.0
+
+
+def test_absent_vehicles_never_act() -> None:
+    env = batched_env("urban_crossing", num_worlds=16, seed=3)
+    mask = env.reset()["vehicle", "mask"]
+    assert 0 < (~mask).sum() < 32 and mask.any(dim=1).all()
+    rollout = env.rollout(5)
+    absent = ~rollout["vehicle", "mask"][:, 0]
+    assert rollout["next", "vehicle", "terminated"].squeeze(-1).transpose(1, 2)[absent].all()
+    assert not rollout["vehicle", "observation"].transpose(1, 2)[absent].any()
+
+
+def test_seeds() -> None:
+    first, second, other = (
+        batched_env("open_square", num_worlds=2, seed=seed).reset()["vehicle", "observation"] for seed in (7, 7, 8)
     )
+    assert torch.equal(first, second) and not torch.equal(first, other) and not torch.equal(first[0], first[1])
+    env = batched_env("open_square", num_worlds=2)
+    env.reset()
+    env.set_seed(7)
+    assert torch.equal(env.reset()["vehicle", "observation"], first)
+    assert not torch.equal(env.reset()["vehicle", "observation"], first)
 
 
-def test_specs() -> None:
-    env, rows = crossing(), batched_env(FOUR_WAY, **OPTIONS)
-    assert env.group_map == {"vehicle": [f"vehicle_{i}" for i in range(1, 5)]}
-    assert rows.batch_size == torch.Size([12])
-    for each in (env, rows):
-        check_env_specs(each)
-
-
-def test_rollout_goes_on_over_deaths() -> None:
-    torch.manual_seed(0)
-    env = crossing()
-    env.set_seed(0)
-    rollout = env.rollout(400)
-    alive = rollout["vehicle", "mask"]  # (steps, vehicles): acted in this step
-    steps = alive.sum(0)
-    assert len(steps.unique()) > 1  # vehicles end at times of their own
-    assert len(rollout) == steps.max()
-    assert rollout["next", "done"].flatten().tolist() == [False] * (len(rollout) - 1) + [True]
-    died = rollout["next", "vehicle", "terminated"].squeeze(-1) & alive
-    assert (died.sum(0) <= 1).all() and died.any()
-    assert not rollout["next", "vehicle", "reward"].squeeze(-1)[~alive].any()
-    assert rollout["next", "vehicle", "info", "collided"][died].any()
-
-
-def test_horizon_truncates() -> None:
-    rollout = crossing(horizon=1.0).rollout(50)
-    assert len(rollout) == 10
-    last = rollout["next"][-1]
-    assert last["truncated"].all() and not last["terminated"].any()
-    assert last["vehicle", "truncated"].all() and not last["vehicle", "terminated"].any()
+def test_pictures() -> None:
+    env = batched_env(FOUR_WAY, num_worlds=2, seed=0, render_mode="rgb_array")
+    env.reset()
+    first = env.render()
+    assert first.dtype == np.uint8 and first.ndim == 3
+    env.rollout(10)
+    assert not np.array_equal(env.render(), first)
+    env.close()
 
 
 def test_ppo_trains_on_living_rows() -> None:
     torch.manual_seed(1)
-    env = crossing(horizon=15.0)
-    policy = actor(env)
+    env = batched_env(FOUR_WAY, num_worlds=4, seed=1, overrides={"horizon": 15.0})
     size = env.observation_spec["vehicle", "observation"].shape[-1]
-    critic = TensorDictModule(
-        MLP(size, 1, num_cells=[64, 64]), [("vehicle", "observation")], [("vehicle", "state_value")]
-    )
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
-    advantage.set_keys(
-        value=("vehicle", "state_value"),
-        reward=("vehicle", "reward"),
-        done=("vehicle", "done"),
-        terminated=("vehicle", "terminated"),
-        advantage=("vehicle", "advantage"),
-        value_target=("vehicle", "value_target"),
-    )
+    network = torch.nn.Sequential(MLP(size, 4, num_cells=[64, 64]), NormalParamExtractor())
     rows = "vehicle"
+    policy = ProbabilisticActor(
+        TensorDictModule(network, [(rows, "observation")], [(rows, "loc"), (rows, "scale")]),
+        spec=env.full_action_spec,
+        in_keys=[(rows, "loc"), (rows, "scale")],
+        out_keys=[(rows, "action")],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0},
+        return_log_prob=True,
+        log_prob_key=(rows, "sample_log_prob"),
+    )
+    critic = TensorDictModule(MLP(size, 1, num_cells=[64, 64]), [(rows, "observation")], [(rows, "state_value")])
+    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
     loss = ClipPPOLoss(policy, critic, normalize_advantage=True)
+    keys = {name: (rows, name) for name in ("advantage", "value_target", "reward", "done", "terminated")}
+    advantage.set_keys(value=(rows, "state_value"), **keys)
     loss.set_keys(
-        action=(rows, "action"),
-        sample_log_prob=(rows, "sample_log_prob"),
-        value=(rows, "state_value"),
-        advantage=(rows, "advantage"),
-        value_target=(rows, "value_target"),
+        value=(rows, "state_value"), action=(rows, "action"), sample_log_prob=(rows, "sample_log_prob"), **keys
     )
     optimiser = torch.optim.Adam(loss.parameters(), 1e-3)
     before = [parameter.detach().clone() for parameter in policy.parameters()]
     errors = []
     for _ in range(3):
         with torch.no_grad():
-            rollout = advantage(env.rollout(150, policy))
-        vehicles = rollout["vehicle"].exclude("info")
-        living = TensorDict({"vehicle": vehicles[vehicles["mask"]]}, batch_size=[int(vehicles["mask"].sum())])
+            rollout = advantage(env.rollout(100, policy, break_when_any_done=False))
+        vehicles = rollout[rows].exclude("info")
+        living = TensorDict({rows: vehicles[vehicles["mask"]]}, batch_size=[int(vehicles["mask"].sum())])
         assert len(living) < vehicles["mask"].numel()
         for _ in range(8):
             losses = loss(living)
@@ -143,31 +207,3 @@ def test_ppo_trains_on_living_rows() -> None:
             errors.append(losses["loss_critic"].item())
     assert errors[7] < errors[0]
     assert any(not torch.equal(a, b) for a, b in zip(before, policy.parameters(), strict=True))
-
-
-OPTIONS = {"num_worlds": 3, "overrides": {"horizon": 6.0}}
-STEPS = 150
-
-
-def test_episodes_are_those_of_vehicles() -> None:
-    """Under wide turns, which end against walls or at the horizon: every end and all rewards are those of the batch."""
-    actions = np.column_stack([np.ones(12), np.linspace(0.0, 0.5, 12)]).astype(np.float32)
-    env = batched_env(FOUR_WAY, **OPTIONS)
-    env.set_seed(0)
-    always = torch.from_numpy(actions)
-    rollout = env.rollout(STEPS, lambda observation: always.clone(), break_when_any_done=False)
-    told = {name: rollout["next", name].squeeze(-1).numpy() for name in ("done", "truncated", "reward")}
-
-    batch = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS), 1000)
-    batch.reset(seed=0)
-    batch.reset()  # as `rollout` does
-    ends, rewards = np.zeros((12, STEPS), dtype=bool), np.zeros((12, STEPS))
-    for step in range(STEPS):
-        _, reward, terminated, truncated, infos = batch.step(actions)
-        rewards[:, step], ends[:, step] = reward, infos.get("_episode", False)
-        over = batch.unwrapped.world_major(terminated | truncated).all(axis=1)
-        if over.any():
-            batch.reset(options={"reset_mask": over})
-    assert np.array_equal(told["done"], ends)
-    assert told["reward"] == pytest.approx(rewards, abs=1e-6)
-    assert told["truncated"].any() and not told["truncated"].all(where=told["done"])
