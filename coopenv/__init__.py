@@ -24,7 +24,7 @@ from coopenv.base.errors import (
     UnknownEnvironmentError,
     evaluation_seed,
 )
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import list_agents, list_envs
 
 if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from coopenv.bench.evaluate import evaluate
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.estimation.poses import position_covariance
+    from coopenv.observers.registry import list_observers
     from coopenv.runs.command import Results, run
     from coopenv.scenario import Scenario, load_scenario
     from coopenv.scenario.own_terms import register_observation, register_reward, register_termination
@@ -67,7 +68,9 @@ __all__ = [
     "compare",
     "evaluate",
     "evaluation_seed",
+    "list_agents",
     "list_envs",
+    "list_observers",
     "load_scenario",
     "make_vec",
     "parallel_env",

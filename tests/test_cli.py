@@ -19,7 +19,7 @@ from coopenv.cli import main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.observability import Trajectory
 from coopenv.observers.recording import Truth
-from coopenv.observers.registry import observer_names
+from coopenv.observers.registry import list_observers
 from coopenv.runs import console
 from coopenv.runs.recorder import record
 
@@ -51,7 +51,7 @@ def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[
 def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "observers"]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
-    assert [line.split()[0] for line in lines if not line.startswith(" ")] == observer_names()
+    assert [line.split()[0] for line in lines if not line.startswith(" ")] == list_observers()
     assert max(map(len, lines)) <= 80
     words = " ".join(" ".join(lines).split())  # wrapped, not cut
     assert words.count("Calibrates its odometry online; fuses neighbours by split") == 1
@@ -64,7 +64,7 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
     ("line", "names"),
     [
         ("list", coopenv.list_envs),
-        ("list observers", observer_names),
+        ("list observers", list_observers),
         ("list agents", list_agents),
         (
             "list variants",

@@ -72,6 +72,25 @@ def test_workflows_call_what_there_is(path: Path) -> None:
         assert (ROOT / name).exists()
 
 
+NEWEST_NODE = {"checkout": 5, "setup-python": 6, "upload-artifact": 6, "download-artifact": 7}
+"""First version of each action that runs on Node 24: the host has removed Node 20."""
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_actions_run_on_a_node_that_there_is(path: Path) -> None:
+    used = re.findall(r"uses: actions/([\w-]+)@v(\d+)", path.read_text(encoding="utf-8"))
+    assert used and all(int(version) >= NEWEST_NODE[action] for action, version in used)
+
+
+def test_a_release_is_built_and_published_by_tools_of_known_hashes() -> None:
+    tools = set(re.findall(r"^([\w-]+)==", (ROOT / ".ci" / "release.txt").read_text(encoding="utf-8"), re.MULTILINE))
+    release = (GITHUB / "workflows" / "release.yml").read_text(encoding="utf-8")
+    called = set(re.findall(r"run: (?:python -m )?(build|twine|uv)\b", release))
+    assert {"build", "uv"} <= called <= tools
+    permissions = read(GITHUB / "workflows" / "release.yml")["jobs"]["pypi"]["permissions"]
+    assert permissions == {"id-token": "write"} and "password" not in release
+
+
 def test_the_pythons_that_are_promised_are_tested() -> None:
     versions = read(GITHUB / "workflows" / "tests.yml")["jobs"]["quick"]["strategy"]["matrix"]["python"]
     promised = [row.rpartition(" ")[2] for row in project()["classifiers"] if re.search(r":: Python :: \d\.\d+$", row)]

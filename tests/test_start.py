@@ -123,6 +123,18 @@ def test_a_city_is_checked_in_few_calls() -> None:
         (["watch", "nosuch"], set()),
         (["evaluate", "facade", "--agents", "peek,nosuch"], set()),
         (["bench", "observers", "facade", "--observers", "riccati,nosuch"], {"numpy"}),
+        (["bench", "observers", "facade", "--observers", "nosuch.py:Mine"], set()),
+        (["bench", "observers", "nosuch.bag"], {"numpy"}),
+        (["bench", "v1", "examples/own_observer.py:Eky"], set()),
+        (["bench", "learning", "nosuch.toml"], {"numpy"}),
+        (["evaluate", "facade", "--agents", "nosuch.py:Mine"], set()),
+        (["train", "facade", "--set", "nosuch=3"], set()),
+        (["train", "facade", "--agent", "nosuch"], set()),
+        (["run", "nosuch.mcap"], {"numpy"}),
+        (["bundle", "nosuch"], {"numpy"}),
+        (["export", "nosuch"], {"numpy"}),
+        (["calibrate", "nosuch"], {"numpy"}),
+        (["svea", "run", "nosuch.toml"], {"numpy"}),
     ],
 )
 def test_a_wrong_name_is_refused_before_anything_is_loaded(command: list[str], modules: set[str]) -> None:

@@ -313,6 +313,9 @@ class Engine:
         self.begun = bool(has_begun(self.view("start_rotation")).all())
 
 
+NO_PICTURE = "render() shows nothing: make the environment with render_mode='rgb_array'"
+
+
 class Saved(Explained):
     """What the environments of an engine share: its layout, and states that are saved and restored."""
 
@@ -333,6 +336,10 @@ class Saved(Explained):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def __len__(self) -> int:
+        """Return the number of vehicles in all worlds."""
+        return self.engine.world.worlds * len(self.scenario.vehicles)
 
     def __repr__(self) -> str:
         return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)

@@ -22,7 +22,7 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import Engine, Saved
+from coopenv.api.engine import NO_PICTURE, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
@@ -272,7 +272,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:
-            warnings.warn("render() shows nothing: make the environment with render_mode='rgb_array'", stacklevel=2)
+            warnings.warn(NO_PICTURE, stacklevel=2)
             return None
         if not self.engine.begun:
             raise CoopenvError("render() called before reset()")

@@ -1,5 +1,6 @@
 """The batched Gymnasium environment: rows are (world, vehicle), for policies that all vehicles share."""
 
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from functools import cached_property
@@ -22,7 +23,7 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import Engine, Saved
+from coopenv.api.engine import NO_PICTURE, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, world_keys
 from coopenv.base.installation import install_command
@@ -295,6 +296,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:
+            warnings.warn(NO_PICTURE, stacklevel=2)
             return None
         pictures = [self.engine.picture(world) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))

@@ -193,14 +193,20 @@ class Explained:
 
 
 def explained(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function whose error for an unknown argument lists those that there are."""
-    known = [*signature(function).parameters]
+    """Return a function whose errors for wrong arguments list those that there are."""
+    form = signature(function)
+    known = [*form.parameters]
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for name in [name for name in kwargs if name not in known]:
             there = f"{suggest(name, known)}; known: {listed(known)}; keys of a scenario are given in overrides"
             raise TypeError(f"{function.__name__}: unknown argument '{name}'{there}")
+        try:
+            form.bind(*args, **kwargs)
+        except TypeError as error:  # too many, twice, or missing
+            by_name = [name for name, one in form.parameters.items() if one.kind is one.KEYWORD_ONLY]
+            raise TypeError(f"{function.__name__}: {error}; by name: {listed(by_name or known)}") from None
         return function(*args, **kwargs)
 
     return call

@@ -5,8 +5,9 @@ A class or function of the user's own is named by its import path: `file.py:Name
 
 import os
 import platform
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
@@ -165,6 +166,15 @@ def needing(words: str) -> Iterator[None]:
         raise CoopenvError(f"{words} ({error})") from None
 
 
+def names_of(given: object) -> list[Any]:
+    """Return names, classes or functions as a list: also one alone, or a text with commas between."""
+    if isinstance(given, str):
+        return [word.strip() for word in given.split(",") if word.strip()]
+    if not (callable(given) or isinstance(given, Iterable)):
+        raise CoopenvError(f"expected a name, a class or a list of them, got {shown(given)}")
+    return [given] if callable(given) else list(given)
+
+
 def is_reference(text: str) -> bool:
     """Return whether a text is meant to name a place in code."""
     return ":" in text
@@ -178,6 +188,25 @@ def absolute_reference(reference: str, folder: Path | None = None) -> str:
     return f"{_file(place, folder)}:{name}" if place.endswith(".py") else reference
 
 
+def check_reference(reference: str) -> Path | None:
+    """Return the file of a reference, None for that of a module, without running any code.
+
+    Raises:
+        CoopenvError: it is no reference, there is no such file, or the file does not mention the name.
+    """
+    place, _, name = reference.rpartition(":")
+    if not place or not name.isidentifier():
+        raise CoopenvError(f"'{reference}': expected file.py:Name or package.module:Name")
+    path = _file(place) if place.endswith(".py") else None
+    if path is not None and not path.is_file():
+        raise CoopenvError(f"'{reference}': no such file: {path}")
+    text = name if path is None else path.read_bytes().decode(errors="replace")
+    if not re.search(rf"\b{name}\b|import \*|globals|setattr|__getattr__|exec", text):
+        known = re.findall(r"^(?:class|def)\s+(\w+)", text, re.MULTILINE)
+        raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
+    return path
+
+
 def load_reference(reference: str) -> Any:
     """Return the object of a reference.
 
@@ -188,11 +217,7 @@ def load_reference(reference: str) -> Any:
         CoopenvError: there is no such file, module or name, or its code raises something.
     """
     place, _, name = reference.rpartition(":")
-    if not place or not name.isidentifier():
-        raise CoopenvError(f"'{reference}': expected file.py:Name or package.module:Name")
-    path = _file(place) if place.endswith(".py") else None
-    if path is not None and not path.is_file():
-        raise CoopenvError(f"'{reference}': no such file: {path}")
+    path = check_reference(reference)
     try:
         if path is not None:
             module = _module_of(path, path.stat().st_mtime_ns)

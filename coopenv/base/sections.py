@@ -5,15 +5,15 @@ import inspect
 import tomllib
 from contextlib import suppress
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
 from pathlib import Path
 from textwrap import dedent
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.base.errors import CoopenvError, shortened, shown, suggest
+from coopenv.base.errors import CoopenvError, listed, shortened, shown, suggest
 
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
@@ -31,6 +31,21 @@ class Section(BaseModel):
         """Refuse a change; overrides of `load_scenario` return a changed copy."""
         where = f"{type(self).__name__}.{name}"
         raise CoopenvError(f"{where}: is frozen; load_scenario(scenario, {{'key': value}}) returns a changed scenario")
+
+    def __getitem__(self, key: str) -> Any:
+        """Return the value of a dotted key, as overrides name it."""
+        return reduce(getattr, key.split("."), self)
+
+    if not TYPE_CHECKING:  # which knows the attributes
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise an error that lists the keys."""
+            try:
+                return super().__getattr__(name)
+            except AttributeError:
+                keys = [] if name.startswith("_") else [*type(self).model_fields]
+                known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; as data: model_dump()" if keys else ""
+                raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
 
     @classmethod
     @cache

@@ -6,10 +6,10 @@ from typing import Any
 
 from rich.console import Console
 
-from coopenv.base.errors import CoopenvError, explained
+from coopenv.base.errors import explained
 from coopenv.base.files import check_new, replace_text, replacing_folder
 from coopenv.base.format import json_text
-from coopenv.base.installation import version, versions
+from coopenv.base.installation import names_of, version, versions
 from coopenv.base.terminal import Terminal
 from coopenv.bench.cards import Contest, Evaluation
 from coopenv.evaluation import METRICS
@@ -100,7 +100,7 @@ def run(
 @explained
 def evaluate(
     environment: ScenarioLike,
-    agents: Iterable[str | Callable[..., Any]] = (),
+    agents: str | Callable[..., Any] | Iterable[str | Callable[..., Any]] = (),
     worlds: int = 256,
     *,
     overrides: Mapping[str, Any] | None = None,
@@ -113,8 +113,8 @@ def evaluate(
 
     Args:
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`.
-        agents: names, folders, import paths (`mine.py:Mine`), classes or functions; none: every shipped agent made for
-            the environment.
+        agents: one or several names, folders, import paths (`mine.py:Mine`), classes or functions; none: every shipped
+            agent made for the environment.
         worlds: how many.
         overrides: dotted scenario keys.
         seed_block: number of the block of held-out seeds.
@@ -123,7 +123,5 @@ def evaluate(
     Raises:
         CoopenvError: an argument is not valid, or an agent cannot drive here.
     """
-    if isinstance(agents, str):
-        raise CoopenvError(f"agents: expected a list such as ['{agents}']")
-    contest = Contest.of(environment, overrides or {}, [*agents], worlds, seed_block, ideal)
+    contest = Contest.of(environment, overrides or {}, names_of(agents), worlds, seed_block, ideal)
     return run(contest, "", Terminal(stderr=True))

@@ -224,7 +224,12 @@ def bench_v1(
 
 @bench.command("learning")
 def bench_learning(
-    study: Annotated[Path, typer.Argument(help="TOML file of the study, such as agents/study.toml.")],
+    study: Annotated[
+        Path,
+        typer.Argument(
+            help="TOML file of the study, such as agents/study.toml.", callback=options.existing("file of a study")
+        ),
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder for the agents (default: beside the study).")] = None,
     only: Annotated[
         str | None,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def calibrate(
     bags: Annotated[
-        list[Path], typer.Argument(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")
+        list[Path], options.bags(metavar="BAG...|FILE.mcap", help="Bags of one drive, or a log of coopenv.")
     ],
     topics: options.TopicMap = None,
     out: Annotated[Path, typer.Option(help="Folder of calibration.toml and the figures.")] = Path("out", "calibration"),
@@ -65,7 +65,7 @@ def calibrate(
 
 
 def identify(
-    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, with the commands.")],
+    bags: Annotated[list[Path], options.bags(help="Bags of one drive, with the commands.")],
     topics: options.TopicMap = None,
     car: Annotated[str | None, typer.Option(help="Name of the car (default: the first one with commands).")] = None,
     out: Annotated[Path, typer.Option(help="File of the result.")] = Path("identified.toml"),

@@ -43,9 +43,9 @@ def completion(names: Callable[[], Iterable[str]], several: bool = False) -> Cal
 
 
 def _observer_names() -> list[str]:
-    from coopenv.observers.registry import observer_names
+    from coopenv.observers.registry import list_observers
 
-    return observer_names()
+    return list_observers()
 
 
 def _override_keys() -> Iterator[str]:
@@ -62,10 +62,24 @@ observers = completion(_observer_names, several=True)
 override_keys = completion(_override_keys)
 
 
-def known_environment(name: str | None) -> str | None:
-    """Return the name of an environment, a file or a recording. Raises UnknownEnvironmentError: there is none."""
-    from coopenv.backends.sources import is_recorded
+def existing(what: str) -> Callable[[Any], Any]:
+    """Return the check that a path, or each of several, exists; `what` it is called."""
 
+    def check(given: Any) -> Any:
+        for path in given if isinstance(given, list) else [given]:
+            if path is not None and not os.path.exists(path):  # noqa: PTH110 (never raises)
+                raise CoopenvError(f"no such {what}: {path}")
+        return given
+
+    return check
+
+
+def known_environment(name: str | None) -> str | None:
+    """Return the name of an environment, a file or a recording. Raises CoopenvError: there is none."""
+    from coopenv.backends.sources import BAG_SUFFIXES, LOG_SUFFIX, is_recorded
+
+    if name is not None and name.endswith((*BAG_SUFFIXES, LOG_SUFFIX)):
+        existing("log" if name.endswith(LOG_SUFFIX) else "bag")(name)
     if name is not None and not (os.path.exists(name) or is_scene(name) or is_recorded(name)):  # noqa: PTH110 (never raises)
         scenario_path(name)
     return name
@@ -125,6 +139,7 @@ def words(text: str | None) -> list[str]:
 ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
 POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
 POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": known_policies}
+AGENT: dict[str, Any] = {"autocompletion": agents, "callback": known_agents}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
 OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
 """Completion and check of an argument or option."""
@@ -157,6 +172,8 @@ FigureWidth = Annotated[
     ),
 ]
 _source = partial(typer.Argument, **ENVIRONMENT)
+deployment = partial(typer.Argument, metavar="DEPLOYMENT.toml", callback=existing("deployment"))
+bags = partial(typer.Argument, metavar="BAG...", callback=existing("bag"))
 Environment = Annotated[
     str,
     _source(metavar="ENV", help="Name of an environment (see `coopenv list`), a scene (lane:20) or a TOML file."),

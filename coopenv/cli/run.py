@@ -107,8 +107,14 @@ def replay(path: Path) -> None:
     printed.print(f"{same}: {error}" if error else "The same figures.", soft_wrap=True)
 
 
+RunFolder = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.", callback=options.existing("run")),
+]
+
+
 def bundle(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")],
+    run: RunFolder,
     out: Annotated[Path | None, typer.Option(help="File to write (default: RUN.zip).")] = None,
 ) -> None:
     """Write a run, or one that failed, to one file, which `coopenv run` replays."""
@@ -232,10 +238,14 @@ def check_log(out: Path, observer: str | None, scene: bool) -> None:
         find(named(observer))
 
 
-RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `coopenv run` has written.")]
 ExportFormat = StrEnum("ExportFormat", {"tum": "tum", "csv": "csv", "parquet": "parquet", "layout": "foxglove-layout"})
 Exported = Annotated[
-    Path, typer.Argument(metavar="RUN|FILE.mcap", help="Folder that `coopenv run` has written, or log of `record`.")
+    Path,
+    typer.Argument(
+        metavar="RUN|FILE.mcap",
+        help="Folder that `coopenv run` has written, or log of `record`.",
+        callback=options.existing("run or log"),
+    ),
 ]
 LAYOUT_FILE = "foxglove_layout.json"
 
@@ -308,7 +318,7 @@ def _export_layout(log: Path, out: Path) -> None:
 
 
 def import_(
-    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, such as one per car.")],
+    bags: Annotated[list[Path], options.bags(help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
     out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
     seed: options.Seed = 0,

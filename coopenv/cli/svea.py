@@ -76,7 +76,7 @@ def demo(
 
 @svea.command()
 def fake(
-    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that it belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="The fleet that it belongs to.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     seed: options.Seed = 0,
     fault: Annotated[
@@ -170,7 +170,7 @@ def gate(
 
 @svea.command()
 def health(
-    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that the car belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="The fleet that the car belongs to.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     connect: options.GateConnect = None,
     off_board: options.OffBoard = False,
@@ -243,7 +243,7 @@ def next_message(transport: "Transport", topic: str, kind: str, patience: float)
 
 @svea.command()
 def see(
-    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="The fleet that the car belongs to.")],
+    deployment: Annotated[Path, options.deployment(help="The fleet that the car belongs to.")],
     car: Annotated[str, typer.Option(help="Name of the car, as in the deployment.")],
     connect: options.GateConnect = None,
     off_board: options.OffBoard = False,
@@ -337,7 +337,7 @@ def router(
 
 @svea.command()
 def attack(
-    deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="A fleet at a stand.")],
+    deployment: Annotated[Path, options.deployment(help="A fleet at a stand.")],
     commands: Annotated[int, typer.Option(min=1, help="Messages of all kinds together, at least.")] = 10_000,
     host: Annotated[
         list[str] | None, typer.Option(help="Address of a car, whose open ports are looked for. Repeatable.")
@@ -387,7 +387,7 @@ def attack(
 class SveaRunOptions:
     """Options of `coopenv svea run`."""
 
-    config: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="Which cars, and how they are reached.")]
+    config: Annotated[Path, options.deployment(help="Which cars, and how they are reached.")]
     car: Annotated[
         str | None,
         typer.Option(help="Estimate and drive this car alone and hear the others (default: all, as an edge server)."),

@@ -13,7 +13,7 @@ from coopenv.cli import options
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
 Agent = Annotated[
     str | None,
-    typer.Option(help="Agent beside which the settings stand, as train.toml.", autocompletion=options.agents),
+    typer.Option(help="Agent beside which the settings stand, as train.toml.", **options.AGENT),
 ]
 Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
 
@@ -97,6 +97,7 @@ def train(given: TrainOptions) -> None:
 
     The agent drives with `coopenv run ENV --policy DIR`. After an interruption go on with --resume.
     """
+    options.load(given.environment, options.parse_overrides(given.overrides))  # mistakes before torch is loaded
     from dataclasses import asdict
 
     from coopenv.runs.console import Progress

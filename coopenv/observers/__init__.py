@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from coopenv.base import lazy_names
-from coopenv.observers.registry import find, observer_names, register
+from coopenv.observers.registry import find, list_observers, register
 
 if TYPE_CHECKING:
     from coopenv.estimation.poses import Coordinates
@@ -37,7 +37,7 @@ __all__ = [
     "Setup",
     "Tick",
     "find",
-    "observer_names",
+    "list_observers",
     "register",
     "run",
 ]

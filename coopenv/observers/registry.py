@@ -19,7 +19,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError, ScenarioError, error_text, shown, suggest
-from coopenv.base.installation import absolute_reference, install_command, is_reference, load_reference
+from coopenv.base.installation import absolute_reference, check_reference, install_command, is_reference, load_reference
 
 if TYPE_CHECKING:
     from coopenv.observers.contract import Factory
@@ -84,7 +84,8 @@ class RegisteredObserver(NamedTuple):
 
 
 _registered: dict[str, RegisteredObserver] = {}
-_places: dict[str, str] = {}  # import paths of those in `_registered`
+_places: dict[str, str] = {}  # import paths of those in `_registered`; empty: given as a class
+_listed: set[str] = set()  # names in `_registered` that the user has registered
 
 
 def register(name: str, factory: Factory | None = None, *, embedded: Embedded | None = None) -> None:
@@ -110,6 +111,7 @@ def register(name: str, factory: Factory | None = None, *, embedded: Embedded | 
     if name in ZOO or _registered.get(name, row) != row:
         raise CoopenvError(f"an observer named '{name}' exists already")
     _registered[name] = row
+    _listed.add(name)
 
 
 def _has_kernels(observer: Any) -> bool:
@@ -144,10 +146,8 @@ def named(observer: str | Factory) -> str:
         if replaced == row:
             return short
         again = replaced is not None and _origin(replaced) == _origin(row)  # edited and loaded once more
-        if again or short not in observer_names():
-            _registered.pop(short, None)
-            register(short, row.factory, embedded=row.embedded)
-            _places[short] = place
+        if again or (replaced is None and short not in list_observers()):
+            _registered[short], _places[short] = row, place
             return short
     raise CoopenvError(f"observers named '{name}' and '{full}' exist already: rename the class")
 
@@ -167,9 +167,9 @@ def _installed() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
-def observer_names() -> list[str]:
-    """Return every known name."""
-    return sorted({*ZOO, *_registered, *_installed()})
+def list_observers() -> list[str]:
+    """Return every known name, without classes and import paths that were merely used."""
+    return sorted({*ZOO, *_listed & _registered.keys(), *_installed()})
 
 
 def states_covariance(name: str) -> bool:
@@ -207,7 +207,9 @@ def with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory |
 
 def check_known(name: str) -> None:
     """Refuse an unknown name without loading an observer. Raises CoopenvError: unknown, with the known names."""
-    if not is_reference(name) and name not in (names := observer_names()):
+    if is_reference(name):
+        check_reference(name)
+    elif name not in {*_registered, *(names := list_observers())}:
         raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
 
 
@@ -228,7 +230,8 @@ def available_names(planar: bool | None = None) -> list[str]:
     """Return the names that can be used here; `planar`: only those for robots on a plane, or for vehicles in space."""
     both = planar is None
     strangers = {name for name, row in ZOO.items() if not (both or (row.on_a_plane if planar else row.in_space))}
-    return [name for name in observer_names() if name not in strangers and not obstacle(name)]
+    names = sorted({*list_observers(), *_registered})
+    return [name for name in names if name not in strangers and not obstacle(name)]
 
 
 def find(name: str | Factory) -> Factory:

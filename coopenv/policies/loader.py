@@ -192,7 +192,10 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
         CoopenvError: there is none, which `what` was to be.
     """
     names = [*others, *list_agents()]
-    if name in names or installation.is_reference(name) or (Path(name) / AGENT_FILE).is_file():
+    if installation.is_reference(name):
+        installation.check_reference(name)
+        return
+    if name in names or (Path(name) / AGENT_FILE).is_file():
         return
     if (Path(name) / CHECKPOINT_FILE).is_file():
         raise CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")

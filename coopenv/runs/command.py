@@ -265,6 +265,10 @@ class Results(Tabular):
             scenario = None
         return cls(metrics, whole.of_vehicles(judged).where_truth_is_known(), scenario)
 
+    def __getitem__(self, vehicle: str) -> Trajectory:
+        """Return the trajectory of one vehicle."""
+        return self.trajectory[vehicle]
+
     def columns(self) -> Columns:
         """Return the trajectory, a row per tick and vehicle."""
         return self.trajectory.columns()

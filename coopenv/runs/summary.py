@@ -16,7 +16,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
 from coopenv.base.installation import environment_id, list_agents, list_envs
-from coopenv.observers.registry import description, observer_names
+from coopenv.observers.registry import description, list_observers
 from coopenv.policies import find_agent
 from coopenv.runs import scenario_text
 from coopenv.runs.scenario_text import Listing, settings
@@ -295,7 +295,7 @@ def list_rows(kind: str) -> Sequence[Mapping[str, Any]]:
     if kind == "envs":
         return environment_rows({name: load_scenario(name) for name in list_envs()})
     if kind == "observers":
-        return [{"name": name, "about": description(name)} for name in observer_names()]
+        return [{"name": name, "about": description(name)} for name in list_observers()]
     if kind == "scenes":
         return scene_rows()
     agents = map(find_agent, list_agents())

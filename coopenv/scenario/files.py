@@ -9,7 +9,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from coopenv.base.errors import ScenarioError, shown
+from coopenv.base.errors import ScenarioError, explained, shown
 from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import TOO_DEEP, read_toml, validated
@@ -37,6 +37,7 @@ ScenarioLike = str | Path | Mapping[str, Any] | Scenario
 """What stands for a scenario: its name (`facade`, `lane:20`), its TOML file, the contents of such a file, or itself."""
 
 
+@explained
 def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
 

@@ -46,7 +46,8 @@
 
   function draw() {
     const k = Math.floor(at), parts = variants[`${observer}/${camera}`], pen = canvas.getContext("2d");
-    const width = home.clientWidth, height = Math.min(width, 460), scale = height / data.side, dots = devicePixelRatio || 1;
+    const width = home.clientWidth, above = canvas.getBoundingClientRect().top + scrollY; // controls stay on the first screen
+    const height = Math.max(280, Math.min(width, 460, innerHeight - above - 96)), scale = height / data.side, dots = devicePixelRatio || 1;
     canvas.width = width * dots;
     canvas.height = height * dots;
     canvas.style.height = `${height}px`;

@@ -70,6 +70,7 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
         repr(env) == "CooperativeLocalisationEnv('facade', vehicles=1, landmarks=14, observer='robust', horizon=40.0)"
     )
     assert "<img" not in env._repr_html_()  # nothing has begun
+    assert len(env) == 1 and len(coopenv.make_vec("lane:3", num_worlds=2)) == 6
     assert (env.unwrapped, env.agents, env.max_num_agents) == (env, [], 1)
     env.reset(seed=np.int64(3))
     assert "data:image/png;base64," in env._repr_html_()
@@ -122,6 +123,34 @@ def test_one_vehicle_of_a_trajectory(scenario: Scenario) -> None:
         whole["f3"]
 
 
+def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
+    scenario = coopenv.load_scenario(ENV)
+    assert scenario["noise.enabled"] is scenario.noise.enabled and scenario["horizon"] == scenario.horizon
+    assert pickle.loads(pickle.dumps(scenario)) == copy.deepcopy(scenario) == scenario
+    for attempt in (lambda: scenario["noise.enabledd"], lambda: scenario.noise.enabledd):
+        with pytest.raises(
+            AttributeError, match=r"^Noise has no attribute 'enabledd' \(did you mean 'enabled'\?\); keys: "
+        ):
+            attempt()
+    with pytest.raises(AttributeError, match=r"no attribute 'to_toml'; .*as data: model_dump\(\)$"):
+        scenario.to_toml()
+
+
+def test_arguments_in_the_wrong_place_are_named() -> None:
+    with pytest.raises(TypeError, match=r"^make_vec: too many positional arguments; by name: num_worlds, "):
+        coopenv.make_vec(ENV, 4)  # type: ignore[call-arg, misc]
+    with pytest.raises(TypeError, match=r"^compare: missing a required argument: 'environment'"):
+        coopenv.compare("mekf")  # type: ignore[call-arg]
+    with pytest.raises(
+        TypeError, match=r"^load_scenario: unknown argument 'horizon'; .* keys of a scenario are given in"
+    ):
+        coopenv.load_scenario(ENV, horizon=3.0)  # type: ignore[call-arg]
+
+
+def test_names_are_listed_alike() -> None:
+    assert "robust" in coopenv.list_observers() and "peek" in coopenv.list_agents() and ENV in coopenv.list_envs()
+
+
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "an id": (lambda: coopenv.parallel_env("coopenv/Facade-v0"), r"an id, for gymnasium\.make; .* is 'facade'"),
     "a title": (lambda: coopenv.parallel_env("Facade"), r"did you mean 'facade'\?"),
@@ -145,7 +174,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "an agent's number": (lambda: coopenv.parallel_env(ENV).observation_space(0), "^unknown agent 0; known"),  # type: ignore[arg-type]
     "an observer": (lambda: coopenv.run(ENV, observer="Robst"), r"did you mean 'robust'\?"),
     "a policy": (lambda: coopenv.run(ENV, policy="PEEK"), r"^unknown policy 'PEEK' \(did you mean 'peek'\?\)"),
-    "observers as text": (lambda: coopenv.compare("riccati", ENV), r"^observers: expected a list such as"),
+    "an observer's number": (lambda: coopenv.compare(3, ENV), r"^expected a name, a class or a list"),  # type: ignore[arg-type]
     "worlds": (lambda: coopenv.make_vec(ENV, num_worlds=2.0), "^num_worlds must be at least 1, whole"),  # type: ignore[arg-type]
 }
 

@@ -24,7 +24,7 @@ from coopenv.observers import (
     Setup,
     Tick,
     find,
-    observer_names,
+    list_observers,
     register,
     run,
 )
@@ -293,7 +293,7 @@ def test_registry(monkeypatch: pytest.MonkeyPatch) -> None:
         find("ricati")
     monkeypatch.setattr(registry, "_registered", {})
     register("mine", Probe)
-    assert find("mine") is Probe and "mine" in observer_names()
+    assert find("mine") is Probe and "mine" in list_observers()
     register("mine", Probe)
     for name in ("mine", "riccati"):
         with pytest.raises(CoopenvError, match="exists already"):
@@ -303,7 +303,19 @@ def test_registry(monkeypatch: pytest.MonkeyPatch) -> None:
             register(odd, Probe)  # type: ignore[arg-type]
     with pytest.raises(CoopenvError, match="'x': expected a class or function, got 3"):
         register("x", 3)
-    assert "x" not in observer_names()
+    assert "x" not in list_observers()
+
+
+def test_observers_that_were_merely_used_are_known_and_not_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for known, empty in (("_registered", {}), ("_places", {}), ("_listed", set())):
+        monkeypatch.setattr(registry, known, empty)
+    assert registry.named(Probe) == "Probe" and find("Probe") is Probe
+    assert "Probe" not in list_observers() and "Probe" in registry.available_names()
+    with pytest.raises(CoopenvError, match="unknown observer") as caught:
+        find("nosuch")
+    assert "Probe" not in str(caught.value)
+    register("Probe", Probe)
+    assert "Probe" in list_observers()
 
 
 def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,7 +329,7 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert find("theirs") is Probe
     with pytest.raises(CoopenvError, match=r"'broken'.*cannot be loaded.*no_such_module"):
         find("broken")
-    assert "broken" in observer_names() and "broken" not in registry.available_names()
+    assert "broken" in list_observers() and "broken" not in registry.available_names()
     assert "theirs" in registry.available_names() and not registry.obstacle("theirs")
     assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from coopenv.base.errors import CoopenvError
 from coopenv.observers import Coordinates, Recording, Run, Tick, belief_propagation, run, smoother
 from coopenv.observers.belief_propagation import BeliefPropagation
-from coopenv.observers.registry import ZOO, available_names, find, observer_names
+from coopenv.observers.registry import ZOO, available_names, find, list_observers
 from coopenv.observers.smoother import FixedLagSmoother, Smoother
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -84,7 +84,7 @@ def test_without_information_it_ends_in_one_line() -> None:
 
 def test_a_missing_module_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(ZOO, "factor_graph", replace(ZOO["factor_graph"], needs="no_such_module"))
-    assert "factor_graph" in observer_names() and "factor_graph" not in available_names()
+    assert "factor_graph" in list_observers() and "factor_graph" not in available_names()
     with pytest.raises(CoopenvError, match=r"'factor_graph' needs no_such_module: pip install '.\[bench\]'"):
         find("factor_graph")
 

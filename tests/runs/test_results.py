@@ -77,7 +77,8 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path) -> None:
     def said(change: str) -> str:
         return refused("figures", str(tmp_path / change))
 
-    assert "no folder of `coopenv run` (metrics.json: No such file" in said("nothing")
+    assert said("nothing").endswith(f"no such run: {tmp_path / 'nothing'}\n")
+    assert "no folder of `coopenv run` (metrics.json: No such file" in said("")
     for name, text, why in (
         ("text", "hello", "metrics.json: not JSON"),
         ("list", "[]", "not of a run, missing: environment, seed"),

@@ -147,5 +147,5 @@ def test_an_evaluation_in_python(capsys: Any) -> None:
             row["mean"], nan_ok=True
         )
     assert dict(zip(found.to_pandas().metric, found.to_pandas().unit, strict=True))["e95_m"] == "m"
-    with pytest.raises(coopenv.CoopenvError, match=r"^agents: expected a list such as \['peek'\]"):
-        coopenv.evaluate("facade", "peek")
+    with pytest.raises(coopenv.CoopenvError, match=r"^unknown agent 'nosuch'"):
+        coopenv.evaluate("facade", "nosuch")

@@ -118,6 +118,9 @@ def test_the_replay_of_the_home_page_can_be_worked(site: Path, browser: Any, siz
     page.goto((site / "index.html").as_uri())
     page.get_by_role("button", name="Pause").click()
     time = page.get_by_label("Time")
+    for part in (time, page.get_by_role("button", name="robust" if size[0] > 1000 else "Play", exact=True)):
+        box = part.bounding_box()
+        assert box["y"] + box["height"] <= size[1]  # the first screen
     time.fill(time.get_attribute("max"))
     verdict = page.locator("#replay .verdict")
     assert verdict.inner_text() == "riccati: 5 of 5 lost"

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from coopenv.base.columns import Columns, Tabular, written
 from coopenv.base.errors import CoopenvError, check_one_of, checked_seed, explained
+from coopenv.base.installation import names_of
 from coopenv.base.notebook import one_line, picture_html, terminal_html
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
@@ -21,7 +22,7 @@ from coopenv.bench.observers.judge import JudgedRun, Task, judge_all
 from coopenv.bench.observers.rows import EDGES, Leaderboard, checked_edges
 from coopenv.bench.observers.sources import ALL, RecordSource, find_source, variants_of
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import available_names, find, named, observer_names, obstacle, portable
+from coopenv.observers.registry import available_names, find, list_observers, named, obstacle, portable
 from coopenv.runs.console import Progress
 from coopenv.scenario import ScenarioLike
 
@@ -149,7 +150,7 @@ class Comparison(Leaderboard, Tabular):
 
 @explained
 def compare(
-    observers: Iterable[str | Factory] | None,
+    observers: str | Factory | Iterable[str | Factory] | None,
     environment: ScenarioLike,
     seeds: int | Iterable[int] = 5,
     *,
@@ -168,7 +169,8 @@ def compare(
     For example `coopenv.compare(["riccati", Mine], "busy_intersection_tracking", seeds=20)`.
 
     Args:
-        observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
+        observers: one or several names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all
+            that suit.
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`; recorded robots (`mrclam_1`,
             `mrclam_1_space`, ...), MCAP file or ROS bag.
         seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
@@ -228,7 +230,7 @@ class Plan:
         edges = (
             checked_edges(windows) if windows is not None else EDGES if source.windowed and not source.planar else ()
         )
-        obstacles = {} if observers is not None else {name: obstacle(name) for name in observer_names()}
+        obstacles = {} if observers is not None else {name: obstacle(name) for name in list_observers()}
         if ALL in ([variants] if isinstance(variants, str) else variants or ()):
             obstacles |= {name: source.obstacle(name) for name in source.variants}
         left_out = {name: reason for name, reason in obstacles.items() if reason}
@@ -278,10 +280,8 @@ class Plan:
 def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) -> tuple[str, ...]:
     """Return the names of observers, each once; None: of all that are meant for the vehicles of a source."""
     if observers is None:
-        return tuple(available_names(source.planar))
-    if isinstance(observers, str):
-        raise CoopenvError(f"observers: expected a list such as ['{observers}']")
-    given = list(dict.fromkeys(observers))
+        return tuple(name for name in available_names(source.planar) if name in list_observers())
+    given = list(dict.fromkeys(names_of(observers)))
     if not given:
         raise CoopenvError("observers: expected at least one name or class")
     names = [named(observer) for observer in given]

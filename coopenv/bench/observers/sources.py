@@ -232,9 +232,8 @@ def find_source(
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    if isinstance(faults, str):
-        raise CoopenvError(f"faults: expected a list such as ['{faults}']")
-    sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(faults))
+    given = [faults] if isinstance(faults, str) else faults
+    sort, added = kind_of(text), tuple(variant_of(fault) for fault in dict.fromkeys(given))
     bag = is_bag(text, topics)
     if sort is SourceKind.ENVIRONMENT and not bag and topics is None and data is None:
         scenario = load_scenario(text, overrides)

@@ -223,6 +223,13 @@ def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:
         comparison.table("v2x_delay")
 
 
+def test_one_observer_needs_no_list() -> None:
+    for one in ("dead_reckoning", DeadReckoning):
+        assert len(compare(one, "busy_intersection_tracking", 1, overrides={"horizon": 1.0}).observers) == 1  # type: ignore[arg-type]
+    both = compare("dead_reckoning, mekf", "busy_intersection_tracking", 1, overrides={"horizon": 1.0})
+    assert both.observers == ("dead_reckoning", "mekf")
+
+
 def makes() -> type:
     return type("Moved", (DeadReckoning,), {})
 
@@ -230,7 +237,8 @@ def makes() -> type:
 @pytest.mark.parametrize(
     ("observers", "options", "message"),
     [
-        ("riccati", {}, r"expected a list such as \['riccati'\]"),
+        ("riccati,nosuch", {}, "unknown observer 'nosuch'"),
+        (3, {}, "expected a name, a class or a list of them, got 3"),
         ([makes(), makes()], {}, "two observers are named 'Moved'"),
         ([3], {}, "expected a name"),
         (["riccati"], {"seeds": 0}, "at least one"),

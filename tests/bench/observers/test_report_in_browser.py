@@ -49,6 +49,8 @@ def test_the_report_draws_offline_and_fits(size: str, browser: Any, page_of_repo
     for chart in ("errors", "consistency", "cost"):
         box = page.locator(f"#{chart}-chart .main-svg").first.bounding_box()
         assert box["x"] >= 0 and box["x"] + box["width"] <= width and box["height"] > 300
+        assert page.locator(f"#{chart}-chart .ytitle").text_content().endswith(", log")
+        assert not page.locator(f"#{chart}-chart .ytick tspan").count()  # numbers without exponents, of one size
     before = page.locator("#errors-chart .scatterlayer path.js-line").first.get_attribute("d")
     page.select_option("#errors-vehicle", label="vehicle_5")
     page.select_option("#errors-variant", label="v2x_loss")

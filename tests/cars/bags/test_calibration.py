@@ -208,8 +208,9 @@ MAP = (
 )
 BAD: list[tuple[list[str], str]] = [
     (["nowhere.mcap"], "nowhere.mcap"),
-    (["nowhere.bag"], "nowhere.bag: needs the map of its topics, --map topics.toml"),
-    (["svea_crossing"], "svea_crossing: needs the map of its topics"),
+    (["nowhere.bag"], "no such bag: nowhere.bag"),
+    (["svea_crossing"], "no such bag: svea_crossing"),
+    (["empty.bag"], "empty.bag: needs the map of its topics, --map topics.toml"),
     (["LOG", "LOG"], "needs the map of its topics"),
     (["LOG", "--set", "camera.position=[0,0,0]"], "--override: needs the map"),
     (["empty.bag", "--map", "nowhere.toml"], "nowhere.toml: cannot be read"),
@@ -217,7 +218,7 @@ BAD: list[tuple[list[str], str]] = [
     (["empty.bag", "--map", "calibrated.toml"], "nowhere.toml"),
     (["empty.bag", "--map", "number.toml"], "calibration"),
     (["short.mcap"], "short.mcap: vehicle_1 has"),
-    (["nowhere.bag", "--map", "good.toml", "--set", "camera"], "--override camera: expected KEY=VALUE"),
+    (["empty.bag", "--map", "good.toml", "--set", "camera"], "--override camera: expected KEY=VALUE"),
 ]
 
 

@@ -14,7 +14,8 @@
   document.head.append(script);
 
   const narrow = window.innerWidth < 700, ink = "#222222", rule = "#D9D9D9";
-  const axis = (title, more) => ({ title: { text: title }, gridcolor: rule, zeroline: false, exponentformat: "power", ...(more?.type === "log" ? { dtick: 1 } : {}), ...more });
+  const axis = (title) => ({ title: { text: title }, gridcolor: rule, zeroline: false });
+  const logarithmic = (title, dtick) => ({ ...axis(`${title}, log`), type: "log", dtick, tickformat: "~g" });
   const layout = (x, y, more) => ({
     font: { family: "system-ui, sans-serif", size: narrow ? 11 : 13, color: ink },
     margin: { l: narrow ? 52 : 64, r: 10, t: 10, b: 44 },
@@ -55,7 +56,7 @@
           }
         });
       });
-      Plotly.react(`${kind}-chart`, [...traces, ...extra(variant, vehicle)], layout(axis("time [s]"), axis(y, { type: "log" }), {
+      Plotly.react(`${kind}-chart`, [...traces, ...extra(variant, vehicle)], layout(axis("time [s]"), logarithmic(y, 1), {
         shapes: kind === "consistency" ? [{ type: "rect", xref: "paper", x0: 0, x1: 1, y0: data.band[0], y1: data.band[1], fillcolor: "#DCEAF6", line: { width: 0 }, layer: "below" }] : [],
       }), config);
     };
@@ -72,6 +73,6 @@
     error_y: { type: "data", array: [point.se ?? 0], visible: point.se !== null, thickness: 1 },
     marker: { size: point.size, color: look(i).color, opacity: 0.75 },
     hovertemplate: `${point.observer}<br>%{x:.3g} µs, %{y:.3g} m, ${point.bytes} bytes/s<extra></extra>`,
-  })), layout(axis("time per update [µs]", { type: "log", dtick: "D2" }), axis("mean position RMSE [m]", { type: "log", dtick: "D2" })), config);
+  })), layout(logarithmic("time per update [µs]", "D2"), logarithmic("mean position RMSE [m]", "D2")), config);
   document.body.dataset.charts = "drawn";
 })();
