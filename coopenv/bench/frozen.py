@@ -246,9 +246,12 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
         errors = ["failed" if row["failure"] else in_parentheses(row["rmse_m"], row["rmse_se_m"]) for row in of]
         scenes.add_row(scene, "-" if of[0]["bound_m"] is None else number(of[0]["bound_m"], 3), *errors)
     yield scenes
-    yield from (
-        f"{row['observer']} ({row['scene']}): failed {row['failure']}" for row in result["rows"] if row["failure"]
-    )
+    failures: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in result["rows"]:
+        if row["failure"]:
+            failures.setdefault((row["observer"], row["failure"].partition(": ")[2]), []).append(row)
+    for (observer, _), rows in failures.items():
+        yield f"{observer} ({listed([row['scene'] for row in rows], 3)}): failed {rows[0]['failure']}"
     if result["remarks"]:
         yield f"Not comparable with the zoo's rows: {listed(result['remarks'], 4)}"
 

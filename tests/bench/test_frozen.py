@@ -101,3 +101,16 @@ def test_totals_are_geometric_means_with_a_limit() -> None:
     assert (total["above"], total["failed"]) == (1, 1)
     [two] = totals_of([row("a", 0.1), row("b", 0.4)])
     assert two["rmse_m"] == pytest.approx(0.2) and two["rmse_se_m"] == pytest.approx(0.2 * 0.1 * math.sqrt(2) / 2)
+
+
+def test_an_observer_that_fails_alike_in_many_scenes_has_one_line() -> None:
+    benchmark = Frozen("v1")
+    scenes = list(benchmark.zoo["scenes"])
+    late = [row(name, None, bound_m=None, failure="with seed 1000: more than 120 s (--seconds)") for name in scenes[1:]]
+    other = row(scenes[0], None, bound_m=None, failure="of vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)")
+    result = {"rows": [other, *late], "scenes": benchmark.zoo["scenes"], "remarks": []}
+    lines = [part for part in frozen.report(benchmark, result) if isinstance(part, str) and "failed " in part]
+    assert lines == [
+        f"mine ({scenes[0]}): failed of vehicle_2 at 3.000 s: KeyError: 3 (mine.py:9)",
+        f"mine ({', '.join(scenes[1:4])}, ... (29 in all)): failed with seed 1000: more than 120 s (--seconds)",
+    ]

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap import read_recording
 from coopenv.cli import main
+from coopenv.estimation.metrics import absolute_error, relative_error
 from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import Results, result_names
 from coopenv.runs.recorder import write_tum
@@ -146,7 +147,7 @@ def test_a_line_is_a_pose(tmp_path: Path) -> None:
 
 
 def test_evo_measures_the_same_errors(tmp_path: Path) -> None:
-    pytest.importorskip("evo", reason="needs evo: pip install evo")
+    pytest.importorskip("evo", reason="needs the extra 'dev'")
     from evo.core import metrics, sync
     from evo.tools import file_interface
 
@@ -160,6 +161,14 @@ def test_evo_measures_the_same_errors(tmp_path: Path) -> None:
     turn = metrics.APE(metrics.PoseRelation.rotation_angle_deg)
     turn.process_data(pair)
     np.testing.assert_allclose(turn.error, run.orientation_error[:, 0], atol=1e-5)
+    whole = absolute_error(run.position[:, 0], run.position_estimate[:, 0])
+    assert whole == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
+    poses = (run.rotation, run.position, run.rotation_estimate, run.position_estimate)
+    own = relative_error(*(part[:, 0] for part in poses), delta=7)
+    for value, relation in zip(own, ("translation_part", "rotation_angle_deg"), strict=True):
+        rpe = metrics.RPE(metrics.PoseRelation[relation], 7, metrics.Unit.frames)
+        rpe.process_data(pair)
+        assert value == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-5)
 
 
 SHORT = ["overtaking", "--set", "horizon=0.5"]
