@@ -94,6 +94,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("run busy_intersection --dtype float16", "float16"),
         ("run busy_intersection --device tpu", "tpu"),
         ("run urban_crossing --policy rando", "did you mean 'random'"),
+        ("run urban_crossing --agent rando", "did you mean 'random'"),
+        ("run urban_crossing --observer mine.py", "mine.py: name a class or function in it: mine.py:Class"),
+        (
+            "run urban_crossing --horizon 5",
+            "No such option: --horizon; a key of the scenario: --override horizon=VALUE",
+        ),
+        ("evaluate facade peek", "evaluate --help"),
         ("run busy_intersection --steady-from 50", "steady_from"),
         ("run busy_intersection --out file", "it is not a folder"),
         ("run busy_intersection --out file/below", "cannot write to"),

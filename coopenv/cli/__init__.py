@@ -230,7 +230,8 @@ def failure_status(error: BaseException) -> int:
         drop_output()
         return PIPE_CLOSED
     if isinstance(error, UsageError):
-        message = error.format_message().replace("Value error, ", "")  # a word of the library that checks values
+        words = error.format_message().replace("Value error, ", "")  # of the library that checks values
+        message = f"{words}{options.usage_hint(error)}"
     elif isinstance(error, CoopenvError):
         message = str(error)
     elif isinstance(error, OSError):

@@ -78,7 +78,7 @@ class ObserverOptions:
     ] = None
     policy: Annotated[
         str | None,
-        typer.Option("--policy", help="Agent or policy that drives in the records.", **options.POLICY),
+        typer.Option("--policy", "--agent", help="Agent or policy that drives in the records.", **options.POLICY),
     ] = None
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5
     first: First = 0

@@ -196,6 +196,7 @@ PolicyName = Annotated[
     str,
     typer.Option(
         "--policy",
+        "--agent",
         help="Policy of the driven vehicles: zero, random, the name of an agent, its folder, or where its class "
         "stands, mine.py:Mine or package.module:Mine.",
         **POLICY,
@@ -289,6 +290,19 @@ class Grouped(TyperGroup):
         for panel, rows in groups.items():
             with formatter.section(panel):
                 formatter.write_dl(rows, col_max=12)
+
+
+def usage_hint(error: Any) -> str:
+    """Return what follows the error of an option or argument that a command does not have; else an empty text."""
+    name, context = str(getattr(error, "option_name", "")), error.ctx
+    if context is None or not (name or type(error) is typer.BadParameter.__base__):
+        return ""
+    if name and "--override" in [option for parameter in context.command.params for option in parameter.opts]:
+        from coopenv.scenario import Scenario
+
+        if (key := name.lstrip("-").replace("-", "_")) in Scenario.model_fields:
+            return f"; a key of the scenario: --override {key}=VALUE"
+    return f"; see {context.command_path} --help"
 
 
 def print_help(context: typer.Context) -> None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 Agent = Annotated[
     str | None,
     typer.Option(
+        "--agent",
+        "--policy",
         help="Driver: zero, random, the name of an agent, its folder, or mine.py:Mine (default: look_ahead or peek, if "
         "made for the environment; else route_follower, where it can drive).",
         **options.POLICY,

@@ -209,6 +209,8 @@ def check_known(name: str) -> None:
     """Refuse an unknown name without loading an observer. Raises CoopenvError: unknown, with the known names."""
     if is_reference(name):
         check_reference(name)
+    elif name.endswith(".py"):
+        raise CoopenvError(f"{name}: name a class or function in it: {name}:Class")
     elif name not in {*_registered, *(names := list_observers())}:
         raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
 
