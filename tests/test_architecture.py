@@ -91,15 +91,15 @@ LINES_AND_FILES = {
     "base": (1735, 11),
     "bench": (5360, 20),
     "cars": (10795, 49),
-    "cli": (2608, 8),
+    "cli": (2611, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
     "observers": (11889, 47),
     "policies": (1885, 11),
-    "runs": (3360, 13),
+    "runs": (3365, 13),
     "scenario": (3755, 15),
     "training": (1720, 7),
-    "viz": (4800, 19),
+    "viz": (4810, 19),
     "world": (5420, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -101,6 +101,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "No such option: --horizon; a key of the scenario: --override horizon=VALUE",
         ),
         ("evaluate facade peek", "evaluate --help"),
+        ("describe peek", "expected an environment, peek is an agent"),
+        ("run robust", "expected an environment, robust is an observer"),
         ("run busy_intersection --steady-from 50", "steady_from"),
         ("run busy_intersection --out file", "it is not a folder"),
         ("run busy_intersection --out file/below", "cannot write to"),

@@ -81,6 +81,9 @@ def known_environment(name: str | None) -> str | None:
     if name is not None and name.endswith((*BAG_SUFFIXES, LOG_SUFFIX)):
         existing("log" if name.endswith(LOG_SUFFIX) else "bag")(name)
     if name is not None and not (os.path.exists(name) or is_scene(name) or is_recorded(name)):  # noqa: PTH110 (never raises)
+        for kind, names in (("agent", list_agents()), ("observer", _observer_names())):
+            if name in names:
+                raise CoopenvError(f"expected an environment, {name} is an {kind}: coopenv list, coopenv list {kind}s")
         scenario_path(name)
     return name
 

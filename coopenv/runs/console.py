@@ -5,7 +5,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
-from math import isnan, nan
+from math import inf, isnan, nan
 from time import monotonic
 from typing import Any, Self, TypeVar
 
@@ -51,7 +51,9 @@ class Progress:
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
         self._rate, self._hinted = rate, False
         self._first: tuple[float, float] | None = None
-        """When the first part was done, s, and how much it was; compiling may have made it slow."""
+        """When the first parts were done, s, and how much they were; compiling may have made them slow."""
+        self._burst = inf
+        """Until when parts count as first ones, s: processes side by side finish theirs together."""
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         self._bar = Bar(*columns, console=log, transient=True)
@@ -73,10 +75,12 @@ class Progress:
 
     def update(self, completed: float, description: str | None = None) -> None:
         """Say how much is done, and what is being done now; time counts from a first word that nothing is done yet."""
+        now = monotonic()
         if completed == 0.0 and self._completed == 0.0:
-            self._begin = monotonic()
-        if completed > 0.0 and self._first is None:
-            self._first = monotonic(), completed
+            self._begin = now
+        if completed > 0.0 and now < self._burst:
+            self._burst = min(self._burst, now + 0.25 * (now - self._begin))
+            self._first = now, completed
         self._completed, self._description = completed, description or self._description
         self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
         if not self._hinted and not isnan(left := self._left()):

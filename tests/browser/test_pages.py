@@ -122,6 +122,12 @@ def test_the_live_view_can_be_worked(
     page.get_by_role("tab", name="Vehicle").click()
     page.locator("img[src^='data:image/jpeg'], img[src^='blob:']").first.wait_for()
     page.wait_for_timeout(1500)
+    plot = page.get_by_text("NEES; dashed: 95 % if consistent")
+    assert plot.is_visible()
+    for name, shown in (("none", False), ("f2", True)):
+        page.get_by_label("Vehicle", exact=True).first.click()
+        page.get_by_role("option", name=name, exact=True).click()
+        plot.wait_for(state="visible" if shown else "hidden")
     page.get_by_role("tab", name="Show").click()
     page.get_by_text("its estimate").wait_for()
     checked(watched)

@@ -58,6 +58,20 @@ def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest
         wait_for(text, "drawing: 50 % after 30 s, about 20 s left\n")
 
 
+def test_processes_that_finish_together_are_one_part(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    with Progress(Console(file=text), "comparing", total=20) as progress:
+        for now in (59.0, 60.0):
+            clock[0] = now
+            progress.advance()
+        assert progress.line() == "comparing: 10 % after 60 s"
+        for now in (119.0, 120.0):
+            clock[0] = now
+            progress.advance()
+        assert progress.line() == "comparing: 20 % after 120 s, about 480 s left"
+
+
 def test_a_notebook_that_asks_for_colours_gets_lines(text: io.StringIO) -> None:
     with Progress(Console(file=text, force_terminal=True), "simulating"):
         wait_for(text, "simulating: ")

@@ -38,17 +38,25 @@ class Plots:
     """Charts in viser's panel."""
 
     def __init__(self, gui: Any, source: Origin) -> None:
-        """Add them, empty."""
+        """Add them, empty and hidden."""
         named = list(zip(source.terms, VEHICLE_COLOURS[:_MOST_TERMS], strict=False))
         self._terms = len(named)
         title = f"Position error [m]; dashed: {'3σ' if source.honest else 'P, a gain'}; dotted: protection level"
         self._error = _plot(gui, title, ("error", BLUE), ("3σ", GREY), ("level", VERMILION))
         title = "NEES; dashed: 95 % if consistent"
         self._nees = _plot(gui, title, ("NEES", BLUE), ("from", GREY), ("to", GREY))
+        self._parts = [self._error, self._nees]
         if named:
             self._reward = _plot(gui, "Reward terms", *named, log=False)
             words = " &nbsp; ".join(f"{swatch(colour)} {escape(name)}" for name, colour in named)
-            gui.add_html(f'<div style="font-size:12px;padding:0 14px">{words}</div>')
+            legend = gui.add_html(f'<div style="font-size:12px;padding:0 14px">{words}</div>')
+            self._parts += [self._reward, legend]
+        self.set_visible(False)
+
+    def set_visible(self, visible: bool) -> None:
+        """Show or hide them."""
+        for part in self._parts:
+            part.visible = visible
 
     def show(self, frames: Sequence[Frame], vehicle: int, rate: float) -> None:
         """Show a vehicle in some frames; `rate` is in camera ticks per second."""
@@ -241,6 +249,7 @@ class Panel:
         self._look.picked, stage = vehicle, self._stage
         self._vehicles.value = NONE_PICKED if vehicle is None else stage.short_name(stage.landmarks + vehicle)
         self._image.visible = vehicle is not None
+        self._plots.set_visible(vehicle is not None)
         if vehicle is None:
             self._vehicle_words.content = _PICK
         self._plots_at = -np.inf
