@@ -32,7 +32,7 @@ from coopenv.api.parallel_env import PlainInfos
 from coopenv.api.trainers.benchmarl import CooperativeTask
 from coopenv.runs.console import number_table
 
-ITERATIONS = 3
+ITERATIONS = 6
 """Of an experiment, beside the first."""
 
 
@@ -107,25 +107,27 @@ class OneAtATime(Batched):
         return False
 
 
-KINDS: tuple[tuple[type[Batched], int, int], ...] = ((Batched, 256, 5120), (OneAtATime, 10, 400))
-"""Class, worlds, and world steps of a minibatch."""
+KINDS: tuple[tuple[type[Batched], int, int, int], ...] = ((Batched, 256, 25, 1280), (OneAtATime, 10, 120, 400))
+"""Class, worlds, steps of each between updates, and world steps of a minibatch."""
 
 
-def costs(kind: type[Batched], worlds: int, minibatch: int, asked: argparse.Namespace, seed: int) -> np.ndarray:
+def costs(
+    kind: type[Batched], worlds: int, steps: int, minibatch: int, asked: argparse.Namespace, seed: int
+) -> np.ndarray:
     """Return CPU seconds per world step of the three parts, in the mean of an experiment's iterations, (3,)."""
     task = kind(asked.environment, {"name_or_path": asked.environment})
     task.clock = clock = Clock()
     config = ExperimentConfig.get_from_yaml()
     config.max_n_iters, config.max_n_frames = ITERATIONS + 1, None
     config.loggers, config.create_json, config.evaluation = [], False, False
-    config.on_policy_n_envs_per_worker, config.on_policy_collected_frames_per_batch = worlds, worlds * asked.steps
+    config.on_policy_n_envs_per_worker, config.on_policy_collected_frames_per_batch = worlds, worlds * steps
     config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = minibatch, asked.epochs
     model = MlpConfig(num_cells=asked.hidden, activation_class=torch.nn.Tanh, layer_class=torch.nn.Linear)
     with tempfile.TemporaryDirectory() as folder:
         config.save_folder = folder
         mappo = MappoConfig.get_from_yaml()
         Experiment(task, mappo, model, seed, config, critic_model_config=model, callbacks=[clock]).run()
-    return np.asarray(np.mean(clock.rows[1:], axis=0) / (worlds * asked.steps))
+    return np.asarray(np.mean(clock.rows[1:], axis=0) / (worlds * steps))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -133,7 +135,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mappo", description=__doc__)
     parser.add_argument("environment", nargs="?", default="open_square", metavar="ENV")
     parser.add_argument("--rounds", type=int, default=5, choices=range(2, 1000), metavar="N", help="default: 5")
-    parser.add_argument("--steps", type=int, default=100, metavar="N", help="of each world per update (default: 100)")
     parser.add_argument("--epochs", type=int, default=4, metavar="N", help="of an update (default: 4)")
     parser.add_argument("--hidden", type=int, nargs="+", default=[128, 128], metavar="N", help="default: 128 128")
     asked = parser.parse_args(arguments)
@@ -141,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     found = np.array([[costs(*kind, asked, seed) for kind in KINDS] for seed in range(asked.rounds)])
     table = number_table(["worlds"], ["steps/s", "ratio", "stepping worlds", "other collection", "updates"])
     whole = found.sum(axis=2)
-    for i, (_, worlds, _) in enumerate(KINDS):
+    for i, (_, worlds, *_) in enumerate(KINDS):
         shares = [f"{100 * share:.0f} %" for share in (found[:, i] / whole[:, i, None]).mean(axis=0)]
         rate, ratio = (mean_and_error(each) for each in (1.0 / whole[:, i], whole[:, 1] / whole[:, i]))
         table.add_row(str(worlds), "{:.0f} ± {:.0f}".format(*rate), "{:.1f} ± {:.1f}".format(*ratio), *shares)
