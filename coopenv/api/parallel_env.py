@@ -306,8 +306,8 @@ NUMBERS = ("position_error", "orientation_error", "nees", "arrived", "collided")
 class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
     """Keeps what is a number of each info, and drops the actions of vehicles that have ended.
 
-    TorchRL makes a tensor of every entry of an info, and sends actions for all agents, the dead ones included. RLlib
-    keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
+    RLlib keeps infos for whole episodes; other libraries make tensors of them, and send actions for all agents. Truth
+    is left out, so that no policy can be built on it by accident.
     """
 
     def __init__(self, env: CooperativeLocalisationEnv) -> None:
