@@ -94,13 +94,13 @@ LINES_AND_FILES = {
     "cli": (2611, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
-    "observers": (11889, 47),
+    "observers": (11865, 47),
     "policies": (1885, 11),
     "runs": (3365, 13),
     "scenario": (3755, 15),
     "training": (1720, 7),
     "viz": (4810, 19),
-    "world": (5420, 20),
+    "world": (5475, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

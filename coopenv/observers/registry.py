@@ -153,7 +153,7 @@ def named(observer: str | Factory) -> str:
 
 
 def _origin(row: RegisteredObserver) -> tuple[str, object]:
-    code = row.factory if row.embedded is None else row.embedded.estimate.func
+    code = row.factory if row.embedded is None else row.embedded.parts[0].func
     return str(getattr(code, "__module__", "")), getattr(code, "__qualname__", code)
 
 

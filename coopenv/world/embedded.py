@@ -81,7 +81,8 @@ class Embedded:
     name: str
     """By which scenarios and tables call it."""
     estimate: Any
-    """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered."""
+    """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered. Or several
+    functions, in turn (`parts`): on a GPU each is a kernel of its own, which keeps nothing else than its records."""
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
     covariance is `coopenv.world.v2x.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
@@ -108,6 +109,11 @@ class Embedded:
     fused: bool = False
     """Whether simulated worlds run it in one kernel with the simulation: faster for small observers, and compiled once
     more for it."""
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """The functions of `estimate`."""
+        return self.estimate if isinstance(self.estimate, tuple) else (self.estimate,)
 
     @property
     def starts(self) -> bool:

@@ -119,7 +119,8 @@ def probe() -> None:
 
 Function = Callable[..., None] | wp.Kernel
 Call = tuple[wp.Kernel, list[Any]]  # a kernel with its arguments
-WORLDS_PER_BLOCK = 16  # that go through a decision together, so that their state stays in the cache
+WORLDS_PER_BLOCK, BLOCK_BYTES = 16, 2**20
+"""Worlds that go through a decision together, and bytes of their state: at most, so that it stays in the cache."""
 WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between threads
 VEHICLES_PER_THREAD = 64
 """Of a world. Two threads run one world of 64, 128, 256 and 1,024 vehicles with `riccati` 1.3, 1.4, 1.6 and 1.9 times
@@ -262,7 +263,10 @@ class Launcher:
     all worlds. What vehicles do at once then comes by `by_lane` and `by_vehicle`.
     """
 
-    def __init__(self, worlds: int, device: str, precision_name: str, threads: int = 1, lanes: int = 1) -> None:
+    def __init__(
+        self, worlds: int, device: str, precision_name: str, threads: int = 1, lanes: int = 1, size: int = 1
+    ) -> None:
+        self._per_block = min(max(BLOCK_BYTES // size, 1), WORLDS_PER_BLOCK)  # a world has `size` bytes
         self._worlds, self._device, self._precision = worlds, device, precision_name
         self.lanes = lanes
         self._lane_threads = lanes if device == "cpu" else 1
@@ -310,7 +314,7 @@ class Launcher:
     def _record_decision(
         self, ticks: int, first: Call, tick: Sequence[Call], share: tuple[int, int]
     ) -> list[Callable[[], Any]]:
-        blocks = (share[1] - share[0]) // WORLDS_PER_BLOCK if self._device == "cpu" else 1
+        blocks = (share[1] - share[0]) // self._per_block if self._device == "cpu" else 1
         launches = []
         for block in _split(*share, max(1, blocks)):
             launches.append(self._record(*first, block))

@@ -6,7 +6,8 @@ simulated worlds (`Embedded.fused`) one kernel, `advance`, runs all ticks of a d
 
 A thread takes a world with all its vehicles, or every `lanes`-th vehicle of a world. The stages of `sense` are then
 launches of their own, and so is `finish`. `follow` is launched once, as what is received has been sent at earlier
-ticks; or, without a delay of the radio, level by level (`Turns`).
+ticks; or, without a delay of the radio, level by level (`Turns`). On a GPU it is a kernel for each part of a large
+observer: one for all takes minutes to compile and several kilobytes of stack per thread.
 """
 
 from functools import cache
@@ -82,22 +83,76 @@ def _sense_tick(source: Source) -> Any:
     return sense_tick
 
 
+@device_function
+def receive_messages(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+    """Let one vehicle receive."""
+    deliver(model, state, world, vehicle, now.tick)
+
+
 @cache
-def _follow_tick(observer: Embedded) -> Any:
-    """Return the Warp function of a tick of one vehicle that has been sensed: receive, estimate, send."""
-    estimate, send = observer.estimate, observer.send
+def _sending(send: Any) -> Any:
+    """Return the Warp function that ends the tick of one vehicle with a function of its observer that sends."""
 
     @device_function
-    def follow_tick(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
-        """Run the observer of one vehicle; leaders come before their followers."""
-        deliver(model, state, world, vehicle, now.tick)
-        estimate(model, state, memory, world, vehicle, now)
+    def sending(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+        """Send the estimate."""
         sample_gramian(model, state, world, vehicle, now.tick)
         broadcast_estimate(model, state, world, vehicle, now.tick)
         send(model, state, memory, world, vehicle, now.tick)
         count_bytes(model, state, world, vehicle, now.tick)
 
-    return follow_tick
+    return sending
+
+
+@cache
+def _in_turn(*functions: Any) -> Any:
+    """Return the Warp function that calls functions of one vehicle's tick in turn."""
+    if len(functions) == 1:
+        return functions[0]
+    first, others = functions[0], _in_turn(*functions[1:])
+
+    @device_function
+    def in_turn(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+        """Call the first function, then the others."""
+        first(model, state, memory, world, vehicle, now)
+        others(model, state, memory, world, vehicle, now)
+
+    return in_turn
+
+
+def _follow(observer: Embedded, p: Precision, *parts: Any) -> Any:
+    """Return the function of the kernel that runs parts of a tick."""
+    Model, State, Memory, Hold = model_struct(p), state_struct(p), observer.memory, wp.array(dtype=wp.int32)
+    follow_tick = _in_turn(*parts)
+
+    def follow(model: Model, state: State, memory: Memory, hold: Hold, turns: Turns, ends: int, first: int, lanes: int):
+        """Let every vehicle of the levels that are due receive, estimate and send. One thread per world and lane.
+
+        With `ends` the tick ends thereby.
+        """
+        world, lane = wp.tid()
+        if is_active(model, state, hold, world):
+            now = regular_tick(model, state.tick[world] + 1)
+            begin = turns.first[world, turns.due[world, 0]] + first + lane
+            for place in range(begin, turns.first[world, turns.due[world, 1]], lanes):
+                follow_tick(model, state, memory, world, turns.vehicle[world, place], now)
+            if ends == 1:
+                finish_tick(model, state, world, now.tick)
+
+    return follow
+
+
+@cache
+def follow_kernels(observer: Embedded, p: Precision, in_parts: bool) -> list[wp.Kernel]:
+    """Return the kernels that are `follow` in turn: one, or if `in_parts`, one per part in modules of their own."""
+    if not in_parts or len(observer.parts) == 1:
+        return [observer_kernels(observer, p)["follow"]]
+    parts = [(f.func.__name__, [f]) for f in observer.parts]
+    parts[0][1].insert(0, receive_messages)
+    parts[-1][1].append(_sending(observer.send))
+    of_part = {name: _follow(observer, p, *functions) for name, functions in parts}
+    modules = [module_kernels(f"{observer.name}_{name}", p, f, **observer.options) for name, f in of_part.items()]
+    return [module["follow"] for module in modules]
 
 
 def _begin(source: Source, p: Precision) -> Any:
@@ -149,22 +204,9 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
     The latter serve observers that are plug-ins (`coopenv.observers.kernel_observer`).
     """
     Model, State, Memory, Hold = model_struct(p), state_struct(p), observer.memory, wp.array(dtype=wp.int32)
-    follow_tick, estimate_pose = _follow_tick(observer), observer.estimate
-    start_vehicle, send_message = observer.start, observer.send
-
-    def follow(model: Model, state: State, memory: Memory, hold: Hold, turns: Turns, ends: int, first: int, lanes: int):
-        """Let every vehicle of the levels that are due receive, estimate and send. One thread per world and lane.
-
-        With `ends` the tick ends thereby.
-        """
-        world, lane = wp.tid()
-        if is_active(model, state, hold, world):
-            now = regular_tick(model, state.tick[world] + 1)
-            begin = turns.first[world, turns.due[world, 0]] + first + lane
-            for place in range(begin, turns.first[world, turns.due[world, 1]], lanes):
-                follow_tick(model, state, memory, world, turns.vehicle[world, place], now)
-            if ends == 1:
-                finish_tick(model, state, world, now.tick)
+    start_vehicle, send_message, estimate_pose = observer.start, observer.send, _in_turn(*observer.parts)
+    follow = _follow(observer, p, receive_messages, *observer.parts, _sending(observer.send))
+    follow = host_only(follow) if len(observer.parts) > 1 else follow
 
     def start(model: Model, state: State, memory: Memory, mask: Hold):
         """Start the observers of the worlds whose episode has just begun. One thread per world."""
@@ -225,7 +267,7 @@ def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
 def fused_kernels(source: Source, observer: Embedded, p: Precision) -> Kernels:
     """Return `begin`, and `advance`, which runs whole decisions of a source and an observer."""
     Model, State, Memory, Record = model_struct(p), state_struct(p), observer.memory, source.record(p)
-    sense_tick, follow_tick = _sense_tick(source), _follow_tick(observer)
+    sense_tick, follow_tick = _sense_tick(source), _in_turn(receive_messages, *observer.parts, _sending(observer.send))
 
     def advance(
         model: Model,

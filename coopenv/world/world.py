@@ -38,6 +38,7 @@ from coopenv.world.step import (
     SENSE,
     Kernels,
     Turns,
+    follow_kernels,
     fused_kernels,
     host_kernels,
     observer_kernels,
@@ -106,6 +107,9 @@ class World:
         self.threads = max(shares, lanes) if self.device == "cpu" else 1
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
+        self.in_parts = self.device != "cpu" and len(self.observer.parts) > 1
+        """Whether the observer's parts are kernels of their own; on the CPU that would only load a world's state more
+        often."""
         sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
         needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, {**sizes, SCRATCH: lanes})
         check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
@@ -127,7 +131,7 @@ class World:
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
-        self.launch = Launcher(worlds, self.device, dtype, shares, lanes)
+        self.launch = Launcher(worlds, self.device, dtype, shares, lanes, needed // worlds)
         self._views: dict[str, np.ndarray] = {}
 
     def _build_model(self) -> Any:
@@ -210,14 +214,14 @@ class World:
             revive = observer_kernels(self.observer, self.precision)["revive"]
             self._run(("revive", ticks), revive, memory, hold, ticks)
         sensing = self._world_kernels
-        if self.launch.lanes > 1:
+        if self.launch.lanes > 1 or (self.in_parts and self.model.radio.delay == 0):
             self._advance_in_lanes(ticks)
         elif "advance" in sensing:
             arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
             self._run(("advance", ticks), sensing["advance"], *arguments)
         else:
             decide = sensing["decide"], [self.model, PerWorld(self.state), PerWorld(self.actions), hold]
-            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), self._follow(1))
+            self.launch.decision(("advance", ticks), ticks, decide, self._sense(SENSE), *self._follow(1))
         self.check_room()
 
     def _advance_in_lanes(self, ticks: int) -> None:
@@ -226,7 +230,7 @@ class World:
         for _ in range(ticks):
             self._move()
             if self.model.radio.delay > 0:
-                self.launch.by_lane("look and follow", self._sense(LOOK), self._follow())
+                self.launch.by_lane("look and follow", self._sense(LOOK), *self._follow())
             else:
                 self.launch.by_lane("look", self._sense(LOOK))
                 self._follow_by_level()
@@ -236,15 +240,15 @@ class World:
         """Let vehicles follow, those of a large level at once; small levels are not worth the handing over."""
         self._run("levels", host_kernels(self.precision)["find_levels"], PerWorld(self.mask), PerWorld(self._turns))
         sizes = np.trim_zeros(np.diff(self._turns.first.numpy()).sum(axis=0), "b")
-        large = (sizes >= VEHICLES_PER_LEVEL * self.launch.lanes) | (self.device != "cpu")
+        large = (sizes >= VEHICLES_PER_LEVEL * self.launch.lanes) | (self.device != "cpu") | self.in_parts
         changes = np.flatnonzero(large[1:] | large[:-1]) + 1
         for first, last in pairwise([0, *changes.tolist(), len(sizes)]):
             self._set_due(first, last)
             if large[first]:
-                self.launch.by_lane("follow", self._follow())
+                self.launch.by_lane("follow", *self._follow())
             else:
-                follow, arguments = self._follow()
-                self.launch("follow in turn", follow, [*arguments, 0, 1], (1,))
+                for n, (follow, arguments) in enumerate(self._follow()):
+                    self.launch(("follow in turn", n), follow, [*arguments, 0, 1], (1,))
 
     def _set_due(self, first: int, last: int) -> None:
         """Set the levels whose vehicles follow next."""
@@ -258,10 +262,11 @@ class World:
         sense = source_kernels(self.source, self.precision)["sense"]
         return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
 
-    def _follow(self, ends: int = 0) -> Call:
-        """Return the launch of the observers; with `ends` it ends the tick."""
-        follow, state = observer_kernels(self.observer, self.precision)["follow"], PerWorld(self.state)
-        return follow, [self.model, state, self._memories, PerWorld(self.mask), PerWorld(self._turns), ends]
+    def _follow(self, ends: int = 0) -> list[Call]:
+        """Return the launches of the observers, in turn; with `ends` the last one ends the tick."""
+        *others, last = follow_kernels(self.observer, self.precision, self.in_parts)
+        given = [self.model, PerWorld(self.state), self._memories, PerWorld(self.mask), PerWorld(self._turns)]
+        return [*((follow, [*given, 0]) for follow in others), (last, [*given, ends])]
 
     def _move(self) -> None:
         """Move the truth to the next tick, in lanes."""

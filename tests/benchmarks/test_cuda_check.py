@@ -38,6 +38,14 @@ def test_every_module_has_limits(modules: dict[str, Any]) -> None:
         assert any(name in module for module in modules), name
 
 
+def test_parts_of_robust_stay_small() -> None:
+    """Bytes of PTX stand for the time to compile: 1.2 MB take 20 s."""
+    parts = [needs for name, needs in limits().items() if name.startswith("robust")]
+    assert len(parts) == 6 * len(PRECISIONS)
+    assert max(needs["stack"] for needs in parts) < 2048
+    assert max(needs["ptx_bytes"] for needs in parts) < 2_000_000
+
+
 def test_the_most_demanding_kernel_counts() -> None:
     report = """
 ptxas info    : Compiling entry function 'a' for 'sm_90'

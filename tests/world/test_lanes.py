@@ -10,6 +10,7 @@ import pytest
 from coopenv.api.engine import Engine
 from coopenv.world import launch
 from coopenv.world.launch import threads_and_lanes
+from coopenv.world.step import follow_kernels
 from coopenv.world.world import World
 from tests.helpers.builders import assert_same, reset, simulate
 from tests.world.test_nearby import street
@@ -43,6 +44,21 @@ def test_vehicles_at_once_are_vehicles_in_turn(variant: str, observer: str) -> N
     assert_same(found[0], found[1])
     assert_same(found[0], found[2])
     assert (found[0]["inbox_tick"] > 0).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["messages of earlier ticks", "messages of this tick"])
+def test_parts_of_an_observer_are_the_whole(variant: str) -> None:
+    """As on a GPU: each part of a tick is a kernel of its own, which finds all that it needs in memory."""
+    description = street(60, 64, "robust", **STREETS[variant])
+    whole, parts = (simulate(description, 1, "float32", 1) for _ in range(2))
+    parts.in_parts = True
+    for world in (whole, parts):
+        reset(world, [4])
+        for _ in range(20):
+            world.advance(6)
+    assert len(follow_kernels(whole.observer, whole.precision, True)) == 5
+    assert_same(whole.get_state(), parts.get_state())
 
 
 @pytest.mark.parametrize("name", MADE)

@@ -106,7 +106,7 @@ def transposed_by_rows(K: Any, H: Any):
 
 @wp.func
 def diagonal_by_rows(G: Any, M: Any):
-    """Return G M for 6x6 matrices of which G is zero but for its blocks of 3x3 on the diagonal, likewise."""
+    """Return G M for a 6x6 matrix G that is zero but for its blocks of 3x3 on the diagonal, likewise."""
     return wp.matrix_from_rows(
         G[0, 0] * M[0] + G[0, 1] * M[1] + G[0, 2] * M[2],
         G[1, 0] * M[0] + G[1, 1] * M[1] + G[1, 2] * M[2],
@@ -118,9 +118,22 @@ def diagonal_by_rows(G: Any, M: Any):
 
 
 @wp.func
-def recentred(left: Any, P: Any, right: Any):
-    """Return left P right^T for two matrices that are zero but for their blocks of 3x3 on the diagonal."""
-    return wp.transpose(diagonal_by_rows(right, wp.transpose(diagonal_by_rows(left, P))))
+def errors_by_rows(G: Any, M: Any):
+    """Return G M for the derivative G of `errors_transition` and a matrix M of six rows, likewise."""
+    return wp.matrix_from_rows(
+        G[0, 0] * M[0],
+        G[1, 1] * M[1],
+        G[2, 2] * M[2],
+        G[3, 0] * M[0] + G[3, 1] * M[1] + G[3, 2] * M[2] + G[3, 3] * M[3],
+        G[4, 0] * M[0] + G[4, 1] * M[1] + G[4, 2] * M[2] + G[4, 3] * M[3],
+        G[5, 0] * M[0] + G[5, 1] * M[1] + G[5, 2] * M[2] + G[5, 3] * M[3],
+    )
+
+
+@wp.func
+def recentred(G: Any, P: Any):
+    """Return G P G^T for a matrix G that is zero but for its blocks of 3x3 on the diagonal, and a symmetric P."""
+    return diagonal_by_rows(G, wp.transpose(diagonal_by_rows(G, P)))
 
 
 @wp.func

@@ -21,7 +21,7 @@ from coopenv.observers.robust.algebra import (
     recentring,
     with_noise,
 )
-from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Member, Pose, PoseEstimate, mat66d
+from coopenv.observers.robust.memory import ERRORS, SENDER_SLOTS, Anchor, Pose, PoseEstimate, mat66d
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import agent_of, entry_at, entry_count
 from coopenv.world.warp_internals import device_function, subroutine
@@ -46,18 +46,12 @@ def set_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
 
 
 @device_function
-def decorrelate(memory: Any, world: int, i: int, n: int):
-    """Set the covariances of a member's error with those of the earlier members to zero."""
-    for k in range(n):
-        set_block(memory, world, i, n, k, mat66d())
-
-
-@device_function
 def begin_belief(memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Begin the belief with the vehicle itself; the calibration states are kept without correlations."""
     memory.belief[world, i].members = memory.belief[world, i].first_sender
     for k in range(1, memory.belief[world, i].first_sender):
-        decorrelate(memory, world, i, k)
+        for j in range(k):
+            set_block(memory, world, i, k, j, mat66d())
     memory.member[world, i, 0].vehicle = i
     memory.member[world, i, 0].pose = estimate.pose
     memory.P[world, i, 0, 0] = estimate.P
@@ -92,67 +86,29 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 
 @device_function
-def is_estimated(memory: Any, world: int, i: int, k: int) -> bool:
-    """Return whether bearings correct a member; a sender is considered and keeps its reported pose."""
-    return k < memory.belief[world, i].first_sender
-
-
-@device_function
-def correct_member(memory: Any, world: int, i: int, k: int):
-    """Apply an estimated member's correction, and set `recentring`, of errors about its new pose by those before."""
-    correction = memory.scratch[world, i, k].correction
-    G = wp.identity(6, wp.float64)
-    if k == ERRORS and memory.belief[world, i].first_sender > ERRORS:
-        memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
-        memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
-    else:
-        apply_error(memory, world, i, k, correction)
-        G = recentring(correction)
-    memory.scratch[world, i, k].recentring = G
+def recentre(memory: Any, world: int, i: int, n: int, G: Any):
+    """Recentre the covariance of a member's error about its moved pose, see `recentring`."""
+    for k in range(memory.belief[world, i].members):
+        if k != n:
+            set_block(memory, world, i, n, k, diagonal_by_rows(G, memory.P[world, i, n, k]))
+    memory.P[world, i, n, n] = symmetric_part(recentred(G, memory.P[world, i, n, n]))
 
 
 @subroutine
 def apply_corrections(memory: Any, world: int, i: int):
-    """Apply the corrections of all estimated members, and recentre the covariance about the new poses."""
-    for k in range(memory.belief[world, i].members):
-        estimated = is_estimated(memory, world, i, k)
-        if estimated:
-            correct_member(memory, world, i, k)
-        for j in range(k + 1):
-            block = memory.P[world, i, k, j]
-            if estimated and is_estimated(memory, world, i, j):
-                block = recentred(memory.scratch[world, i, k].recentring, block, memory.scratch[world, i, j].recentring)
-                if k == j:
-                    block = symmetric_part(block)
-            elif estimated:
-                block = diagonal_by_rows(memory.scratch[world, i, k].recentring, block)
-            elif is_estimated(memory, world, i, j):
-                block = wp.transpose(diagonal_by_rows(memory.scratch[world, i, j].recentring, wp.transpose(block)))
-            else:
-                continue
-            set_block(memory, world, i, k, j, block)
+    """Apply the corrections of all estimated members, and recentre the covariance about the new poses.
 
-
-@device_function
-def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
-    """Subtract a block from the covariance at (k, j), and its transpose at (j, k)."""
-    left = memory.P[world, i, k, j] - block
-    if k == j:
-        left = symmetric_part(left)
-    set_block(memory, world, i, k, j, left)
-
-
-@device_function
-def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: Any):
-    """Add a member whose error is independent of the other members' errors; there must be room. Nothing else is set."""
-    n = memory.belief[world, i].members
-    decorrelate(memory, world, i, n)
-    memory.P[world, i, n, n] = P
-    member = Member()
-    member.vehicle = vehicle
-    member.pose = pose
-    memory.member[world, i, n] = member
-    memory.belief[world, i].members = n + 1
+    Senders are considered: they keep their reported poses.
+    """
+    for k in range(memory.belief[world, i].first_sender):
+        correction = memory.scratch[world, i, k].correction
+        if k == ERRORS:
+            memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
+            memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
+        else:
+            apply_error(memory, world, i, k, correction)
+            memory.scratch[world, i, k].recentring = recentring(correction)
+            recentre(memory, world, i, k, memory.scratch[world, i, k].recentring)
 
 
 @device_function
@@ -213,15 +169,9 @@ def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> in
 
 
 @device_function
-def sender_capacity(memory: Any) -> int:
-    """Return how many other vehicles there is room for in a belief."""
-    return memory.member.shape[2] - 1 - MOUNTING
-
-
-@device_function
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
-    if memory.belief[world, i].members - memory.belief[world, i].first_sender < sender_capacity(memory):
+    if memory.belief[world, i].members - memory.belief[world, i].first_sender < SENDER_SLOTS:
         return True
     n = longest_unseen(model, memory, world, i, tick)
     if n > 0:

@@ -4,9 +4,10 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
-from coopenv.observers.robust.belief import apply_corrections, is_estimated, subtract_block
+from coopenv.observers.robust.belief import apply_corrections, set_block
 from coopenv.observers.robust.measurements import innovation_cross_covariance, innovation_weight, linearise, project
 from coopenv.observers.robust.memory import DERIVATIVES, BearingFrame, mat66d, vec6d
 from coopenv.world.warp_internals import device_function, subroutine
@@ -26,22 +27,22 @@ def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share:
 
     Considered members stay.
     """
-    for k in range(memory.belief[world, i].members):
-        if is_estimated(memory, world, i, k):
-            correction = share * memory.scratch[world, i, k].correction
-            memory.scratch[world, i, k].last_correction = correction
-            memory.scratch[world, i, k].recentring = recentring(correction)
-            memory.member[world, i, k].pose = displaced(memory.scratch[world, i, k].pose, correction)
+    estimated = memory.belief[world, i].first_sender
+    for k in range(estimated):
+        correction = share * memory.scratch[world, i, k].correction
+        memory.scratch[world, i, k].last_correction = correction
+        memory.scratch[world, i, k].recentring = recentring(correction)
+        memory.member[world, i, k].pose = displaced(memory.scratch[world, i, k].pose, correction)
     for n in range(frame.bearings):
         if memory.measurement[world, i, n].fits != 0:
             linearise(frame, memory, world, i, n)
             for part in range(DERIVATIVES):
                 member = memory.derivative[world, i, n, part].member
-                if member >= 0 and is_estimated(memory, world, i, wp.max(member, 0)):
-                    H = by_rows(
-                        memory.derivative[world, i, n, part].jacobian, memory.scratch[world, i, member].recentring
+                if member >= 0 and member < estimated:
+                    G = memory.scratch[world, i, member].recentring
+                    memory.derivative[world, i, n, part].jacobian = by_rows(
+                        memory.derivative[world, i, n, part].jacobian, G
                     )
-                    memory.derivative[world, i, n, part].jacobian = H
 
 
 @device_function
@@ -95,23 +96,24 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                 for k in range(members):
                     correction = memory.scratch[world, i, k].correction + weighted * memory.projection[world, i, n, k]
                     memory.scratch[world, i, k].correction = correction
-    for k in range(members):
-        if not is_estimated(memory, world, i, k):
-            memory.scratch[world, i, k].correction = vec6d()
+    for k in range(memory.belief[world, i].first_sender, members):
+        memory.scratch[world, i, k].correction = vec6d()
 
 
 @subroutine
 def update_covariance(memory: Any, world: int, i: int, bearings: int):
     """Update the covariance by the bearings that fit; that of considered errors stays."""
-    for k in range(memory.belief[world, i].members):
-        for j in range(k + 1):
-            if is_estimated(memory, world, i, k) or is_estimated(memory, world, i, j):
-                block = mat66d()
-                for n in range(bearings):
-                    if memory.measurement[world, i, n].fits == 1:
-                        K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
-                        block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
-                subtract_block(memory, world, i, k, j, block)
+    for k in range(memory.belief[world, i].first_sender):
+        for j in range(k, memory.belief[world, i].members):
+            block = mat66d()
+            for n in range(bearings):
+                if memory.measurement[world, i, n].fits == 1:
+                    K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
+                    block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
+            block = memory.P[world, i, k, j] - block
+            if k == j:
+                block = symmetric_part(block)
+            set_block(memory, world, i, k, j, block)
 
 
 @device_function
@@ -122,13 +124,10 @@ def turn_of_sight(memory: Any, world: int, i: int, bearings: int, share: Any, la
         if memory.measurement[world, i, n].fits == 1:
             distance = wp.min(distance, memory.measurement[world, i, n].distance)
     turn = wp.float64(0.0)
-    for k in range(memory.belief[world, i].members):
-        if is_estimated(memory, world, i, k):
-            further = (
-                share * memory.scratch[world, i, k].correction - last * memory.scratch[world, i, k].last_correction
-            )
-            size = wp.abs(further)
-            turn = wp.max(turn, wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance))
+    for k in range(memory.belief[world, i].first_sender):
+        further = share * memory.scratch[world, i, k].correction - last * memory.scratch[world, i, k].last_correction
+        size = wp.abs(further)
+        turn = wp.max(turn, wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance))
     return turn
 
 

@@ -16,10 +16,25 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen, set_block
-from coopenv.observers.robust.correlations import correlated_tick, is_positive, rank, regress
+from coopenv.observers.robust.belief import (
+    apply_corrections,
+    index_of,
+    insert_member,
+    make_room,
+    mark_seen,
+    recentre,
+    set_block,
+)
+from coopenv.observers.robust.correlations import (
+    by_clocks,
+    correlated_tick,
+    is_positive,
+    rank,
+    regress,
+    stated_covariance,
+)
 from coopenv.observers.robust.measurements import is_received
-from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec6d
+from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
 from coopenv.observers.robust.source_monitor import add_to_drift
@@ -27,16 +42,6 @@ from coopenv.observers.robust.sources import clear_source, is_excluded, take_slo
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.warp_internals import device_function, subroutine
-
-
-@device_function
-def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
-    """Return the covariance, 6x6, of member n's error by clock offsets; zero before its velocity is known."""
-    std = wp.float64(model.fault[i].clock)
-    v = memory.member[world, i, n].clock_v
-    P = mat66d()
-    P[3:, 3:] = (wp.float64(2.0) * std * std) * wp.outer(v, v)
-    return P
 
 
 @device_function
@@ -68,10 +73,8 @@ def set_row(memory: Any, world: int, i: int, n: int):
 @subroutine
 def set_to_report(model: Any, memory: Any, world: int, i: int, n: int):
     """Set a member to the pose and covariance of its report, without its earlier estimate."""
-    report = memory.member[world, i, n].report
-    after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
-    memory.member[world, i, n].pose = report.pose
-    regress(model, memory, world, i, n, after, False)
+    memory.member[world, i, n].pose = memory.member[world, i, n].report.pose
+    regress(model, memory, world, i, n, False)
     set_row(memory, world, i, n)
 
 
@@ -80,29 +83,29 @@ def add_member(model: Any, state: Any, memory: Any, world: int, i: int, sender: 
     """Add a sender that is new to the belief, if there is room."""
     if make_room(model, memory, world, i, tick):
         n = memory.belief[world, i].members
-        box = box_of(model, state, world, i, sender)
-        report = memory.inbox[world, i, box]
-        append_member(memory, world, i, sender, report.pose, mat66d(report.P))
         q = take_slot(memory, world, i, model.landmarks + sender, tick, False, model.camera_period)
-        memory.member[world, i, n].source = q
-        memory.member[world, i, n].box = box
         if not is_excluded(memory, world, i, q):
             clear_source(memory, world, i, q)
-        memory.member[world, i, n].report = report
-        memory.member[world, i, n].seen_tick = tick
-        known = includes(memory.belief[world, i].depends_on, sender)
-        memory.member[world, i, n].correlation_unknown = wp.where(known, 1, 0)
+        member = Member()
+        member.vehicle = sender
+        member.source = q
+        member.box = box_of(model, state, world, i, sender)
+        member.report = memory.inbox[world, i, member.box]
+        member.seen_tick = tick
+        member.correlation_unknown = wp.where(includes(memory.belief[world, i].depends_on, sender), 1, 0)
+        insert_member(memory, world, i, n)
+        memory.member[world, i, n] = member
         set_to_report(model, memory, world, i, n)
-        depends_on = report.depends_on | bit_of(sender)
+        depends_on = member.report.depends_on | bit_of(sender)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
 @subroutine
-def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
-    """Correct the own pose by a sender's increment d (covariance N); `scratch.column` holds cov(d, y) for errors y."""
+def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any):
+    """Correct the own pose by a sender's increment d. `scratch.column` holds cov(d, y) for errors y, `known` cov(d)."""
     members = memory.belief[world, i].members
     first_sender = memory.belief[world, i].first_sender
-    inverse = algebra.inverse6(N)
+    inverse = algebra.inverse6(memory.known[world, i, 0].covariance)
     for k in range(first_sender):
         gain = wp.transpose(memory.scratch[world, i, k].column) * inverse
         memory.scratch[world, i, k].correction = gain * d
@@ -126,34 +129,38 @@ def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, known: An
 
 
 @subroutine
-def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, unknown: Any):
-    """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
+def set_increment(memory: Any, world: int, i: int, n: int):
+    """Set a member to the pose of its new report, and return the increment from the old pose, (6,)."""
     report = memory.member[world, i, n].report
-    after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     shift = algebra.left_error(memory.member[world, i, n].pose, report.pose)
     G = algebra.recentring(shift)
-    members = memory.belief[world, i].members
-    for k in range(members):
-        if k != n:
-            set_block(memory, world, i, n, k, algebra.diagonal_by_rows(G, memory.P[world, i, n, k]))
-    d = G * shift
-    before = algebra.recentred(G, memory.P[world, i, n, n], G)
-    memory.P[world, i, n, n] = before
+    recentre(memory, world, i, n, G)
     memory.member[world, i, n].pose = report.pose
-    more = regress(model, memory, world, i, n, after, True)
-    for k in range(members):
+    return G * shift
+
+
+@subroutine
+def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: bool, unknown: Any):
+    """Set a member to its new report, and correct the own pose by the increment if `fusing`."""
+    d = set_increment(memory, world, i, n)
+    regress(model, memory, world, i, n, True)
+    for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].column = memory.P[world, i, n, k] - memory.scratch[world, i, k].row
-    memory.scratch[world, i, n].column = -more
-    set_row(memory, world, i, n)
-    N = before - after + more
+    after = stated_covariance(model, memory, world, i, n)
+    memory.scratch[world, i, n].column = after - memory.scratch[world, i, n].row
+    before = mat66d(memory.P[world, i, n, n])
+    N = before - after - memory.scratch[world, i, n].column
     unknown = unknown + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
     monitor_increment(memory, world, i, n, d, block3(N, 3, 3), unknown)
     N = N + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
+    memory.known[world, i, 0].covariance = N
     variance = algebra.position_variance(before)
-    reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
+    set_row(memory, world, i, n)
+    away = memory.member[world, i, n].pose.p - memory.member[world, i, 0].pose.p
+    reach = wp.float64(constants.LINEAR_ANGLE) * wp.length(away)
     if fusing and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
         if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.POSE_GATE):
-            apply_sender_increment(memory, world, i, n, d, N)
+            apply_sender_increment(memory, world, i, n, d)
 
 
 @device_function
@@ -252,13 +259,11 @@ def should_follow_pending(model: Any, state: Any, memory: Any, world: int, i: in
     for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if k != n:
             if is_pending(model, state, memory, world, i, k, tick):
-                other = memory.member[world, i, k].vehicle
-                if (
-                    correlated_tick(memory, world, i, memory.member[world, i, n].box, other)
-                    > memory.member[world, i, k].report.tick
-                ):
-                    return True
-                if correlated_tick(memory, world, i, memory.member[world, i, k].box, sender) == before:
+                own = correlated_tick(
+                    memory, world, i, memory.member[world, i, n].box, memory.member[world, i, k].vehicle
+                )
+                other = correlated_tick(memory, world, i, memory.member[world, i, k].box, sender)
+                if own > memory.member[world, i, k].report.tick or other == before:
                     return True
     return False
 

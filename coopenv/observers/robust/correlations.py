@@ -19,17 +19,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import (
-    Correlation,
-    Pose,
-    Regressor,
-    SenderReport,
-    fill,
-    fill_rows,
-    mat66d,
-    mat66f,
-    vec3d,
-)
+from coopenv.observers.robust.memory import Correlation, Pose, SenderReport, fill, fill_rows, mat66d, mat66f, vec3d
 from coopenv.observers.robust.messages import dependents, depends_on_own, marker_jacobian, own_report
 from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
@@ -222,12 +212,12 @@ def is_near(model: Any, tick: int, other: int) -> bool:
 
 
 @device_function
-def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, use_reverse: bool):
-    """Return (is known, is broadcast, matrix) of the correlation of the new error of member n with that of member k.
+def set_correlation(model: Any, memory: Any, world: int, i: int, n: int, k: int, use_reverse: bool, a: int):
+    """Set the covariance of regressor a to the correlation of the new error of member n with that of member k.
 
     The source is a message of n, or a message of k if `use_reverse` is set. Without either, it is the product of both
     correlations with the third vehicle on which n and k depend most; this value is an approximation. Correlations of
-    reports too far apart in time are not used.
+    reports too far apart in time are not used. Return whether it is known, and whether it is broadcast.
     """
     sender = memory.member[world, i, n].vehicle
     other = memory.member[world, i, k].vehicle
@@ -235,52 +225,46 @@ def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, 
     other_box = memory.member[world, i, k].box
     c = correlation_index(memory, world, i, box, other)
     if c >= 0:
-        near = is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, k].report.tick)
-        return near, True, matrix_of(memory, world, i, box, c)
+        memory.known[world, i, a].covariance = matrix_of(memory, world, i, box, c)
+        return is_near(model, memory.correlation[world, i, box, c].tick, memory.member[world, i, k].report.tick), True
     c = correlation_index(memory, world, i, other_box, sender)
     if c >= 0:
+        memory.known[world, i, a].covariance = wp.transpose(matrix_of(memory, world, i, other_box, c))
         near = is_near(model, memory.correlation[world, i, other_box, c].tick, memory.member[world, i, n].report.tick)
-        return use_reverse and near, True, wp.transpose(matrix_of(memory, world, i, other_box, c))
+        return use_reverse and near, True
     most = wp.float64(-1.0)
-    shared = mat66d()
-    for a in range(memory.correlation.shape[3]):
-        third = memory.correlation[world, i, box, a].vehicle
+    for c in range(memory.correlation.shape[3]):
+        third = memory.correlation[world, i, box, c].vehicle
         if third >= 0:
             b = correlation_index(memory, world, i, other_box, third)
             if b >= 0:
                 tick = memory.correlation[world, i, other_box, b].tick
-                if is_near(model, memory.correlation[world, i, box, a].tick, tick):
-                    X = matrix_of(memory, world, i, box, a) * wp.transpose(matrix_of(memory, world, i, other_box, b))
+                if is_near(model, memory.correlation[world, i, box, c].tick, tick):
+                    X = matrix_of(memory, world, i, box, c) * wp.transpose(matrix_of(memory, world, i, other_box, b))
                     size = wp.ddot(X, X)
                     if size > most:
                         most = size
-                        shared = X
-    return most >= wp.float64(0.0), False, shared
+                        memory.known[world, i, a].covariance = X
+    return most >= wp.float64(0.0), False
 
 
 @subroutine
 def note_correlations(
-    model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool, count: int, broadcast: bool
-):
-    """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors."""
-    A = factor(after)
+    model: Any, memory: Any, world: int, i: int, n: int, received: bool, count: int, broadcast: bool
+) -> int:
+    """Store broadcast (or approximate) correlations of member n's new error; return the number of regressors.
+
+    `scratch.column` of n is the Cholesky factor of its new covariance.
+    """
     for k in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
         if k != n:
-            known, is_broadcast, X = correlation_of(model, memory, world, i, n, k, not received)
+            known, is_broadcast = set_correlation(model, memory, world, i, n, k, not received, count)
             if known and is_broadcast == broadcast:
-                covariance = A * X * wp.transpose(factor(memory.P[world, i, k, k]))
-                memory.known[world, i, count] = Regressor(k, covariance, mat66d())
+                X = memory.scratch[world, i, n].column * memory.known[world, i, count].covariance
+                memory.known[world, i, count].covariance = X * wp.transpose(factor(memory.P[world, i, k, k]))
+                memory.known[world, i, count].member = k
                 count += 1
     return count
-
-
-@device_function
-def regressed(memory: Any, world: int, i: int, count: int, k: int):
-    """Return the covariance L cov(x, y) with the error y of member k."""
-    block = mat66d()
-    for a in range(count):
-        block = block + memory.known[world, i, a].coefficient * memory.P[world, i, memory.known[world, i, a].member, k]
-    return block
 
 
 @wp.func
@@ -291,6 +275,29 @@ def is_positive(P: Any) -> bool:
         if not X[k, k] * X[k, k] * P[k, k] < wp.float64(1.0 / constants.ROUNDING):
             return False
     return wp.min(wp.get_diag(P)) > wp.float64(0.0)
+
+
+@device_function
+def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
+    """Return the covariance, 6x6, of member n's error by clock offsets; zero before its velocity is known."""
+    std = wp.float64(model.fault[i].clock)
+    v = memory.member[world, i, n].clock_v
+    P = mat66d()
+    P[3:, 3:] = (wp.float64(2.0) * std * std) * wp.outer(v, v)
+    return P
+
+
+@device_function
+def stated_covariance(model: Any, memory: Any, world: int, i: int, n: int):
+    """Return the covariance, 6x6, that member n's report states, and that by clock offsets."""
+    return mat66d(memory.member[world, i, n].report.P) + by_clocks(model, memory, world, i, n)
+
+
+@subroutine
+def leaves_enough(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether the residual in `scratch.column` of n is above a share of the stated covariance."""
+    share = wp.float64(constants.LEAST_SHARE)
+    return is_positive(memory.scratch[world, i, n].column - share * stated_covariance(model, memory, world, i, n))
 
 
 @wp.func
@@ -311,6 +318,13 @@ def excess(left: Any, after: Any):
     return more
 
 
+@subroutine
+def set_own_row(model: Any, memory: Any, world: int, i: int, n: int, larger: Any):
+    """Set `scratch.row` of n to its stated covariance, with the inflation that the residual needs, times `larger`."""
+    after = stated_covariance(model, memory, world, i, n)
+    memory.scratch[world, i, n].row = larger * (after + excess(memory.scratch[world, i, n].column, after))
+
+
 @device_function
 def dependence_inflation(memory: Any, world: int, i: int, n: int):
     """Return the share by which member n's covariance is inflated for its dependence on other vehicles.
@@ -326,24 +340,32 @@ def dependence_inflation(memory: Any, world: int, i: int, n: int):
 
 
 @subroutine
-def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
-    """Set the regression coefficients L; return the residual covariance.
-
-    The block Cholesky factor of the regressors' covariance has its inverse on the diagonal.
-    """
+def factorise(memory: Any, world: int, i: int, count: int):
+    """Set `factor` to the block Cholesky factor of the regressors' covariance, with its inverse on the diagonal."""
     for a in range(count):
-        Y = mat66d(memory.known[world, i, a].covariance)
         for b in range(a + 1):
             X = mat66d(memory.P[world, i, memory.known[world, i, a].member, memory.known[world, i, b].member])
-            if a == b:
-                X = algebra.inflated(X, wp.float64(constants.SINGLE))
             for c in range(b):
                 X = X - memory.factor[world, i, a, c] * wp.transpose(memory.factor[world, i, b, c])
             if a == b:
-                memory.factor[world, i, a, a] = algebra.inverse_factor(X)
+                variances = wp.get_diag(
+                    memory.P[world, i, memory.known[world, i, a].member, memory.known[world, i, a].member]
+                )
+                memory.factor[world, i, a, a] = algebra.inverse_factor(
+                    X + wp.diag(wp.float64(constants.SINGLE) * variances)
+                )
             else:
                 memory.factor[world, i, a, b] = X * wp.transpose(memory.factor[world, i, b, b])
-                Y = Y - memory.known[world, i, b].coefficient * wp.transpose(memory.factor[world, i, a, b])
+
+
+@subroutine
+def solve_for(model: Any, memory: Any, world: int, i: int, n: int, count: int):
+    """Set the regression coefficients L, `scratch.row` to L cov(x, y), and `scratch.column` of n to the residual."""
+    factorise(memory, world, i, count)
+    for a in range(count):
+        Y = mat66d(memory.known[world, i, a].covariance)
+        for b in range(a):
+            Y = Y - memory.known[world, i, b].coefficient * wp.transpose(memory.factor[world, i, a, b])
         memory.known[world, i, a].coefficient = Y * wp.transpose(memory.factor[world, i, a, a])
     for back in range(count):
         a = count - 1 - back
@@ -351,35 +373,40 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
         for c in range(a + 1, count):
             Y = Y - memory.known[world, i, c].coefficient * memory.factor[world, i, c, a]
         memory.known[world, i, a].coefficient = Y * memory.factor[world, i, a, a]
-    left = mat66d(after)
+    for k in range(memory.belief[world, i].members):
+        row = mat66d()
+        for a in range(count):
+            row = row + memory.known[world, i, a].coefficient * memory.P[world, i, memory.known[world, i, a].member, k]
+        memory.scratch[world, i, k].row = row
+    left = stated_covariance(model, memory, world, i, n)
     for a in range(count):
-        block = regressed(memory, world, i, count, memory.known[world, i, a].member)
-        left = left - block * wp.transpose(memory.known[world, i, a].coefficient)
-    return left
+        row = memory.scratch[world, i, memory.known[world, i, a].member].row
+        left = left - row * wp.transpose(memory.known[world, i, a].coefficient)
+    memory.scratch[world, i, n].column = left
 
 
 @subroutine
-def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, received: bool):
-    """Set `scratch.row` to the covariance of member n's new error with all errors; return the inflation of `after`.
+def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool):
+    """Set `scratch.row` to the covariance of member n's new error with all errors.
 
-    `after` is the reported covariance; both are 6x6, rad and m. Known are the covariance with the previous error of n,
-    if its report was `received` before, the broadcast ones, and approximate ones. Approximate ones that contradict the
-    others are not used.
+    Its own is what its report states, inflated if needed. Known are the covariance with the previous error of n, if its
+    report was `received` before, the broadcast ones, and approximate ones. Approximate ones that contradict the others
+    are not used.
     """
-    count = wp.where(received, 1, 0)
-    memory.known[world, i, 0] = Regressor(n, after, mat66d())
-    sure = note_correlations(model, memory, world, i, n, after, received, count, True)
-    count = note_correlations(model, memory, world, i, n, after, received, sure, False)
-    left = solve_for(memory, world, i, after, count)
-    if sure > 0 and sure < count and not is_positive(left - wp.float64(constants.LEAST_SHARE) * after):
+    first = wp.where(received, 1, 0)
+    after = stated_covariance(model, memory, world, i, n)
+    memory.known[world, i, 0].member = n
+    memory.known[world, i, 0].covariance = after
+    memory.scratch[world, i, n].column = factor(after)
+    sure = note_correlations(model, memory, world, i, n, received, first, True)
+    count = note_correlations(model, memory, world, i, n, received, sure, False)
+    solve_for(model, memory, world, i, n, count)
+    if sure > 0 and sure < count and not leaves_enough(model, memory, world, i, n):
         count = sure
-        left = solve_for(memory, world, i, after, count)
-    larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
-    more = larger * (after + excess(left, after)) - after
-    growth = wp.sqrt(larger)
-    if count > wp.where(received, 1, 0):
+        solve_for(model, memory, world, i, n, count)
+    if count > first:
         memory.member[world, i, n].correlation_unknown = 0
+    larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
     for k in range(memory.belief[world, i].members):
-        memory.scratch[world, i, k].row = growth * regressed(memory, world, i, count, k)
-    memory.scratch[world, i, n].row = after + more
-    return more
+        memory.scratch[world, i, k].row = wp.sqrt(larger) * memory.scratch[world, i, k].row
+    set_own_row(model, memory, world, i, n, larger)

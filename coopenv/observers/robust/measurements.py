@@ -285,9 +285,8 @@ def linearise(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     memory.measurement[world, i, n].residual = T * bearing
     memory.measurement[world, i, n].distance = distance
     remainder = linearisation_variance(memory, world, i, member, turn, u, distance, frame.period)
-    memory.measurement[world, i, n].noise = (
-        frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
-    )
+    variance = frame.variance + memory.measurement[world, i, n].variance * inverse * inverse + remainder
+    memory.measurement[world, i, n].noise = variance
     return wp.dot(u, bearing) > wp.float64(0.0)
 
 

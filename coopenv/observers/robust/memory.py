@@ -12,17 +12,7 @@ import warp as wp
 from coopenv.base.format import LARGEST
 from coopenv.estimation.poses import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, STEPS
-from coopenv.world.state import (
-    COVARIANCE,
-    FLAG,
-    LEAST_EIGENVALUE,
-    ROTATION,
-    TICK,
-    Rule,
-    array,
-    numbers,
-    whole,
-)
+from coopenv.world.state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, array, numbers, whole
 from coopenv.world.warp_internals import device_function
 
 vec2d: Any = wp.vec2d
@@ -141,6 +131,7 @@ class Search:
     """A search for the pose."""
 
     active: wp.int32
+    found: wp.int32  # whether at this tick
     prior: PoseEstimate  # carried on by odometry
     hypotheses: wp.int32  # how many
     tracked_time: wp.float64  # s for which hypotheses have been tracked
@@ -245,7 +236,7 @@ class RobustMemory:
     source: array("WNQ", Source)
     sensitivity: array("WNQO", mat63d)  # of the own error and the calibration errors by the fault of a source
     drift_effect: array("WNTO", vec6d)  # the errors themselves, if a sender's `drift` is a fault
-    information: array("WNQQ", mat33d)  # on faults, below the diagonal
+    information: array("WNQU", mat33d)  # on a fault; and on it and that of a sender, by slot
     fault_mixture: array("WN", mat66d)  # what faults that are not certain add to the covariance of the own pose
     effect: array("WLXQ", mat23d)  # of an innovation by the fault of a source
     weighted_effect: array("WLXQ", mat23d)  # times the weight of the bearing
@@ -277,6 +268,7 @@ ROBUST_SIZES = {
     "C": MAX_CORRELATIONS,
     "Q": SOURCES,
     "T": SENDER_SLOTS,
+    "U": 1 + SENDER_SLOTS,
     "O": 1 + MOUNTING,
 }
 """Besides the hypotheses of one frame there is the prior."""
@@ -348,7 +340,7 @@ def robust_rules() -> dict[str, Rule]:
     """Return the rules of a saved memory by field, see `coopenv.world.state`."""
     members = ROBUST_SIZES["K"]
     flags = (
-        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
+        "search.active search.found outbox.valid inbox.valid belief.has_sample member.has_twist source.excluded "
         "member.correlation_unknown member.report.valid belief.gate_disabled outbox.carries_correlations "
         "inbox.carries_correlations member.report.carries_correlations"
     )

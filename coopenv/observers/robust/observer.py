@@ -45,12 +45,7 @@ from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.correlated_fusion import fuse_messages
 from coopenv.observers.robust.correlations import clear_broadcasts, receive_broadcast, send_broadcast
 from coopenv.observers.robust.fault_hypotheses import detect_and_exclude, test_excluded
-from coopenv.observers.robust.measurements import (
-    RESECTION,
-    TRACKING,
-    innovation_squared,
-    set_bearing_measurements,
-)
+from coopenv.observers.robust.measurements import RESECTION, TRACKING, innovation_squared, set_bearing_measurements
 from coopenv.observers.robust.memory import (
     ROBUST_SIZES,
     BearingFrame,
@@ -158,19 +153,13 @@ def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now
     if missed >= wp.float64(constants.FOUND_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].healthy_time = healthy
-    if memory.belief[world, i].gate_disabled_time > wp.float64(constants.LONG_TIME) and missed > wp.float64(
-        constants.LOST_SHARE
-    ):
+    long = memory.belief[world, i].gate_disabled_time > wp.float64(constants.LONG_TIME)
+    if long and missed > wp.float64(constants.LOST_SHARE):
         declare_lost(model, memory, world, i, now.tick)
     elif healthy > wp.float64(constants.MEAN_TIME) and is_valid(own_estimate(memory, world, i)):
         noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
-        set_anchor(
-            memory,
-            world,
-            i,
-            with_noise(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0], noise),
-            now.tick,
-        )
+        P = with_noise(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0], noise)
+        set_anchor(memory, world, i, P, now.tick)
 
 
 @device_function
@@ -246,9 +235,6 @@ def resect(frame: BearingFrame, memory: Any, world: int, i: int) -> bool:
     return True
 
 
-ESTIMATING, SEARCHING, FOUND = 0, 1, 2  # status of the own pose; found: by the search, at this tick
-
-
 @subroutine
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEstimate):
     """Restart the belief with an own pose, which may depend on every vehicle that can be received."""
@@ -314,58 +300,80 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
 
 
 @device_function
-def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> int:
-    """Search for the pose; a single hypothesis left becomes the estimate, or the prior does if both agree."""
-    if not advance_search(model, state, memory, world, i, now):
-        return SEARCHING
-    prior = memory.search[world, i].prior
-    found = memory.hypothesis[world, i, 0].estimate
-    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.POSE_GATE)
-    if confirmed:
-        found = prior
-    restart_belief(model, memory, world, i, found)
-    return wp.where(confirmed, ESTIMATING, FOUND)
+def is_searching(memory: Any, world: int, i: int) -> bool:
+    """Return whether the own pose is searched for, and has not been found at this tick."""
+    return memory.search[world, i].active == 1 and memory.search[world, i].found == 0
 
 
-@subroutine
-def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
-    """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
-    purpose = wp.where(standing == ESTIMATING, TRACKING, RESECTION)
-    frame = set_bearing_measurements(model, state, memory, world, i, now, purpose)
-    if standing == ESTIMATING:
-        memory.search[world, i].active = 0
-        update(model, state, memory, world, i, now, frame)
-    elif resect(frame, memory, world, i) and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
-        memory.search[world, i].active = 0
-    else:
-        postpone_acceptance(memory, world, i)
+# A tick in parts; with `Embedded.parts` each is a kernel of its own on a GPU.
 
 
 @device_function
-def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Take one camera tick of one vehicle, whose messages have been delivered."""
+def propagate_belief(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Receive the messages that have been delivered, and propagate the belief, or the search, by odometry."""
     state.nis[world, i] = wp.float64(0.0)
     state.nis_dof[world, i] = 0
     receive_broadcast(model, state, memory, world, i)
     step, jump = take_odometry(model, state, memory, world, i, now.period)
     walk_errors(model, memory, world, i, now.period)
     walk_mounting(model, memory, world, i, now.period)
-    standing = int(ESTIMATING)
     if memory.search[world, i].active == 1:
         noise = increment_noise(model, memory, world, i, step, now.period) + jump
         propagate_search(memory, world, i, step, noise)
-        standing = SEARCHING
-        if now.due:
-            standing = search(model, state, memory, world, i, now)
     else:
         noise = odometry_noise(model, i, now.period) + jump
         propagate_own(memory, world, i, step, noise, now.period)
-    if standing != SEARCHING:
+
+
+@subroutine
+def accept_hypothesis(model: Any, memory: Any, world: int, i: int):
+    """Make the single hypothesis that is left the estimate, or the prior, which ends the search, if both agree."""
+    found = memory.hypothesis[world, i, 0].estimate
+    prior = memory.search[world, i].prior
+    if is_known(prior.P) and distance_squared(prior, found) < wp.float64(constants.POSE_GATE):
+        found = prior
+        memory.search[world, i].active = 0
+    restart_belief(model, memory, world, i, found)
+    memory.search[world, i].found = 1
+
+
+@device_function
+def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Search for the pose if it is not known."""
+    memory.search[world, i].found = 0
+    if memory.search[world, i].active == 1 and now.due:
+        if advance_search(model, state, memory, world, i, now):
+            accept_hypothesis(model, memory, world, i)
+
+
+@device_function
+def fuse(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Fuse the reports that are new."""
+    if not is_searching(memory, world, i):
         fuse_messages(model, state, memory, world, i, now.tick)
-        if now.due:
-            correct(model, state, memory, world, i, now, standing)
-        if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
-            declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
+
+
+@device_function
+def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Correct the belief by a frame; a pose that the search has just found is resected from this frame alone."""
+    if now.due and not is_searching(memory, world, i):
+        found = memory.search[world, i].active == 1
+        frame = set_bearing_measurements(model, state, memory, world, i, now, wp.where(found, RESECTION, TRACKING))
+        if not found:
+            update(model, state, memory, world, i, now, frame)
+        else:
+            determined = resect(frame, memory, world, i)
+            if determined and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
+                memory.search[world, i].active = 0
+            else:
+                postpone_acceptance(memory, world, i)
+
+
+@device_function
+def conclude(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Write the estimate; begin a search if it is not valid."""
+    if memory.search[world, i].active == 0 and not is_valid(own_estimate(memory, world, i)):
+        declare_lost(model, memory, world, i, now.tick)  # by a message that no correct vehicle sends
     write(state, memory, world, i)
     if now.due:
         state.corrected_tick[world, i] = now.tick
@@ -376,7 +384,7 @@ OPTIONS = {"max_unroll": 1}
 
 ROBUST = Embedded(
     "robust",
-    estimate,
+    (propagate_belief, search, fuse, correct, conclude),
     start,
     send_broadcast,
     RobustMemory,

@@ -6,20 +6,9 @@ import warp as wp
 
 from coopenv.estimation.linalg import exp_so3, orthonormalise, skew, symmetric_part
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import moved, odometry_noise, with_noise
+from coopenv.observers.robust.algebra import errors_by_rows, moved, odometry_noise, with_noise
 from coopenv.observers.robust.belief import propagate, set_block
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    MOUNTING,
-    Member,
-    Pose,
-    mat33d,
-    mat66d,
-    vec2d,
-    vec3d,
-    vec4d,
-    vec6d,
-)
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, Member, Pose, mat33d, mat66d, vec2d, vec3d, vec4d, vec6d
 from coopenv.observers.robust.sources import propagate_sources
 from coopenv.world.warp_internals import device_function, subroutine
 
@@ -134,11 +123,12 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
     propagate(memory, world, i, 0, step, noise)
     G = errors_transition(memory, world, i, step, dt)
     for k in range(memory.belief[world, i].members):
-        coupled = G * memory.P[world, i, ERRORS, k]
+        coupled = errors_by_rows(G, memory.P[world, i, ERRORS, k])
         if k > 0:
             set_block(memory, world, i, 0, k, memory.P[world, i, 0, k] + coupled)
         else:
-            both = coupled + wp.transpose(coupled) + G * memory.P[world, i, ERRORS, ERRORS] * wp.transpose(G)
+            own = errors_by_rows(G, wp.transpose(errors_by_rows(G, memory.P[world, i, ERRORS, ERRORS])))
+            both = coupled + wp.transpose(coupled) + own
             memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)
     propagate_sources(memory, world, i, step, G, dt)
 

@@ -61,20 +61,21 @@ def next_triple(memory: Any, world: int, i: int, count: int, size: Any, number: 
     return best, best_size, best_number
 
 
-@device_function
-def covariance_of(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, require_determined: bool):
-    """Return whether three bearings determine the present pose well enough, and its covariance."""
+@subroutine
+def is_determined(frame: BearingFrame, memory: Any, world: int, i: int, triple: Any, require_determined: bool) -> bool:
+    """Return whether three bearings determine the present pose well enough, and set its covariance by them."""
     M = mat66d()
     for n in range(3):
         linearise(frame, memory, world, i, triple[n])
         H = memory.derivative[world, i, triple[n], 0].jacobian
         M += (wp.transpose(H) * (wp.float64(1.0) / memory.measurement[world, i, triple[n]].noise)) * H
     P = symmetric_part(inverse6(M))
+    memory.P[world, i, 0, 0] = P
     if require_determined:
-        return is_known(P), P
+        return is_known(P)
     angles = wp.vec3d(P[0, 0], P[1, 1], P[2, 2])
     determined = wp.min(angles) > wp.float64(0.0) and wp.max(angles) <= wp.float64(1.0)
-    return determined and is_regular(M, P, wp.float64(constants.MAX_CONDITION)), P
+    return determined and is_regular(M, P, wp.float64(constants.MAX_CONDITION))
 
 
 @device_function
@@ -87,12 +88,12 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     return True
 
 
-@device_function
-def add_hypothesis(memory: Any, world: int, i: int, estimate: PoseEstimate):
-    """Add a hypothesis, unless there is one like it."""
+@subroutine
+def add_hypothesis(memory: Any, world: int, i: int):
+    """Add the present estimate as a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
     if h < constants.MAX_HYPOTHESES:
-        memory.hypothesis[world, i, h].estimate = estimate
+        memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
         if is_new(memory, world, i, h, h):
             memory.search[world, i].hypotheses = h + 1
 
@@ -143,11 +144,11 @@ def solve_triple(
             if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
                 pose = Pose(R, camera - R * frame.lever)
                 begin_belief(memory, world, i, PoseEstimate(pose, mat66d()))
-                determined, P = covariance_of(frame, memory, world, i, triple, require_determined)
+                determined = is_determined(frame, memory, world, i, triple, require_determined)
                 if require_determined and not determined:
                     return False
                 if tracking and determined:
-                    add_hypothesis(memory, world, i, PoseEstimate(pose, P))
+                    add_hypothesis(memory, world, i)
     return True
 
 

@@ -25,15 +25,8 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.memory import (
-    ERRORS,
-    MOUNTING,
-    SOURCES,
-    BearingFrame,
-    mat33d,
-    mat63d,
-    vec3d,
-)
+from coopenv.observers.robust.algebra import diagonal_by_rows
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, SENDER_SLOTS, SOURCES, BearingFrame, fill, mat33d, vec3d
 from coopenv.observers.robust.sources import (
     CAMERA,
     VELOCITY,
@@ -48,15 +41,6 @@ from coopenv.observers.robust.sources import (
 from coopenv.world.warp_internals import device_function, subroutine
 
 
-@wp.func
-def by_blocks(G: Any, M: Any):
-    """Return G M for a 6x6 matrix that is zero but for its blocks of 3x3 on the diagonal, and M, 6x3."""
-    result = mat63d()
-    result[:3, :] = block3(G, 0, 0) * M[:3, :]
-    result[3:, :] = block3(G, 3, 3) * M[3:, :]
-    return result
-
-
 @device_function
 def share_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     """Return the share of a bearing's information that counts: errors of messages are the same for `NEWS_TIME`."""
@@ -67,13 +51,14 @@ def share_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
 
 @device_function
 def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
-    """Add the innovations of a frame to the vector of a source, and correct its sensitivities."""
+    """Add a frame to the vector and the information of a source, and correct its sensitivities."""
     first_sender = memory.belief[world, i].first_sender
     turn = wp.transpose(memory.scratch[world, i, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
     errors = memory.sensitivity[world, i, q, ERRORS]
     mounting = memory.sensitivity[world, i, q, MOUNTING]
     vector = memory.source[world, i, q].vector
+    A = memory.information[world, i, q, 0]
     for n in range(frame.bearings):
         fits = memory.measurement[world, i, n].fits
         if fits != 0:
@@ -87,6 +72,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
                 M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
             WM = memory.measurement[world, i, n].weight * M
             weighted = share_of(frame, memory, world, i, n) * WM
+            A = A + wp.transpose(weighted) * M
             memory.effect[world, i, n, q] = M
             memory.weighted_effect[world, i, n, q] = weighted
             vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
@@ -96,10 +82,13 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
                 if first_sender > MOUNTING:
                     mounting = mounting - wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
-    memory.sensitivity[world, i, q, 0] = by_blocks(memory.scratch[world, i, 0].recentring, own)
+    memory.information[world, i, q, 0] = A
+    memory.sensitivity[world, i, q, 0] = diagonal_by_rows(memory.scratch[world, i, 0].recentring, own)
     memory.sensitivity[world, i, q, ERRORS] = errors
     if first_sender > MOUNTING:
-        memory.sensitivity[world, i, q, MOUNTING] = by_blocks(memory.scratch[world, i, MOUNTING].recentring, mounting)
+        memory.sensitivity[world, i, q, MOUNTING] = diagonal_by_rows(
+            memory.scratch[world, i, MOUNTING].recentring, mounting
+        )
 
 
 @device_function
@@ -152,7 +141,7 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
 
 @device_function
 def add_information(frame: BearingFrame, memory: Any, world: int, i: int, q: int, c: int):
-    """Add the information of a frame on the faults of two sources."""
+    """Add the information of a frame on the faults of a source and of a sender."""
     A = memory.information[world, i, q, c]
     for n in range(frame.bearings):
         if memory.measurement[world, i, n].fits != 0:
@@ -176,17 +165,19 @@ def correct_sources(frame: BearingFrame, memory: Any, world: int, i: int):
             memory.source[world, i, q].rejected += weight
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
-            for c in range(q + 1):
-                if (c == q or is_sender(q) or is_sender(c)) and is_active(memory, world, i, c):
+            for c in range(1, wp.where(is_sender(q), q, 1 + SENDER_SLOTS)):
+                if is_active(memory, world, i, c):
                     add_information(frame, memory, world, i, q, c)
 
 
 @wp.func
 def block_between(blocks: Any, q: int, c: int):
-    """Return the block (q, c) of a symmetric matrix of which only the triangle c <= q is stored."""
-    if c <= q:
-        return blocks[q, c]
-    return wp.transpose(blocks[c, q])
+    """Return the information on the faults of a source q and a sender c; of two senders, one block is stored."""
+    if c == q:
+        return blocks[q, 0]
+    if is_sender(q) and c > q:
+        return wp.transpose(blocks[c, q])
+    return blocks[q, c]
 
 
 @device_function
@@ -276,12 +267,12 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             V = mat33d()
             v = vec3d()
             if is_rejected(memory, world, i, q) or q >= CAMERA or not located:
-                V = memory.information[world, i, q, q]
+                V = memory.information[world, i, q, 0]
                 v = memory.source[world, i, q].vector
                 for b in range(count):
                     c = source_at(memory, world, i, b)
                     X = coupling(memory, world, i, count, q, b)
-                    V = V - X * block_between(memory.information[world, i], c, q)
+                    V = V - X * wp.transpose(block_between(memory.information[world, i], q, c))
                     v = v - X * memory.source[world, i, c].vector
             V = kept * memory.source[world, i, q].information + wp.float64(0.5) * (V + wp.transpose(V))
             v = kept * memory.source[world, i, q].sum + v
@@ -315,5 +306,4 @@ def clear_block(memory: Any, world: int, i: int):
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             memory.source[world, i, q].vector = vec3d()
-            for c in range(q + 1):
-                memory.information[world, i, q, c] = mat33d()
+            fill(memory.information[world, i, q], mat33d())

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import forward, forward_error
+from coopenv.observers.robust.algebra import errors_by_rows, forward, forward_error
 from coopenv.observers.robust.memory import (
     ERRORS,
     SENDER_SLOTS,
@@ -58,9 +58,10 @@ def clear_source(memory: Any, world: int, i: int, q: int):
         clear_drift(memory, world, i, q)
     memory.source[world, i, q].information = mat33d()
     fill(memory.sensitivity[world, i, q], mat63d())
-    for c in range(SOURCES):
-        memory.information[world, i, q, c] = mat33d()
-        memory.information[world, i, c, q] = mat33d()
+    fill(memory.information[world, i, q], mat33d())
+    if is_sender(q):
+        for c in range(SOURCES):
+            memory.information[world, i, c, q] = mat33d()
 
 
 @device_function
@@ -172,7 +173,8 @@ def propagate_sources(memory: Any, world: int, i: int, step: Pose, G: Any, dt: A
     """Carry the sensitivities through an increment of odometry over dt; G: of the own error by the odometry's."""
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
-            Phi = forward(step, memory.sensitivity[world, i, q, 0]) + G * memory.sensitivity[world, i, q, ERRORS]
+            Phi = forward(step, memory.sensitivity[world, i, q, 0])
+            Phi = Phi + errors_by_rows(G, memory.sensitivity[world, i, q, ERRORS])
             if q == VELOCITY:
                 E = dt * wp.transpose(step.R)
                 for k in range(3):

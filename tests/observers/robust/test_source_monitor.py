@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from benchmarks.evidence import CHANGES, STEP_AT, changed
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
-from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS
+from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS, SOURCES
 from coopenv.observers.robust.sources import CAMERA, GYRO, NO_TARGET, VELOCITY
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -122,8 +122,12 @@ def test_errors_of_senders_are_eliminated(seed: int) -> None:
     for k, member in enumerate(observer.others):
         to_map[3 * k : 3 * k + 3, 6 * (others + k) + 3 : 6 * (others + k) + 6] = member["pose"]["R"]
     P = to_map @ observer.P @ to_map.T
-    lower = np.tril(np.ones(information.shape[:2]))[..., None, None]
-    A = np.where(lower > 0, information, information.transpose(1, 0, 3, 2))
+    A = np.zeros((SOURCES, SOURCES, 3, 3))
+    for q in range(SOURCES):
+        A[q, q] = information[q, 0]
+        for c in slots:
+            if q not in slots or c < q:  # of two senders the lower slot's block
+                A[q, c], A[c, q] = information[q, c], information[q, c].T
     V, v = eliminated(A, vector, P * MONITOR_TIME / SHORT_TIME, slots)
     assert all(np.linalg.norm(A[q, slots]) > 0.0 for q in (VELOCITY, 1, 2, 5, 6, 7))
     kept = slice(CAMERA)  # the sums of camera and gyro begin anew while their ratios are small
