@@ -38,7 +38,7 @@ from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, 
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
 from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
 from coopenv.observers.robust.source_monitor import add_to_drift
-from coopenv.observers.robust.sources import clear_source, is_excluded, take_slot
+from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE
 from coopenv.world.nearby import box_of, box_of_entry, entry_at, entry_count, sender_of
 from coopenv.world.warp_internals import device_function, subroutine
@@ -192,6 +192,7 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     grown = algebra.position_variance(P) - spread
     if grown > wp.float64(constants.RESET_GROWTH) * spread:
         inflate_dependents(memory, world, i, n, wp.float64(algebra.THIRD) * grown)
+        clear_drift(memory, world, i, memory.member[world, i, n].source)
     if dt > wp.float64(constants.SHORT_TIME):
         estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
         if algebra.distance_squared(estimated, PoseEstimate(report.pose, P)) > wp.float64(constants.POSE_GATE):

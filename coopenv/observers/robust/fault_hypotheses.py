@@ -1,7 +1,8 @@
 """Hypotheses of faults of single sources.
 
 All sources have the same prior odds. The source of a hypothesis that is nearly certain is excluded: unless the gate has
-rejected its bearings, the covariance grows by what the solution without it differs by, and what it is less certain.
+rejected its bearings, the covariance grows by what the solution without it differs by, and what it is less certain. An
+own sensor is used on: its fault becomes an error of its calibration, correlated with the error that it has caused.
 Hypotheses that are only likely add to the covariance that is stated and sent, each by its probability. An excluded
 source stays under test, and is readmitted when its bearings fit without a fault and not with the one it had.
 """
@@ -10,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, exp_so3, symmetric_part
+from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.belief import insert_member, remove_member, set_block
 from coopenv.observers.robust.measurements import innovation_weight
@@ -74,6 +75,25 @@ def inflate_by_fault(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
+def add_to_calibration(memory: Any, world: int, i: int, q: int):
+    """Let the fault of an own sensor be an error of the odometry's scale, the gyro's bias or the camera's mounting."""
+    if q == VELOCITY:
+        v = memory.belief[world, i].mean_v
+        square = wp.dot(v, v)
+        if square > wp.float64(constants.MIN_VELOCITY_STD * constants.MIN_VELOCITY_STD):
+            memory.sensitivity[world, i, q, ERRORS][3] -= v / square
+    elif q == GYRO:
+        for k in range(3):
+            memory.sensitivity[world, i, q, ERRORS][k, k] -= wp.float64(1.0)
+    else:
+        if mounting_of(memory, world, i) == 0:
+            insert_member(memory, world, i, MOUNTING)
+            begin_calibration(memory, world, i, MOUNTING, vec6d())
+        for k in range(3):
+            memory.sensitivity[world, i, q, MOUNTING][k, k] += wp.float64(1.0)
+
+
+@device_function
 def inflate_by_drift(memory: Any, world: int, i: int, q: int):
     """Add to the covariance the square of the own error by a sender's drift."""
     for o in range(memory.belief[world, i].first_sender):
@@ -101,22 +121,20 @@ def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; an own sensor is used on, with an uncertain scale, bias or mounting."""
     memory.source[world, i, q].exclusions += 1
     if is_own(q):
+        add_to_calibration(memory, world, i, q)
         inflate_by_fault(memory, world, i, q)
-        if q == VELOCITY:
-            correct_scale(memory, world, i)
-        elif q == GYRO:
-            correct_bias(memory, world, i)
-        else:
-            correct_mounting(memory, world, i)
         return
+    drift_time = wp.float64(0.0)
     if drifts(memory, world, i, q):
         inflate_by_drift(memory, world, i, q)
         memory.source[world, i, q].offset = -memory.source[world, i, q].drift
+        drift_time = memory.source[world, i, q].drift_time
     else:
         inflate_by_fault(memory, world, i, q)
     f = memory.source[world, i, q].offset
     clear_source(memory, world, i, q)
     memory.source[world, i, q].offset = f
+    memory.source[world, i, q].drift_time = drift_time
     memory.source[world, i, q].excluded = 1
     memory.source[world, i, q].time = wp.float64(0.0)
     k = member_of(memory, world, i, q)
@@ -126,9 +144,13 @@ def exclude(memory: Any, world: int, i: int, q: int):
 
 @device_function
 def drifts(memory: Any, world: int, i: int, q: int) -> bool:
-    """Return whether a sender nearly certainly drifts from its own odometry."""
-    certain = wp.float64(constants.FAULT_GATE + constants.ODDS)
-    return is_sender(q) and is_active(memory, world, i, q) and memory.source[world, i, q].drift_ratio > certain
+    """Return whether a sender nearly certainly drifts from its own odometry, for longer than a correct one needs.
+
+    A sender with a faulty sensor moves until its own monitor finds that, at the end of a block.
+    """
+    certain = memory.source[world, i, q].drift_ratio > wp.float64(constants.FAULT_GATE + constants.ODDS)
+    lasting = memory.source[world, i, q].drift_time > wp.float64(constants.MEAN_TIME - constants.SAME_TIME)
+    return is_sender(q) and is_active(memory, world, i, q) and certain and lasting
 
 
 @device_function
@@ -173,16 +195,14 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 
 @subroutine
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
-    """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain.
+    """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
-    Innovations of a wrong pose, while the gate is disabled, show no faults but those of the own sensors.
+    Soon after it began, a fault of the gyro cannot be told from one of the camera: both count as faulty. Innovations of
+    a wrong pose, while the gate is disabled, show no faults but those of the own sensors.
     """
     end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
     lost = memory.belief[world, i].gate_disabled == 1
-    if not lost and exclude_drifting(memory, world, i, landmarks):
-        forget_faults(memory, world, i)
-        return
     gate = wp.float64(constants.FAULT_GATE)
     most = gate
     worst = int(-1)
@@ -199,10 +219,13 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
             if not is_same(q, worst):
                 rivals += w
     certain = worst >= 0 and rivals < wp.float64(constants.FAULT_RISK)
+    if not (certain and is_own(worst)) and not lost and exclude_drifting(memory, world, i, landmarks):
+        forget_faults(memory, world, i)
+        return
     if certain and (is_own(worst) or not lost):
         for q in range(SOURCES):
             likely = weight_of(memory.source[world, i, q].ratio, most) > wp.float64(constants.FAULT_RISK)
-            if likely and is_same(q, worst):
+            if is_same(q, worst) and (likely or (q >= CAMERA and worst >= CAMERA)):
                 exclude(memory, world, i, q)
     if certain or lost:
         forget_faults(memory, world, i)
@@ -223,50 +246,10 @@ def weight_of(ratio: Any, most: Any):
 
 
 @device_function
-def correct_scale(memory: Any, world: int, i: int):
-    """Correct the odometry's scale by the estimated fault of its velocity, and add the uncertainty to its variance."""
-    f = memory.source[world, i, VELOCITY].offset
-    covariance = memory.source[world, i, VELOCITY].covariance
-    v = memory.belief[world, i].mean_v
-    square = wp.dot(v, v)
-    if square > wp.float64(constants.MIN_VELOCITY_STD * constants.MIN_VELOCITY_STD):
-        scale = wp.dot(v, f) / square
-        variance = wp.dot(v, covariance * v) / (square * square)
-        memory.member[world, i, ERRORS].v[0] -= scale
-        memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * scale + variance
-
-
-@device_function
-def correct_bias(memory: Any, world: int, i: int):
-    """Correct the gyro's bias by the estimated fault of the angular velocity, and add to its variance likewise."""
-    memory.member[world, i, ERRORS].w -= memory.source[world, i, GYRO].offset
-    inflate_turn(memory, world, i, ERRORS, GYRO)
-
-
-@device_function
-def correct_mounting(memory: Any, world: int, i: int):
-    """Turn the camera by its estimated fault, and add to the variance of its mounting likewise."""
-    if mounting_of(memory, world, i) == 0:
-        insert_member(memory, world, i, MOUNTING)
-        begin_calibration(memory, world, i, MOUNTING, vec6d())
-    turn = exp_so3(memory.source[world, i, CAMERA].offset)
-    memory.member[world, i, MOUNTING].pose.R = memory.member[world, i, MOUNTING].pose.R * turn
-    inflate_turn(memory, world, i, MOUNTING, CAMERA)
-
-
-@device_function
-def inflate_turn(memory: Any, world: int, i: int, n: int, q: int):
-    """Add to the first three variances of a state the square of an estimated fault and its variance."""
-    f = memory.source[world, i, q].offset
-    P = memory.P[world, i, n, n]
-    P[:3, :3] = block3(P, 0, 0) + wp.outer(f, f) + memory.source[world, i, q].covariance
-    memory.P[world, i, n, n] = P
-
-
-@device_function
 def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, q: int):
-    """Readmit an excluded source if its bearings fit well without an offset, and not with the one that it had.
+    """Readmit an excluded source if its bearings fit well without an offset, and not with the one that it would have.
 
+    That is the one at the exclusion, grown since if the source drifted.
     Errors of the own pose are the same in many frames, so that all frames together count as one.
     """
     H = -(memory.derivative[world, i, n, 0].jacobian[:, 3:] * wp.transpose(memory.member[world, i, 0].pose.R))
@@ -280,6 +263,8 @@ def test_excluded(frame: BearingFrame, memory: Any, world: int, i: int, n: int, 
     memory.source[world, i, q].sum = a
     memory.source[world, i, q].time += frame.period
     f = memory.source[world, i, q].offset
+    if memory.source[world, i, q].drift_time > wp.float64(0.0):
+        f = (wp.float64(1.0) + memory.source[world, i, q].time / memory.source[world, i, q].drift_time) * f
     least = wp.float64(constants.ROUNDING) * wp.trace(A) + wp.float64(constants.MIN_VARIANCE)
     present = wp.dot(a, wp.inverse(A + least * wp.identity(3, wp.float64)) * a)
     gain = wp.dot(f, A * f) - wp.float64(2.0) * wp.dot(f, a)

@@ -94,6 +94,7 @@ class Source:
     drift_vector: vec3d  # their decaying sum, weighted by the inverse of the covariance that each has without a fault
     drift_information: mat33d  # the decaying sum of these weights
     drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
+    drift_time: wp.float64  # s for which it has been likely; of an excluded source, for which it drifted, 0: it did not
     time: wp.float64  # s for which it has been excluded and in view
 
 
@@ -347,8 +348,8 @@ def robust_rules() -> dict[str, Rule]:
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick source.seen_tick"
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
-        "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.vector "
-        "source.ratio source.sum source.information source.covariance source.offset"
+        "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
+        "source.vector source.ratio source.sum source.information source.covariance source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),

@@ -122,7 +122,7 @@ def add_to_drift(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
 
 
 @device_function
-def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
+def end_drift_block(memory: Any, world: int, i: int, q: int, time: Any, kept: Any):
     """Set the likelihood ratio of a sender's drift, which gives all increments the same mean, at the end of a block.
 
     A drift begins where the ratio is last as small as without a fault.
@@ -135,6 +135,8 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, kept: Any):
     if ratio < wp.float64(3.0):
         clear_drift(memory, world, i, q)
     else:
+        if ratio > wp.float64(constants.FAULT_GATE):
+            memory.source[world, i, q].drift_time += time
         memory.source[world, i, q].drift_vector = kept * v
         memory.source[world, i, q].drift_information = kept * V
 
@@ -287,7 +289,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
             memory.source[world, i, q].offset = covariance * v
             memory.source[world, i, q].ratio = wp.dot(v, covariance * v)
             if is_sender(q):
-                end_drift_block(memory, world, i, q, kept)
+                end_drift_block(memory, world, i, q, time, kept)
             if q >= CAMERA and memory.source[world, i, q].ratio < wp.float64(constants.OFFSET_GATE):
                 restart_fault(memory, world, i, q)
     clear_block(memory, world, i)

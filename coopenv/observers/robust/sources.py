@@ -44,6 +44,7 @@ def clear_drift(memory: Any, world: int, i: int, q: int):
     memory.source[world, i, q].drift = vec3d()
     memory.source[world, i, q].drift_vector = vec3d()
     memory.source[world, i, q].drift_ratio = wp.float64(0.0)
+    memory.source[world, i, q].drift_time = wp.float64(0.0)
     memory.source[world, i, q].drift_information = mat33d()
     fill(memory.drift_effect[world, i, q - 1], vec6d())
 
