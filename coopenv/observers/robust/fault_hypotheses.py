@@ -197,8 +197,8 @@ def set_fault_mixture(memory: Any, world: int, i: int, most: Any, total: Any):
 def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: int):
     """Weigh the hypotheses after a block of a time, s; exclude the source of one nearly certain, own sensors first.
 
-    Soon after it began, a fault of the gyro cannot be told from one of the camera: both count as faulty. Innovations of
-    a wrong pose, while the gate is disabled, show no faults but those of the own sensors.
+    Soon after it began, a fault of the gyro cannot be told from one of the camera: if both are likelier than none, both
+    count as faulty. Innovations of a wrong pose, while the gate is disabled, show no faults but those of own sensors.
     """
     end_block(memory, world, i, time)
     memory.fault_mixture[world, i] = mat66d()
@@ -224,8 +224,9 @@ def detect_and_exclude(memory: Any, world: int, i: int, time: Any, landmarks: in
         return
     if certain and (is_own(worst) or not lost):
         for q in range(SOURCES):
-            likely = weight_of(memory.source[world, i, q].ratio, most) > wp.float64(constants.FAULT_RISK)
-            if is_same(q, worst) and (likely or (q >= CAMERA and worst >= CAMERA)):
+            likely = memory.source[world, i, q].ratio > most - wp.float64(constants.ODDS)
+            turned = q >= CAMERA and worst >= CAMERA and memory.source[world, i, q].ratio > wp.float64(constants.ODDS)
+            if is_same(q, worst) and (likely or turned):
                 exclude(memory, world, i, q)
     if certain or lost:
         forget_faults(memory, world, i)
