@@ -135,7 +135,7 @@ def end_drift_block(memory: Any, world: int, i: int, q: int, time: Any, kept: An
     if ratio < wp.float64(3.0):
         clear_drift(memory, world, i, q)
     else:
-        if ratio > wp.float64(constants.FAULT_GATE):
+        if ratio > wp.float64(constants.OFFSET_GATE):
             memory.source[world, i, q].drift_time += time
         memory.source[world, i, q].drift_vector = kept * v
         memory.source[world, i, q].drift_information = kept * V
