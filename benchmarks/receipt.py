@@ -163,7 +163,7 @@ def change_of(case: str) -> Callable[..., Any]:
 
     faults = {
         "nominal": "",
-        "landmark": CHANGES["one landmark of the map off by 3 m"],
+        "landmark": CHANGES["one landmark off by 3 m"],
         "bias": f"gyro_step={np.radians(1.0)}@{STEP_AT}",
         "camera": CHANGES["the second camera turns by 3 deg at 12 s"],
         "large bias": f"gyro_step={np.radians(5.0)}@{STEP_AT}",

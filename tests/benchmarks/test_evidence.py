@@ -30,7 +30,7 @@ def recording() -> Recording:
 
 
 def test_a_landmark_is_moved_in_the_map_alone(recording: Recording) -> None:
-    fault = evidence.CHANGES["one landmark of the map off by 0.3 m"]
+    fault = evidence.CHANGES["one landmark off by 0.3 m"]
     moved = evidence.changed(recording, fault, 0)
     assert moved.interference is not None
     for vehicle, k in ((0, 0), (4, recording.ticks - 1)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -33,6 +34,6 @@ def test_the_table_has_every_stage() -> None:
         "2",
     ]
     table = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stdout
-    rows = {line[:36].strip(): line[36:].split() for line in table.splitlines()[2:]}
+    rows = {name: values for name, *values in (re.split(r" {2,}", line.strip()) for line in table.splitlines()[2:])}
     assert set(rows) == {"all else", "sum", *(name for name, _ in STAGES)}
     assert all(float(rows[name][0]) > 0.0 for name in ("monitors", "iterated correction", "fusion"))
