@@ -84,8 +84,8 @@ def test_modules_are_found_from_here(folder: Path, monkeypatch: pytest.MonkeyPat
     ],
 )
 def test_mistakes_are_one_line(folder: Path, reference: str, message: str) -> None:
-    (folder / "raises.py").write_text("1 / 0")
-    (folder / "leaves.py").write_text("raise SystemExit(3)")
+    (folder / "raises.py").write_text("1 / 0\nclass Mine: ...")
+    (folder / "leaves.py").write_text("raise SystemExit(3)\nclass Mine: ...")
     (folder / "broken.py").write_text("class Mine(")
     with pytest.raises(CoopenvError, match=message) as caught:
         load_reference(reference)

@@ -104,7 +104,7 @@ def test_without_the_extra_runs_say_what_is_missing(
         (["view", "no.bag"], "no.bag"),
         (["view", "scene.npz"], "scene.npz: not a readable scene"),
         (["view", "others.mcap"], "others.mcap"),
-        (["view", "drive.mcap", "--agent", "peek"], "--agent: is for a simulation, drive.mcap is recorded"),
+        (["view", "others.mcap", "--agent", "peek"], "--agent: is for a simulation, others.mcap is recorded"),
         (["view", "overtaking", "--host", "192.0.2.7"], "--host 192.0.2.7: is no address of this computer"),
         (["film", "overtaking", "--out", "film.avi"], "film.avi: unknown format of a film"),
         (["film", "overtaking", "--out", "none/film.gif"], "folder none does not exist"),

@@ -203,7 +203,7 @@ def test_large_numbers_fit_as_well() -> None:
         (["overtaking", "--address", "127.0.0.1:1"], "only --engine ray"),
         (["overtaking", "--engine", "ray", "--jobs", "2"], "the cluster decides"),
         (["overtaking", "--engine", "ray", "--address", "nowhere"], "expected HOST:PORT"),
-        (["nowhere.mcap"], "no such log file"),
+        (["nowhere.mcap"], "no such log: nowhere.mcap"),
         (["mrclam_6", "--set", "horizon=1"], "recorded"),
         (["mrclam_6", "--basin", "2"], "basins are studied in simulated environments"),
         (["mrclam_6", "--variants", "v2x_loss"], "known: landmarks, landmarks+robots, blind"),

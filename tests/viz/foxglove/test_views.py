@@ -294,7 +294,7 @@ def test_the_command_writes_a_scene_and_a_layout_of_it(
     assert main(["export", "b.mcap", "--format", "foxglove-layout"]) == 2
     assert "b.mcap: has no scene, `coopenv record --scene` writes one" in capsys.readouterr().err
     assert main(["export", "nowhere.mcap", "--format", "foxglove-layout"]) == 2
-    assert "nowhere.mcap: cannot be read" in capsys.readouterr().err
+    assert "no such run or log: nowhere.mcap" in capsys.readouterr().err
     assert main([*record, "c.mcap", "--no-scene", "--observer", "robust"]) == 2
     assert "--observer robust: is for a scene" in capsys.readouterr().err
     assert main([*record, "c.mcap", "--observer", "robst"]) == 2
