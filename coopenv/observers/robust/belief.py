@@ -40,9 +40,11 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 @device_function
 def set_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
-    """Set the covariance at (k, j) to a block, and to its transpose at (j, k)."""
+    """Set the covariance at (k, j) to a block and at (j, k) to its transpose; on the diagonal to the symmetric part."""
     memory.P[world, i, k, j] = block
     memory.P[world, i, j, k] = wp.transpose(block)
+    if k == j:
+        memory.P[world, i, k, k] = symmetric_part(block)
 
 
 @device_function

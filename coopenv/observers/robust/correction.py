@@ -4,7 +4,6 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, set_block
@@ -110,10 +109,7 @@ def update_covariance(memory: Any, world: int, i: int, bearings: int):
                 if memory.measurement[world, i, n].fits == 1:
                     K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
                     block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
-            block = memory.P[world, i, k, j] - block
-            if k == j:
-                block = symmetric_part(block)
-            set_block(memory, world, i, k, j, block)
+            set_block(memory, world, i, k, j, memory.P[world, i, k, j] - block)
 
 
 @device_function

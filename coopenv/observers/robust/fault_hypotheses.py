@@ -71,7 +71,6 @@ def inflate_by_fault(memory: Any, world: int, i: int, q: int):
         for j in range(o + 1):
             block = memory.P[world, i, o, j] + X * wp.transpose(memory.sensitivity[world, i, q, j])
             set_block(memory, world, i, o, j, block)
-        memory.P[world, i, o, o] = symmetric_part(memory.P[world, i, o, o])
     fill(memory.sensitivity[world, i, q], mat63d())
 
 
