@@ -87,10 +87,10 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 LINES_AND_FILES = {
     ".": (123, 2),
     "api": (4155, 19),
-    "backends": (3825, 21),
+    "backends": (3870, 21),
     "base": (1735, 11),
     "bench": (5360, 20),
-    "cars": (10795, 49),
+    "cars": (10690, 49),
     "cli": (2611, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),

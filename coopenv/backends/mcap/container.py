@@ -1,18 +1,21 @@
 """The records of an MCAP file, and the limit of what compressed files may unpack to. Needs the extra `log`."""
 
 import bz2
-from collections.abc import Iterator
-from dataclasses import replace
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext, suppress
 from io import BytesIO
-from itertools import takewhile
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import zstandard
 from lz4.frame import LZ4FrameDecompressor
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, MessageIndex, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 
-from coopenv.backends.mcap.format import CUT_OFF, MAGIC, MENDED
+from coopenv.backends.mcap.format import CUT_OFF, MAGIC, MENDED, is_cut_off
 from coopenv.base.errors import DataError, check_memory, shown
 
 AT_ONCE = 32 * 2**20
@@ -76,8 +79,74 @@ def _first(compression: str, data: bytes, most: int) -> bytes:
     raise ValueError(f"unknown compression {shown(compression)}")
 
 
+KINDS: dict[int, Any] = {
+    **{Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel},
+    **{Opcode.ATTACHMENT: Attachment, Opcode.METADATA: Metadata},
+}
+"""Classes of the records that are read as they stand."""
+
+
+def records_of(stream: BinaryIO, most: int, allowance: Allowance | None) -> Iterator[Any]:
+    """Yield the records of a file's data behind its magic, or of a chunk.
+
+    Args:
+        stream: of the records.
+        most: largest length of a record, bytes.
+        allowance: what chunks may unpack to, whose records come instead of them; None: they are left out.
+
+    Raises:
+        EOFError: it breaks off. Of a chunk in which it does, what there is has been yielded.
+        ValueError: a record is too long, a chunk is damaged or unpacks to too much; other errors are the library's.
+    """
+    while head := stream.read(9):
+        opcode, length = struct.unpack("<BQ", head)
+        if length > most:
+            name = Opcode(opcode).name if opcode in list(Opcode) else f"unknown ({opcode})"
+            raise ValueError(f"{name} record has length {length} that exceeds limit {most}")
+        body = stream.read(length)
+        fields = ReadDataStream(BytesIO(body))
+        if opcode == Opcode.CHUNK and allowance is not None:
+            chunk = Chunk.read(fields)
+            data = allowance.unpack(chunk.compression, chunk.data, chunk.uncompressed_size)
+            whole = len(data) == chunk.uncompressed_size
+            if whole and chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+                raise ValueError("a chunk is damaged, its check sum differs")
+            with nullcontext() if whole else suppress(EOFError, struct.error):
+                yield from records_of(BytesIO(data), len(data), allowance)
+            if not whole:
+                raise ValueError(f"a chunk unpacks to {len(data)} bytes, not to the stated {chunk.uncompressed_size}")
+        if len(body) < length:
+            raise EOFError(CUT_OFF)
+        if opcode == Opcode.MESSAGE:
+            yield Message.read(fields, length)
+        elif opcode in KINDS:
+            yield KINDS[opcode].read(fields)
+        elif opcode == Opcode.DATA_END:
+            return
+
+
+def messages_of(records: Iterable[Any]) -> Iterator[tuple[Channel, Schema | None, Message | None]]:
+    """Yield messages in their order, each with its channel and the schema of that; a channel, too, as it is described.
+
+    Raises ValueError: a message has no channel.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for record in records:
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+            yield record, schemas.get(record.schema_id), None
+        elif isinstance(record, Message):
+            if record.channel_id not in channels:
+                raise ValueError(f"a message's channel {record.channel_id} is not described")
+            channel = channels[record.channel_id]
+            yield channel, schemas.get(channel.schema_id), record
+
+
 class Container:
-    """An MCAP file, read from begin to end; the index behind its data is not needed."""
+    """An MCAP file in memory, read from begin to end; the index behind its data is not needed."""
 
     def __init__(self, path: Path, forgiving: bool = False) -> None:
         """Read a file; if `forgiving`, of one that is cut off what is whole.
@@ -86,59 +155,33 @@ class Container:
             DataError: it is no MCAP file, or cut off; other errors are the library's.
         """
         check_memory(path.stat().st_size, f"{path}:")
-        data = path.read_bytes()
-        if not data.startswith(MAGIC):
+        self._data = path.read_bytes()
+        if not self._data.startswith(MAGIC):
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
-        self.cut_off = len(data) < 2 * len(MAGIC) or not data.endswith(MAGIC)
+        self.cut_off = is_cut_off(path)
         """Whether the end is missing."""
         if self.cut_off and not forgiving:
             raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
-        records = StreamReader(BytesIO(data), emit_chunks=True, record_size_limit=len(data)).records
-        section = takewhile(lambda record: not isinstance(record, DataEnd), self._whole(records))
-        self._records = [record for record in section if not isinstance(record, MessageIndex)]
-        self._size = len(data)
 
     def extras(self) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
         """Return the file's metadata and its attachments, by name."""
-        metadata = {record.name: record.metadata for record in self._records if isinstance(record, Metadata)}
-        return metadata, {record.name: record.data for record in self._records if isinstance(record, Attachment)}
+        records = list(self._records(None))
+        metadata = {record.name: record.metadata for record in records if isinstance(record, Metadata)}
+        return metadata, {record.name: record.data for record in records if isinstance(record, Attachment)}
 
     def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
-        """Yield all messages in the order of the file, each with its channel and the schema of that.
+        """Yield all messages in the order of the file, with their channels and the schemas of those.
 
         Raises ValueError: a chunk would unpack to too much, or a message has no channel. Others are the library's.
         """
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for record in self._whole(self._unpacked()):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                if record.channel_id not in channels:
-                    raise ValueError(f"a message's channel {record.channel_id} is not described")
-                channel = channels[record.channel_id]
-                yield channel, schemas.get(channel.schema_id), record
+        for channel, schema, message in messages_of(self._records(Allowance(len(self._data)))):
+            if message is not None:
+                yield channel, schema, message
 
-    def _whole(self, records: Iterator[McapRecord]) -> Iterator[McapRecord]:
+    def _records(self, allowance: Allowance | None) -> Iterator[Any]:
         """Yield records up to where a file is cut off; there anything can be wrong with them."""
         try:
-            yield from records
+            yield from records_of(BytesIO(self._data[len(MAGIC) :]), len(self._data), allowance)
         except Exception:
             if not self.cut_off:
                 raise
-
-    def _unpacked(self) -> Iterator[McapRecord]:
-        """Yield the records inside and outside of chunks."""
-        allowance = Allowance(self._size)
-        for record in self._records:
-            if isinstance(record, Chunk):
-                data = allowance.unpack(record.compression, record.data, record.uncompressed_size)
-                if len(data) != record.uncompressed_size:
-                    raise ValueError(
-                        f"a chunk unpacks to {len(data)} bytes, not to the stated {record.uncompressed_size}"
-                    )
-                yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
-            else:
-                yield record

@@ -164,6 +164,7 @@ class Track:
 
     def clean_stamps(self, mode: str) -> None:
         """Drop messages with wrong stamps, after jumps of the clock if a mode removes them; measure the delay."""
+        self.entries.sort(key=lambda entry: entry.received)
         stamps, received = (
             np.array([getattr(e, name) for e in self.entries], np.int64) for name in ("stamp", "received")
         )
