@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 # Quotients of literals inside a kernel would be rounded to float32; constants are not.
+THIRD = wp.constant(1.0 / 3.0)
 SIXTH = wp.constant(1.0 / 6.0)
 OVER_24 = wp.constant(1.0 / 24.0)
 OVER_120 = wp.constant(1.0 / 120.0)

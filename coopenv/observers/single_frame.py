@@ -1,6 +1,6 @@
 """The pose from the bearings of one frame (P3P, PnP); odometry carries it to the next one, and counts no further.
 
-Source: candidates by robust/p3p.py; among them the one that agrees with most bearings, then the one nearest to the pose
+Source: candidates by p3p.py; among them the one that agrees with most bearings, then the one nearest to the pose
 predicted by odometry (Fischler and Bolles, Random sample consensus, Communications of the ACM 24(6), 1981, with all
 triples in place of random ones); then Gauss-Newton over all bearings that agree. Where Gauss-Newton from the predicted
 pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
@@ -25,7 +25,7 @@ from coopenv.observers.bearing_measurements import (
 )
 from coopenv.observers.contract import Estimate, Message, Tick
 from coopenv.observers.error_state_filters import PoseObserver
-from coopenv.observers.robust.p3p import solve_p3p
+from coopenv.observers.p3p import solve_p3p
 
 MOST_TRIPLES = 20
 ITERATIONS = 8

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import (
+    THIRD,
     block3,
     cholesky6,
     exp_so3,
@@ -22,7 +23,6 @@ from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = constants.KNOWN_POSITION**2
-THIRD = 1.0 / 3.0
 QUARTER = 0.25 / constants.MAX_ACCELERATION**2
 BEYOND = -0.9  # cosine of an angle below which the skew part of a rotation does not determine its axis
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, symmetric_part
+from coopenv.estimation.linalg import THIRD, block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import (
     apply_corrections,
@@ -191,7 +191,7 @@ def sender_reset_detected(memory: Any, world: int, i: int, n: int, dt: Any) -> b
     spread = algebra.position_variance(before)
     grown = algebra.position_variance(P) - spread
     if grown > wp.float64(constants.RESET_GROWTH) * spread:
-        inflate_dependents(memory, world, i, n, wp.float64(algebra.THIRD) * grown)
+        inflate_dependents(memory, world, i, n, wp.float64(THIRD) * grown)
         clear_drift(memory, world, i, memory.member[world, i, n].source)
     if dt > wp.float64(constants.SHORT_TIME):
         estimated = PoseEstimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])

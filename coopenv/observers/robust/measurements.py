@@ -7,11 +7,10 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, exp_so3, skew
+from coopenv.estimation.linalg import THIRD, block3, exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
-    THIRD,
     averaging_time,
     between,
     by_rows,

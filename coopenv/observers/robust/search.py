@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.p3p import camera_pose, solve_triangle
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.belief import begin_belief, own_estimate
@@ -27,7 +28,6 @@ from coopenv.observers.robust.measurements import (
     tangent_basis,
 )
 from coopenv.observers.robust.memory import BearingFrame, Hypothesis, Pose, PoseEstimate, Search, mat33d, mat66d
-from coopenv.observers.robust.p3p import camera_pose, solve_triangle
 from coopenv.world.warp_internals import device_function, subroutine
 
 PROBLEMS = 1 + 3 * 2 * 5

@@ -13,11 +13,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from coopenv.estimation.linalg import THIRD
 from coopenv.estimation.poses import Array
-from coopenv.observers.robust.algebra import THIRD
-from coopenv.observers.robust.memory import mat33d, vec2d, vec3d
 from coopenv.world import launch
 from coopenv.world.launch import kernel, start_warp
+
+vec2d: Any = wp.vec2d
+vec3d: Any = wp.vec3d
+mat33d: Any = wp.mat33d
+mat43d: Any = wp.types.matrix((4, 3), wp.float64)
 
 THIRD_TURN = 2.0943951023931953
 
@@ -132,8 +136,6 @@ def directions_in(plane: Any, null: Any, cone: Any):
     q = -(b + wp.where(b < wp.float64(0.0), -root, root))
     return vec2d(q, a), vec2d(c, q)
 
-
-mat43d: Any = wp.types.matrix((4, 3), wp.float64)
 
 NEWTON_STEPS = 3
 TOLERANCE = 1e-8  # what a solution may miss of the squared sides, relative to the longest
