@@ -56,7 +56,7 @@ class Outcomes(NamedTuple):
     @property
     def cost(self) -> np.ndarray:
         """(W,) m, what a search minimises."""
-        return np.nan_to_num(self.stated, nan=MISSED) + MISSED * (1.0 - self.arrived + self.collided)
+        return np.asarray(np.nan_to_num(self.stated, nan=MISSED) + MISSED * (1.0 - self.arrived + self.collided))
 
 
 class Recorded:
@@ -86,8 +86,9 @@ class Plans:
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the next actions, (rows, A)."""
-        row, self._next = self._actions[min(self._next, len(self._actions) - 1)], self._next + 1
-        return row
+        row = min(self._next, len(self._actions) - 1)
+        self._next += 1
+        return np.asarray(self._actions[row])
 
 
 def driven(engine: Engine, policy: Policy, seed: int) -> tuple[Outcomes, np.ndarray]:
