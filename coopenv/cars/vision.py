@@ -90,7 +90,7 @@ def _blocks(message: Any, _settings: VisionSettings, camera: Calibration) -> lis
     for block in message.objects:
         u, v, area = int(block.center_x), int(block.center_y), int(block.width) * int(block.height)
         valid = 0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0
-        found.append(Tag(int(block.signature), area, ray_of(camera, u, v) if valid else None))
+        found.append(Tag(int(block.signature), area, ray_of(camera, u, v) if valid else None, v if valid else None))
     return found
 
 

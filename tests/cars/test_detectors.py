@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.cars.profile import Role, VisionSettings
+from coopenv.cars.codec import decode, encode, header, make, stamp_of, warm_up
+from coopenv.cars.profile import Role, VisionSettings, load_profile
 from coopenv.cars.readings import calibration_of, read
 from coopenv.cars.vision import Calibration
 
@@ -58,6 +59,41 @@ def test_every_detector_gives_the_rays_of_its_pixels(kind: str, message: Fields)
     message.__dict__["__msgtype__"] = kind
     found: Any = read(Role.DETECTIONS, message, CAMERA)
     assert found.markers == (3, 7)
+    for marker, ray in zip(found.markers, found.bearings, strict=True):
+        np.testing.assert_allclose(ray, RAYS[marker] / np.linalg.norm(RAYS[marker]), atol=1e-12)
+
+
+SQUARE = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]
+LIVE: dict[str, dict[str, Any]] = {
+    "apriltag_msgs/msg/AprilTagDetectionArray": {
+        "detections": [{"id": n, "centre": pixel, "corners": SQUARE} for n, pixel in PIXELS.items()]
+    },
+    "vision_msgs/msg/Detection2DArray": {
+        "detections": [
+            {
+                "results": [
+                    {"hypothesis": {"class_id": name, "score": score}} for name, score in ((str(n), 0.9), ("5", 0.4))
+                ],
+                "bbox": {"center": {"position": pixel}, "size_x": 20.0, "size_y": 20.0},
+            }
+            for n, pixel in PIXELS.items()
+        ]
+    },
+    "aruco_msgs/msg/MarkerArray": {
+        "markers": [{"id": n, "pose": {"pose": {"position": 3.0 * ray}}, "confidence": 1.0} for n, ray in RAYS.items()]
+    },
+}
+"""Fields of messages by type."""
+
+
+@pytest.mark.parametrize("kind", LIVE)
+def test_messages_of_other_detectors_are_read_live(kind: str) -> None:
+    """From the bytes on the network, by the definitions that come with coopenv, as a station reads them."""
+    profile = load_profile({"base": "svea", "topics": {"detections": {"name": "fleet/{car}/found", "type": kind}}})
+    warm_up(profile)
+    message = decode(encode(make(kind, header=header(5 * 10**9), **LIVE[kind])), kind)
+    found: Any = read(Role.DETECTIONS, message, CAMERA, vision=profile.vision)
+    assert found.markers == (3, 7) and stamp_of(message) == 5 * 10**9
     for marker, ray in zip(found.markers, found.bearings, strict=True):
         np.testing.assert_allclose(ray, RAYS[marker] / np.linalg.norm(RAYS[marker]), atol=1e-12)
 

@@ -120,6 +120,7 @@ UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may re
 CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
 FEWEST, MOST = 50, 20_000  # elements compared
 ABSURD = 0.1  # rad between bearings and poses, with which no camera or map is right
+LASTING = 0.1  # share of the residuals of bearings that wrong lenses and mountings may make look like an offset
 
 
 @dataclass(frozen=True)
@@ -195,10 +196,13 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
     return rest, weights
 
 
-def lead_by(residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False) -> Lead | None:
+def lead_by(
+    residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False, lasting: float = 0.0
+) -> Lead | None:
     """Return the offset at which a residual, of elements at times (n,), is smallest; None: no clear minimum.
 
-    There is none either if its root mean square is above `most`. `least` is added to the error, `scaled` as in `fit`.
+    There is none either if its root mean square is above `most`. `least` is added to the error, as is what a share
+    `lasting` of the residual would give if it were a constant's; `scaled` as in `fit`.
     """
     if len(times) < FEWEST:
         return None
@@ -223,7 +227,8 @@ def lead_by(residual: Residual, times: Array, most: float, least: float, *, scal
             return None
         offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
-    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, least)))
+    wrong = lasting * np.sqrt((w * rest**2).sum() / information)
+    return Lead(offset, float(np.linalg.norm([np.sqrt((blocks**2).sum()) / information, least, wrong])))
 
 
 def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
@@ -251,7 +256,7 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
         ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
         return np.angle(ahead * np.exp(-1j * azimuths)), np.ones((len(times), 1))
 
-    return lead_by(residual, times, ABSURD, FLOOR)
+    return lead_by(residual, times, ABSURD, FLOOR, lasting=LASTING)
 
 
 def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:

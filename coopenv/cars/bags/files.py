@@ -86,11 +86,17 @@ class BagFile:
         return reader
 
     def _unpacked(self, file: Path) -> Path:
-        """Return a copy of a packed file that is unpacked, until the bag is closed."""
-        from coopenv.cars.bags.streams import unpack_file
+        """Return a copy of a packed file that is unpacked, until the bag is closed. Raises TooLargeError."""
+        import zstandard
+
+        from coopenv.backends.mcap.container import Allowance
 
         place = Path(self._stack.enter_context(tempfile.TemporaryDirectory()), file.name.removesuffix(PACKED))
-        unpack_file(file, place)
+        allowance = Allowance(file.stat().st_size)
+        with file.open("rb") as packed, place.open("wb") as out:
+            for data in zstandard.ZstdDecompressor().read_to_iter(packed):
+                allowance.take(len(data))
+                out.write(data)
         return place
 
     def _complete_types(self) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import apsw
-import zstandard
 from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat, TopicInfo
 from rosbags.rosbag1.reader import Header, RecordType, normalize, read_uint32
 from rosbags.typesys.msg import normalize_msgtype
@@ -175,16 +174,6 @@ def _ros1_records(stream: BinaryIO, allowance: Allowance) -> Iterator[tuple[Any,
         if not chunks:
             return
     raise EOFError(ENDS_EARLY)
-
-
-def unpack_file(packed: Path, place: Path) -> None:
-    """Write a file unpacked to a place. Raises TooLargeError: it unpacks to too much."""
-    allowance = Allowance(packed.stat().st_size)
-    with packed.open("rb") as stream, place.open("wb") as out:
-        unpacked = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
-        while data := unpacked.read(2**20):
-            allowance.take(len(data))
-            out.write(data)
 
 
 FORMS: dict[str, Callable[[Path, Allowance], Entries]] = {

@@ -89,14 +89,14 @@ class FakeCamera:
         share = self._faults.value("wrong_stamps", due)
         if share and self._rng.random() < share:
             stamp += round(AHEAD * 1e9)
+        begin = stamp - self._vision.late((), self._calibration.image_size[1])
         if self._renderer is None:
             blocks = [self._block(spot) for spot in spots]
-            self._publisher.send(Role.DETECTIONS, stamp, "camera", objects=blocks)
+            self._publisher.send(Role.DETECTIONS, begin, "camera", objects=blocks)
             self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
             return
         frame = self._renderer.render(self._tags(spots), BLUR, NOISE, self._rng)
-        stamp -= self._vision.late((), len(frame))
-        self._publisher.send(Role.DETECTIONS, stamp, "camera", **self._fields(frame))
+        self._publisher.send(Role.DETECTIONS, begin, "camera", **self._fields(frame))
 
     def _camera_info(self, _due: int, stamp: int) -> None:
         c = self._calibration
@@ -112,11 +112,22 @@ class FakeCamera:
         self._frames += 1
         seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
         self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
-        pixels = self._calibration.pixels(np.array([*seen.values()]).reshape(-1, 3))
-        sizes = [self._side / max(self._world.distance(agent), self._side) for agent in seen]
+        far = np.array([max(self._world.distance(agent), self._side) for agent in seen])
+        pixels, sizes = self._rolled(np.array([*seen.values()]).reshape(-1, 3), far), self._side / far
         rows = zip(seen, pixels, sizes, strict=True)
         spots = [Spot(self._markers[agent], pixel, size, self._ages[agent]) for agent, pixel, size in rows]
         return self._with_faults(sorted(spots, key=lambda spot: -spot.size), now)
+
+    def _rolled(self, units: Array, far: Array) -> Array:
+        """Return the pixels (m, 2) of rays (m, 3) to markers at distances (m,), each at the time of its row.
+
+        Rays are those of the middle row. Only the own motion counts.
+        """
+        pixels = self._calibration.pixels(units)
+        late = self._vision.row_time * (pixels[:, 1:] - 0.5 * self._calibration.image_size[1])
+        (velocity, turn), camera = self._world.twist, self._world.scenario.cameras[self._world.vehicle]
+        w, v = turn @ camera.to_body(), (velocity + np.cross(turn, camera.position)) @ camera.to_body()
+        return self._calibration.pixels(units - late * (np.cross(w, units) + v / far[:, None]))
 
     def _with_faults(self, spots: list[Spot], now: int) -> list[Spot]:
         faults, rng, size = self._faults, self._rng, self._calibration.image_size

@@ -22,6 +22,7 @@ from coopenv.cars.deployment import DeploymentError, Sensors, load_deployment
 from coopenv.cars.fake.faults import FakeSettings
 from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.profile import SVEA, CarProfile, Role, load_profile
+from coopenv.cars.readings import read
 from coopenv.cars.see import FrameReader
 from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
@@ -115,6 +116,41 @@ def test_bearings_are_stamped_with_the_middle_of_the_exposure() -> None:
     frame = eyes.arrivals("svea7", Role.DETECTIONS)[-1]
     assert stamp_of(about) - stamp_of(frame) == 10_000_000
     assert 0 <= eyes.wall + eyes.now - stamp_of(about) < 10_000_000  # when it was taken
+
+
+def test_a_rolling_shutter_is_read_at_the_time_of_its_rows() -> None:
+    """While the car turns, bearings hold for their stamps, exactly for their rows; without settings for neither."""
+    eyes = Eyes(exposure=0.008, row_time=4e-5)
+    world, camera, vision = (
+        eyes.cars["svea7"].world,
+        Calibration.of(eyes.scenario.cameras[0]),
+        eyes.fleet.profile.vision,
+    )
+    world.put(world.agent, turned(0.7 * np.pi), np.array([-0.3, -1.2, 0.0]))
+    eyes.drive("svea7", 0.4, -0.45, 2.0)
+    poses = eyes.arrivals("svea7", Role.TRUTH)
+    table = np.array([(stamp_of(m) - eyes.wall, *place_of(m)) for m in poses], dtype=np.float64)
+
+    def error(ray: np.ndarray, marker: int, stamp: float) -> float:
+        x, y, yaw = (np.interp(stamp - eyes.wall, table[:, 0], column) for column in table[:, 1:].T)
+        world.put(world.agent, turned(yaw), np.array([x, y, 0.0]))
+        return float(np.degrees(np.linalg.norm(ray - true_rays(eyes)[marker])))
+
+    at_stamp, at_row, unset = list[float](), list[float](), list[float]()
+    for message in eyes.arrivals("svea7", Role.DETECTIONS)[10:]:
+        found: Any = read(Role.DETECTIONS, message, camera, vision=vision)
+        rows, begin = camera.pixels(found.bearings)[:, 1], stamp_of(message)
+        for marker, ray, row in zip(found.markers, found.bearings, rows, strict=True):
+            at_stamp.append(error(ray, marker, begin + found.late))
+            at_row.append(error(ray, marker, begin + vision.late([row], 0)))
+            unset.append(error(ray, marker, begin))
+    assert len(unset) > 100 and max(at_stamp) < 0.1 and max(at_row) < 0.03 and np.mean(unset) > 0.3
+
+
+def place_of(message: Any) -> tuple[float, float, float]:
+    """Return x, y and yaw."""
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    return p.x, p.y, float(2.0 * np.arctan2(q.z, q.w))
 
 
 def test_identities_are_lost_and_wrong() -> None:
