@@ -100,6 +100,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "run urban_crossing --horizon 5",
             "No such option: --horizon; a key of the scenario: --override horizon=VALUE",
         ),
+        ("run urban_crossing noise.enabled=false", "; a key of the scenario: --override noise.enabled=VALUE"),
+        ("run facade.toml", "no such scenario file: facade.toml (did you mean 'facade'?)"),
         ("evaluate facade peek", "evaluate --help"),
         ("describe peek", "expected an environment, peek is an agent"),
         ("run robust", "expected an environment, robust is an observer"),

@@ -1,4 +1,4 @@
-"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`.
+"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`, and by its own name.
 
 Entry points are strings, and what they need is imported when an environment is made: `import coopenv` costs little.
 """
@@ -46,14 +46,14 @@ def make_aec(name: str, **options: Any) -> AECEnv[str, Any, Any]:
 def register_all() -> None:
     """Register what is not registered yet."""
     for name in list_envs():
-        identity = environment_id(name)
-        if identity not in gymnasium.registry:
-            gymnasium.register(
-                identity,
-                entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
-                vector_entry_point="coopenv.api.make:make_rows",
-                kwargs={"name_or_path": name},
-            )
-        for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):
-            if identity not in registry:
-                pettingzoo.register(kind, identity, entry_point=f"{__name__}:make_{kind}", kwargs={"name": name})
+        for identity in (environment_id(name), f"coopenv/{name}", name):
+            if identity not in gymnasium.registry:
+                gymnasium.register(
+                    identity,
+                    entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
+                    vector_entry_point="coopenv.api.make:make_rows",
+                    kwargs={"name_or_path": name},
+                )
+            for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):
+                if identity not in registry:
+                    pettingzoo.register(kind, identity, entry_point=f"{__name__}:make_{kind}", kwargs={"name": name})

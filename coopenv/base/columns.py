@@ -5,15 +5,15 @@ from __future__ import annotations
 import csv
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from coopenv.base.errors import Explained
+from coopenv.base.errors import CoopenvError, Explained
 from coopenv.base.files import replace_text, replacing_file
 from coopenv.base.installation import install_command, needing
 
@@ -79,9 +79,26 @@ class Tabular(Explained, ABC):
     `frame.attrs["units"]`, `dataset["position_rmse_m"].attrs["units"]`.
     """
 
+    _PARTS = ""
+    """Attribute with the names that `result[name]` takes, over which a result is iterated."""
+
     @abstractmethod
     def columns(self) -> Columns:
         """Return the table."""
+
+    def __iter__(self) -> Iterator[str]:
+        return map(str, getattr(self, self._PARTS))
+
+    def __len__(self) -> int:
+        return len(getattr(self, self._PARTS))
+
+    def __array__(self, *args: Any, **options: Any) -> NoReturn:
+        """Refuse, as `pandas.DataFrame(result)` asks for this: columns differ in type."""
+        raise CoopenvError(f"{type(self).__name__} is not an array: to_pandas() returns its table")
+
+    def __arrow_c_stream__(self, schema: Any = None) -> Any:
+        """Return the table for programs that read Arrow, as `polars.DataFrame(result)` does."""
+        return self.to_polars().__arrow_c_stream__(schema)
 
     def to_pandas(self, **options: Any) -> DataFrame:
         """Return the table for pandas. Raises CoopenvError: it is not installed."""

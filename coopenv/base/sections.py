@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.base.errors import CoopenvError, listed, shortened, shown, suggest
+from coopenv.base.errors import CoopenvError, check_one_of, listed, shortened, shown, suggest
 
+CHANGE = "scenario | {'dotted.key': value} returns a changed scenario"
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
@@ -30,11 +31,13 @@ class Section(BaseModel):
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a change; overrides of `load_scenario` return a changed copy."""
         where = f"{type(self).__name__}.{name}"
-        raise CoopenvError(f"{where}: is frozen; load_scenario(scenario, {{'key': value}}) returns a changed scenario")
+        raise CoopenvError(f"{where}: is frozen; {CHANGE}")
+
+    __dataclass_fields__ = property()  # which `dataclasses.replace` asks for; it raises the error of `__getattr__`
 
     def __getitem__(self, key: str) -> Any:
-        """Return the value of a dotted key, as overrides name it."""
-        return reduce(getattr, key.split("."), self)
+        """Return the value of a dotted key, as overrides name it; an entry of a list by index or name."""
+        return reduce(_entry, str(key).split("."), self)
 
     if not TYPE_CHECKING:  # which knows the attributes
 
@@ -43,6 +46,8 @@ class Section(BaseModel):
             try:
                 return super().__getattr__(name)
             except AttributeError:
+                if name == "__dataclass_fields__":
+                    raise AttributeError(f"{type(self).__name__} is not a dataclass; {CHANGE}") from None
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
                 known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; as data: model_dump()" if keys else ""
                 raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
@@ -70,6 +75,14 @@ class Section(BaseModel):
             if name in properties:
                 properties[name]["description"] = text
         return schema
+
+
+def _entry(node: Any, key: str) -> Any:
+    if not isinstance(node, tuple):
+        return getattr(node, key)
+    named = {name: entry for i, entry in enumerate(node) for name in (str(i), getattr(entry, "name", str(i)))}
+    check_one_of("unknown entry", key, named)
+    return named[key]
 
 
 Model = TypeVar("Model", bound=BaseModel)

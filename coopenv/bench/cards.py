@@ -18,7 +18,7 @@ from rich.table import Table
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.base.columns import Columns, Tabular
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
@@ -154,6 +154,7 @@ class Evaluation(Contest, Tabular):
     As a table it has a row per driver and metric: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
 
+    _PARTS = "episodes"
     episodes: Mapping[str, Episodes]
 
     @cached_property
@@ -172,6 +173,11 @@ class Evaluation(Contest, Tabular):
         base, others = self.episodes[self.reference], {**self.episodes}
         del others[self.reference]
         return {name: compare_paired(own, base, self.block) for name, own in others.items()}
+
+    def __getitem__(self, driver: str) -> list[Result]:
+        """Return the figures of one driver. Raises CoopenvError: it was not evaluated."""
+        check_one_of("unknown driver", driver, self.results)
+        return self.results[driver]
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one flat row per driver and metric."""

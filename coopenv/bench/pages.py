@@ -62,7 +62,8 @@ def space_path(name: str, folder: Path) -> Path:
 def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: Callable[[float], None]) -> None:
     """Film an environment for the page in a folder; where nothing moves there is no film.
 
-    Those that are driven are filmed in 3-D too, behind the vehicle that drives longest, where the extra is installed.
+    Those that are driven are filmed in 3-D too, where the extra is installed: behind the vehicle that drives longest,
+    until it leaves the scene.
     """
     path, space = folder / f"{name}.webp", space_path(name, folder)
     policy, driver = driver_of(None, scenario, name, _SEED)
@@ -75,8 +76,11 @@ def write_page_films(name: str, scenario: Scenario, folder: Path, on_progress: C
     _write_small(lambda width: top_view_film(record, False), path, record, lambda share: on_progress(0.5 + share / 4))
     if scenario.driven and find_spec("pyvista"):
         longest = int(np.isfinite(record.fields["position_error"]).sum(axis=0).argmax())
-        behind = partial(space_film, [("", record)], cameras=("follow",), vehicle=longest)
-        _write_small(behind, space, record, lambda share: on_progress(0.75 + share / 4))
+        distance = np.abs(record.fields["position"][..., :2]).max(axis=-1)
+        near = distance[:, len(scenario.landmarks) + longest] <= 1.1 * np.nanmax(distance[0])  # of all at the start
+        inside = record.of(np.flatnonzero(near))
+        behind = partial(space_film, [("", inside)], cameras=("follow",), vehicle=longest)
+        _write_small(behind, space, inside, lambda share: on_progress(0.75 + share / 4))
 
 
 def _write_small(

@@ -25,6 +25,8 @@ from coopenv.base.interrupts import end_with_parent, held
 POLL = 0.1  # s between two looks at the processes
 PATIENCE = 10.0
 """Seconds of the clock per second of processor time: a process that waits for ever needs none."""
+NOT_RUN = "; its remaining records were not run"
+"""End of a reason for which an observer is started on no further record."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,8 @@ class Divided(Protocol):
     def rest(self, done: int) -> Self:
         """Return the task without its first parts."""
 
-    def ending(self, other: Self, part: int, reason: str) -> Self:
-        """Return the task, in which what has ended in a part of another one is not started, but fails as well."""
+    def ending(self, other: Self, part: int, reason: str, everywhere: bool) -> Self:
+        """Return the task; what ended in a part of another fails unstarted, everywhere or in tasks that are alike."""
 
 
 @contextmanager
@@ -110,7 +112,7 @@ class _Worker:
         with suppress(psutil.Error):  # it has ended, and its pipe with it
             time, clock, memory = (now - then for now, then in zip(self.measured(), self.before, strict=True))
             if time > limits.seconds or clock > PATIENCE * limits.seconds:
-                return f"more than {limits.seconds:g} s on one record (--seconds)"
+                return f"more than {limits.seconds:g} s on one record (--seconds){NOT_RUN}"
             if memory > limits.mebibytes:
                 return f"more than {limits.mebibytes:g} MiB of memory (--memory)"
         return ""
@@ -218,6 +220,6 @@ class Pool:
             raise CoopenvError(f"a process died: out of memory, or killed, or an observer ended it ({ended})")
         task, part, reason = self.tasks[number], self.done[number], reason or ended
         for other in (number, *self.waiting):
-            self.tasks[other] = self.tasks[other].ending(task, part, reason)
+            self.tasks[other] = self.tasks[other].ending(task, part, reason, reason.endswith(NOT_RUN))
         self.tasks[number], self.done[number] = self.tasks[number].rest(part), 0
         self.waiting.appendleft(number)

@@ -300,10 +300,12 @@ def usage_hint(error: Any) -> str:
     name, context = str(getattr(error, "option_name", "")), error.ctx
     if context is None or not (name or type(error) is typer.BadParameter.__base__):
         return ""
-    if name and "--override" in [option for parameter in context.command.params for option in parameter.opts]:
+    if "--override" in [option for parameter in context.command.params for option in parameter.opts]:
         from coopenv.scenario import Scenario
 
-        if (key := name.lstrip("-").replace("-", "_")) in Scenario.model_fields:
+        given = name or error.format_message().rpartition("(")[2]
+        key = given.lstrip("-").partition("=")[0].replace("-", "_")
+        if key.partition(".")[0] in Scenario.model_fields:
             return f"; a key of the scenario: --override {key}=VALUE"
     return f"; see {context.command_path} --help"
 

@@ -78,6 +78,7 @@ class Trajectory(RecordedGeometry, Tabular):
     As a table it has a row per tick and vehicle: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
 
+    _PARTS = "vehicles"
     rotation: Annotated[np.ndarray, "f K N 3 3"]  # true, body to map
     position_estimate: Annotated[np.ndarray, "f K N 3"]  # m
     rotation_estimate: Annotated[np.ndarray, "f K N 3 3"]  # body to map

@@ -219,6 +219,7 @@ class Results(Tabular):
     The trajectory as a table: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
 
+    _PARTS = "trajectory"
     metrics: dict[str, Any]
     """Contents of `metrics.json`."""
     trajectory: Trajectory

@@ -90,6 +90,9 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
         raise
 
 
+Scenario.__or__ = load_scenario  # type: ignore[assignment,method-assign]
+
+
 def scenario_name(name_or_path: ScenarioLike) -> str:
     """Return what results call a scenario: the stem of its file, the name of a scene; without these its title."""
     if isinstance(name_or_path, str | Path):

@@ -3,9 +3,9 @@
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -38,7 +38,11 @@ class Map(Section):
 
 
 class Scenario(Section):
-    """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
+    """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up.
+
+    `scenario["noise.enabled"]` is a value, `scenario | {"noise.enabled": False}` a changed scenario, and
+    `scenario.model_dump_json()` its JSON.
+    """
 
     title: Text
     description: Text = ""
@@ -82,6 +86,10 @@ class Scenario(Section):
         """The main figures: of vehicles and landmarks, the observer's name, and the length, s."""
         counts = {"vehicles": len(self.vehicles), "landmarks": len(self.landmarks)}
         return {**counts, "observer": self.observer.name, "horizon": self.horizon}
+
+    if TYPE_CHECKING:  # which is `load_scenario`
+
+        def __or__(self, overrides: Mapping[str, Any]) -> Self: ...
 
     def __repr__(self) -> str:
         return one_line(self, self.title, self.facts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import pickle
 from collections.abc import Callable
@@ -37,7 +38,7 @@ def kinds(scenario: Scenario) -> dict[str, Any]:
         "scenario": scenario,
         "dict": scenario.model_dump(),
         "JSON": json.loads(scenario.model_dump_json(exclude_unset=True)),
-        "changed copy": coopenv.load_scenario(coopenv.load_scenario(ENV), {"horizon": 0.5}),
+        "changed copy": coopenv.load_scenario(ENV) | {"horizon": 0.5},
     }
 
 
@@ -147,6 +148,27 @@ def test_arguments_in_the_wrong_place_are_named() -> None:
         coopenv.load_scenario(ENV, horizon=3.0)  # type: ignore[call-arg]
 
 
+def test_a_scenario_is_changed_and_read_by_dotted_keys(scenario: Scenario) -> None:
+    changed = scenario | {"noise.enabled": False, "landmarks.1.yaw": 0.3}
+    assert scenario["noise.enabled"] and not changed["noise.enabled"]
+    name = scenario.landmarks[1].name
+    assert changed[f"landmarks.{name}.yaw"] == changed["landmarks.1.yaw"] == 0.3
+    with pytest.raises(coopenv.CoopenvError, match=rf"^unknown entry 'nosuch'; known: .*{name}"):
+        scenario["landmarks.nosuch"]
+    with pytest.raises(
+        AttributeError, match=r"^Scenario is not a dataclass; scenario \| \{'dotted\.key': value\} returns"
+    ):
+        dataclasses.replace(scenario, horizon=3.0)  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("identity", ["coopenv/Facade-v0", "coopenv/facade", "facade", "coopenv:facade"])
+def test_an_environment_is_made_by_its_own_name(identity: str) -> None:
+    with gymnasium.make(identity) as env:
+        assert env.reset(seed=1)[0].shape == env.observation_space.shape
+    if ":" not in identity:
+        assert pettingzoo.make("parallel", identity).scenario == coopenv.load_scenario(ENV)
+
+
 def test_names_are_listed_alike() -> None:
     assert "robust" in coopenv.list_observers() and "peek" in coopenv.list_agents() and ENV in coopenv.list_envs()
 
@@ -159,13 +181,15 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a list": (lambda: coopenv.compare(["riccati"], [ENV]), "^environment: .* got list"),  # type: ignore[arg-type]
     "a set attribute": (
         lambda: setattr(coopenv.load_scenario(ENV), "horizon", 3.0),
-        r"^Scenario\.horizon: is frozen; load_scenario\(scenario, \{'key': value\}\) returns a changed scenario",
+        r"^Scenario\.horizon: is frozen; scenario \| \{'dotted\.key': value\} returns a changed scenario",
     ),
     "a nested one": (
         lambda: setattr(coopenv.load_scenario(ENV).noise, "enabled", False),
         r"^Noise\.enabled: is frozen",
     ),
     "a seed as text": (lambda: coopenv.parallel_env(ENV).reset(seed="3"), "^seed must be a whole number, got '3'"),  # type: ignore[arg-type]
+    "an unknown key": (lambda: coopenv.load_scenario(ENV) | {"horizn": 3.0}, r"horizn: .*did you mean 'horizon'\?"),
+    "a file of an environment": (lambda: coopenv.load_scenario("facade.toml"), r"did you mean 'facade'\?"),
     "a range of seeds": (lambda: coopenv.run(ENV, seed=range(3)), "^seed must be a whole number"),  # type: ignore[arg-type]
     "a render mode": (
         lambda: coopenv.parallel_env(ENV, render_mode="ansi"),

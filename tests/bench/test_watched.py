@@ -13,7 +13,8 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import find_executor
-from coopenv.bench.watched import _work
+from coopenv.bench.frozen import Frozen, report
+from coopenv.bench.watched import NOT_RUN, Limits, _work
 from coopenv.cli import main
 from tests.helpers.processes import DEADLOCK
 
@@ -75,8 +76,8 @@ class Crashes(Fine):
 '''
 REASONS = {
     "Fine": "",
-    "Loops": "with seed 0: more than 2 s on one record (--seconds)",
-    "Waits": "with seed 0: more than 2 s on one record (--seconds)",
+    "Loops": "with seed 0: more than 2 s on one record (--seconds); its remaining records were not run",
+    "Waits": "with seed 0: more than 2 s on one record (--seconds); its remaining records were not run",
     "Allocates": "with seed 0: more than 400 MiB of memory (--memory)",
     "Delegates": "with seed 0: more than 400 MiB of memory (--memory)",
     "Raises": "of vehicle_1 at 0.083 s: ValueError: on purpose (mine.py:",
@@ -114,6 +115,23 @@ def test_what_misbehaves_is_ended_with_one_line(tmp_path: Path, monkeypatch: pyt
     names = ["Loops", "Allocates", "Raises", "Ends", "Fine"]
     for name, reason in board(tmp_path, monkeypatch, names, "--seeds", "2", "--jobs", "1").items():
         assert reason.startswith(REASONS[name]) and bool(reason) == (name != "Fine")
+
+
+@pytest.mark.parametrize(("name", "started", "seeds"), [("Loops", ["lane"], 1), ("Raises", ["lane", "roots"], 4)])
+def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
+    name: str, started: list[str], seeds: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = f"class Mine{name}({name}):\n    def reset(self, *start):\n        print('reset', file=open('log', 'a'))\n"
+    (tmp_path / "own.py").write_text(f"{PLUGINS}\n{count}        super().reset(*start)\n")
+    monkeypatch.chdir(tmp_path)
+    benchmark, names = Frozen("v1"), ["lane", "roots"]
+    result = benchmark.run([f"own.py:Mine{name}", "dead_reckoning"], names, 1, Limits(seconds=2.0), lambda share: None)
+    rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
+    assert all(rows["dead_reckoning", scene]["rmse_m"] and rows[f"Mine{name}", scene]["failure"] for scene in names)
+    vehicles = sum(len(scene.source.scenario.vehicles) for scene in benchmark.scenes(started))
+    assert len((tmp_path / "log").read_text().split()) == seeds * vehicles
+    lines = [part for part in report(benchmark, result) if isinstance(part, str) and part.startswith(f"Mine{name}")]
+    assert len(lines) == 1 and lines[0].endswith(NOT_RUN) == (name == "Loops")
 
 
 @pytest.mark.slow

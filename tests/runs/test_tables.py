@@ -74,7 +74,18 @@ def test_a_trajectory_is_a_long_table(results: Results) -> None:
     data = results.to_xarray()
     assert_array_equal(data["position_error_m"], of.position_error)
     assert data["position_error_m"].attrs == {"units": "m"} and list(data.vehicle.values) == of.vehicles.tolist()
-    assert_array_equal(results.to_polars()["nees"], frame["nees"])
+    assert_array_equal(polars.DataFrame(results)["nees"], frame["nees"])
+
+
+def test_a_result_is_iterated_by_what_it_is_indexed_with(results: Results) -> None:
+    vehicles = results.trajectory.vehicles.tolist()
+    for found in (results, results.trajectory):
+        assert len(found) == len(vehicles) and [*found] == vehicles and "nosuch" not in found
+        assert all(found[name].vehicles.tolist() == [name] for name in found)
+        with pytest.raises(
+            coopenv.CoopenvError, match=rf"^{type(found).__name__} is not an array: to_pandas\(\) returns"
+        ):
+            pandas.DataFrame(found)
 
 
 def test_the_spread_is_that_of_infos() -> None:

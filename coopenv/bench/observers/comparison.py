@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, product
 from pathlib import Path
@@ -37,6 +37,8 @@ class Comparison(Leaderboard, Tabular):
     `windows=True` of every window of time: `to_pandas`, `to_polars`, `to_xarray`, `to_csv` and `to_parquet`.
     """
 
+    _PARTS = "observers"
+
     def table(self, variant: str | None = None) -> Table:
         """Return the position RMSE of every observer and vehicle beside the bounds, m, as a table for a terminal.
 
@@ -65,15 +67,6 @@ class Comparison(Leaderboard, Tabular):
         samples = [sample for sample in self.samples if sample.observer == observer]
         draws = [draw for draw in self.draws if draw.observer == observer]
         return replace(self, observers=(observer,), samples=samples, draws=draws)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.observers)
-
-    def __len__(self) -> int:
-        return len(self.observers)
-
-    def __contains__(self, observer: object) -> bool:
-        return observer in self.observers
 
     def to_latex(self, path: str | Path | None = None, variant: str | None = None) -> str:
         """Return the position RMSE with standard errors as a LaTeX table (package booktabs); write it to a path.

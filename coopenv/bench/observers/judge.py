@@ -232,10 +232,11 @@ class Task:
         """Return the task without its first observers."""
         return replace(self, observers=dict([*self.observers.items()][done:]))
 
-    def ending(self, other: "Task", part: int, reason: str) -> "Task":
-        """Return the task without the observer that was ended as another's part, if the variant is the same."""
+    def ending(self, other: "Task", part: int, reason: str, everywhere: bool) -> "Task":
+        """Return the task without the observer that was ended as another's part; unless everywhere, of one variant."""
         name = [*other.observers][part]
-        if name not in self.observers or (self.source, self.variant) != (other.source, other.variant):
+        alike = (self.source, self.variant) == (other.source, other.variant)
+        if name not in self.observers or not (alike or everywhere):
             return self
         ended = Ended(f"with seed {other.seed}: {reason}")
         return replace(self, observers={**self.observers, name: ended})
@@ -249,7 +250,7 @@ def judge(task: Task) -> list[JudgedRun]:
 def judge_all(executor: Executor, tasks: Sequence[Task], on_done: Callable[[int], None]) -> list[list[JudgedRun]]:
     """Judge the observers of all tasks; where the executor has limits, those that exceed one fail, the others do not.
 
-    An observer that was ended is not started again in the same variant.
+    An observer that was ended is not started again in the same variant; one that took too long not at all.
     """
     if isinstance(executor, Local) and executor.limits is not None:
         return Pool(tasks, executor.jobs, executor.limits).run(on_done)
