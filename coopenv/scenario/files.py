@@ -39,7 +39,9 @@ ScenarioLike = str | Path | Mapping[str, Any] | Scenario
 
 @explained
 def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | None = None) -> Scenario:
-    """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
+    """Read a scenario and apply dotted overrides; `scenario | {"noise.enabled": False}` does the same.
+
+    `scenario["noise.enabled"]` is the value of a key, `scenario.model_dump_json()` all of them as JSON.
 
     Args:
         name_or_path: file stem of `envs/`, a scene such as `lane:20`, the path of a TOML file, a dict of what such a

@@ -38,11 +38,7 @@ class Map(Section):
 
 
 class Scenario(Section):
-    """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up.
-
-    `scenario["noise.enabled"]` is a value, `scenario | {"noise.enabled": False}` a changed scenario, and
-    `scenario.model_dump_json()` its JSON.
-    """
+    """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
 
     title: Text
     description: Text = ""
