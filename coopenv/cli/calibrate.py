@@ -52,14 +52,14 @@ def calibrate(
     replace_text(files[0], toml_text(result))
     files += [save(residual_figure(result, c), out / f"residuals_{car.name}.png") for c, car in enumerate(drive.cars)]
     if as_json:
-        options.print_json({"rows": result.rows, "findings": result.findings, "noise": result.noise})
+        options.print_json({name: getattr(result, name) for name in ("rows", "findings", "notes", "noise")})
         return
     _print(result.rows)
     console = options.console()
     if any(car.lens is None for car in drive.cars):
         console.print("Bearings without pixels: intrinsics cannot be estimated.")
     console.print("Measured noise: " + ", ".join(f"{name} = {value:.3g}" for name, value in result.noise.items()))
-    for line in result.findings or ("No constant is wrong.",):
+    for line in (*(result.findings or ("No constant is wrong.",)), *result.notes):
         console.print(line, soft_wrap=True)
     console.print(f"Files: {', '.join(map(str, files))}", soft_wrap=True)
 

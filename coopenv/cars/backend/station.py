@@ -109,7 +109,7 @@ class Pacer:
     def start(self) -> int:
         """Begin anew: time counts from the first decision on. Returns the time now."""
         self._wall = time.time_ns() - time.monotonic_ns()
-        self._due = 0  # before the first decision
+        self._due, self._late = 0, False  # before the first decision
         self.missed = self.in_a_row = 0
         """Decisions that missed their deadline, in all and in a row up to now."""
         self.lateness.clear()
@@ -117,8 +117,9 @@ class Pacer:
 
     def decide(self) -> None:
         """Begin a decision: where even its last tick is due already, count it and go on from now."""
-        self._due = self._due or self.now()
-        self.in_a_row = self.in_a_row + 1 if self._leave_out() else 0
+        self._due, self._late = self._due or self.now(), False
+        self._leave_out()
+        self.in_a_row = self.in_a_row + 1 if self._late else 0
 
     def wait(self) -> int:
         """Sleep until the next tick is due and return the time then."""
@@ -131,14 +132,12 @@ class Pacer:
         self.lateness.append((now - self._due) * 1e-9)
         return now
 
-    def _leave_out(self) -> bool:
-        """Skip decisions whose time is over; return whether there were any."""
-        over = (self.now() - self._due) // self._decision
-        if over <= 0:
-            return False
-        self.missed += 1
-        self._due += over * self._decision
-        return True
+    def _leave_out(self) -> None:
+        """Skip decisions whose time is over; the present one counts as late once."""
+        if (over := (self.now() - self._due) // self._decision) > 0:
+            self.missed += not self._late
+            self._late = True
+            self._due += over * self._decision
 
     def late(self, share: float) -> float:
         """Return the lateness that a share of the ticks did not exceed, s; 0 where there were none."""

@@ -69,6 +69,7 @@ class Calibrated:
     fit: Fit  # with the wrong ones corrected
     rows: tuple[Row, ...]
     findings: tuple[str, ...]  # a line per finding
+    notes: tuple[str, ...]  # which stamps import has moved
     noise: dict[str, float]  # measured, by key of an environment
 
 
@@ -211,13 +212,13 @@ def _result(batch: Batch, given: Fit, fit: Fit, pairs: Sequence[tuple[int, int]]
         found = [rows[n] for n in part if bad[n]]
         changes = [f"{r.name.split('.', 1)[1]} {r.given:.5g} -> {r.value:.5g} +- {r.error:.2g} {r.unit}" for r in found]
         lines += [f"{title} is wrong: {', '.join(changes)}"] if changes else []
+    topics = ((car.name, topic, added) for car in batch.cars for topic, added in car.topics if abs(added) > FINEST["s"])
+    notes = tuple(f"{name}: import has moved the stamps of {topic} by {added:+.3f} s" for name, topic, added in topics)
     for c, car in enumerate(batch.cars):
-        shifted = ((topic, added) for topic, added in car.topics if abs(added) > FINEST["s"])
-        lines += [f"{car.name}: import has moved the stamps of {topic} by {added:+.3f} s" for topic, added in shifted]
         late = batch.own(c).start + np.array([CAMERA_TIME, TRUTH_TIME])
         if bad[late].all() and abs(np.diff(x[late])[0]) < SIGNIFICANT * np.hypot(*error[late]):
             lines.append(f"{car.name}: camera and motion capture agree, so that the stamps of wheels and IMU are wrong")
-    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), _noise(batch, fit))
+    return Calibrated(batch, given, fit, tuple(rows.values()), tuple(lines), notes, _noise(batch, fit))
 
 
 def _unexplained(batch: Batch, fit: Fit) -> Iterator[str]:

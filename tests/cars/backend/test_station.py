@@ -79,6 +79,17 @@ def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes(clock):
     assert pacer.missed == 0 and pacer.late(1.0) == 0.0
 
 
+def test_a_decision_misses_its_deadline_once_however_often_the_computer_stands_still(clock):
+    pacer = begun()
+    decision(pacer, clock, (200 * MS, 200 * MS, 0))
+    assert pacer.missed == 1
+    decision(pacer, clock, (0, 0, 200 * MS))
+    decision(pacer, clock, (200 * MS, 200 * MS, 200 * MS))
+    assert pacer.missed == 2 and pacer.in_a_row == 1
+    decision(pacer, clock, (0, 0, 0))
+    assert pacer.missed == 3 and pacer.in_a_row == 2
+
+
 def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_anything(clock):
     pacer = begun()
     begin = pacer.now()

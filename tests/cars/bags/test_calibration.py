@@ -167,6 +167,13 @@ def test_several_wrong_constants_are_named_and_recovered(
         assert off(result, name, value) < 3.0, name
 
 
+def test_stamps_that_import_has_moved_are_no_finding() -> None:
+    given = drive()
+    moved = replace(given.cars[0], topics=(("/camera", -0.12), ("/wheels", 0.0), ("/truth", 0.0)))
+    result = calibrate(replace(given, cars=(moved,)))
+    assert not result.findings and result.notes == ("car: import has moved the stamps of /camera by -0.120 s",)
+
+
 def test_bearings_alone_give_the_mounting_and_no_intrinsics() -> None:
     given = drive(lever=LEVER - [0, 0, 0.02])
     car = given.cars[0]
