@@ -73,6 +73,14 @@ test-train: $(VENV)/.train ## the tests that train policies (installs torch)
 agents: $(VENV)/.train ## train the agents of agents/ that learn, about two hours; goes on where it was interrupted
 	@$(BIN)/coopenv bench learning agents/study.toml
 
+$(VENV)/.study: $(VENV)/.train
+	@echo "Installing the methods of the study into $(VENV) (once) ..."
+	@$(PIP) --editable '.[study]'
+	@touch $@
+
+study: $(VENV)/.study ## compare methods of learning, about an hour; goes on where it was interrupted
+	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.methods --page docs/environments/methods.md
+
 test-sumo: $(VENV)/.dev ## the tests that need SUMO (250 MB)
 	@$(PIP) --editable '.[sumo]'
 	@$(BIN)/python -m pytest -k sumo tests/backends tests/test_envs.py

@@ -1,0 +1,1 @@
+"""A study of methods of learning, on equal budgets; `python -m benchmarks.methods`."""
