@@ -40,9 +40,9 @@ def data_directory(kind: str) -> Path:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra: from the folder of a clone, or else by the package's name."""
-    package = Path(__file__).resolve().parents[1]
-    return f"pip install '{'coopenv' if (package / 'data').is_dir() else '.'}[{extra}]'"
+    """Return the command that installs an extra: in or from a clone by its folder, or else by the package's name."""
+    clone = not (Path(__file__).resolve().parents[1] / "data").is_dir() or Path("coopenv", "__init__.py").is_file()
+    return f"pip install '{'.' if clone else 'coopenv'}[{extra}]'"
 
 
 @cache
