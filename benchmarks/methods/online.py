@@ -64,8 +64,14 @@ class GroupDriver:
         self.policy, self.engine = policy, engine
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return actions (rows, A), rows (world, vehicle); vehicles that have ended observe 0, as in training."""
+        """Return actions, (rows, A), rows (world, vehicle).
+
+        Where an episode is over the observation is 0, as in training; with a reward of the team, it is over for all
+        vehicles at once.
+        """
         going = self.engine.view("ended") == 0
+        if self.engine.backend.scenario.reward.team != "own":
+            going = np.broadcast_to(going.any(axis=1, keepdims=True), going.shape)
         rows = torch.from_numpy(observations.reshape(*going.shape, -1) * going[..., None])
         group = TensorDict({GROUP: TensorDict({"observation": rows.float()}, going.shape)}, going.shape[:1])
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

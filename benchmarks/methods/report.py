@@ -25,16 +25,18 @@ by the reward of the environment. With each of {seeds} seeds they drive {worlds}
 
 {methods}
 
-Recordings are Minari datasets of {drivers}, with noise of {noise:g} on the actions.
+Recordings are Minari datasets of {drivers}, with noise of {noise:g} on the actions. `ppo` and `recurrent` also
+differ from `{base}` in their settings, and in that observations are normalised.
 
-A cell is the interquartile mean over seeds with its 95 % interval (bootstrap over seeds); e95 is that of all vehicles
-within the horizon. *Better* is the probability that a run is better than one of `{base}`. Of two runs that both have at
-least {arriving:.0f} % arrivals, the one with the smaller e95 is better; otherwise, the one with more arrivals.
+A cell is the interquartile mean over seeds with its 95 % interval (bootstrap over seeds). e95 is the 95th percentile of
+the position error of all vehicles under way, from 3 s on. *Better* is the probability that a run is better than one of
+`{base}`. Of two runs that both have at least {arriving:.0f} % arrivals, the one with the smaller e95 is better;
+otherwise, the one with more arrivals.
 
 {tables}
 
 ```
-make study                                # {minutes:.0f} minutes of CPU time; continues after an interruption
+make study                                # {minutes:.0f} minutes of CPU time to learn; continues after an interruption
 python -m benchmarks.methods --table      # the tables of the finished runs
 ```
 
@@ -101,7 +103,8 @@ def verdict(ranks: Mapping[str, list[np.ndarray]]) -> str:
         beside = ", ".join(shown[other] for other in close)
         return f"No method is apart from all others: `{best}` leads, not apart from {beside}."
     nearest = min(own, key=lambda other: own[other])
-    return f"`{best}` wins: its runs are better than those of every other method, least clearly than {shown[nearest]}."
+    words = "its probability to be better is above one half over every other method, and least over"
+    return f"`{best}` wins: {words} {shown[nearest]}."
 
 
 def chance_text(chance: tuple[float, float, float]) -> str:

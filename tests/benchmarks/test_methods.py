@@ -12,6 +12,8 @@ import pytest
 from benchmarks.methods import __main__ as command
 from benchmarks.methods import report, study
 from coopenv.base.errors import CoopenvError
+from coopenv.policies import Policy
+from coopenv.scenario import load_scenario
 
 SMALL = """
 decisions = 400
@@ -40,7 +42,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def rows(folder: Path) -> list[dict[str, str]]:
+def results_of(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "results.csv").open(encoding="utf-8")))
 
 
@@ -56,10 +58,10 @@ def test_every_method_trains_and_what_is_finished_is_kept(
     arguments = [str(place), "--data", str(tmp_path / "data"), "--page", str(page)]
     assert command.main([*arguments, "--only", "1"]) == 0
     assert "8 of 16 runs are finished" in page.read_text()
-    first = rows(tmp_path)
+    first = results_of(tmp_path)
     assert {row["seed"] for row in first} == {"1"} and len({row["e95_m"] for row in first}) == 8
     assert command.main(arguments) == 0
-    found, shown = rows(tmp_path), capsys.readouterr()
+    found, shown = results_of(tmp_path), capsys.readouterr()
     assert [row for row in found if row["seed"] == "1"] == first
     assert "8/8 lighthouse td3_bc 2" in shown.err
     assert page.read_text().count("\n| `") == 7 + 9
@@ -127,6 +129,23 @@ def test_probability_of_improvement_is_the_share_of_pairs() -> None:
     assert study.improvement([apart + 5.0], [apart]) == (1.0, 1.0, 1.0)
 
 
+def test_the_page_has_a_row_of_every_method(tmp_path: Path) -> None:
+    asked = study.read_study(written(tmp_path, SMALL.replace("seeds = [1, 2]", "seeds = [1, 2, 3]")))
+    arrived = {"ppo": 1.0, "clone": 0.5, "ippo": 0.25}
+    figures = dict.fromkeys(study.COLUMNS[4:], 0.0)
+    results = {
+        run: {**figures, "arrival_rate": arrived.get(run.method, 0.0), "e95_m": 0.1 * run.seed}
+        for run in study.runs(asked)
+    }
+    page = report.page(asked, results)
+    assert "| `ippo` | 25 [25, 25] | 0 [0, 0] | 20 [10, 30] |  | 0.0 |" in page
+    assert "| `clone` | 50 [50, 50] | 0 [0, 0] | 20 [10, 30] | 1.00 [1.00, 1.00] | 0.0 |" in page
+    assert "| `mappo` | 0 [0, 0] | 0 [0, 0] | 20 [10, 30] | 0.00 [0.00, 0.00] | 0.0 |" in page
+    assert "`ppo` wins" in page
+    del results[next(iter(results))]
+    assert "23 of 24 runs are finished" in report.page(asked, results)
+
+
 @pytest.mark.parametrize(("shift", "words"), [(10.0, "`b` wins"), (0.5, "No method is apart")])
 def test_the_verdict_names_a_winner_only_where_intervals_are_apart(shift: float, words: str) -> None:
     runs = np.arange(5.0)
@@ -168,3 +187,30 @@ def test_recurrent_ppo_learns_from_rows_under_way_alone() -> None:
         samples = [*buffer.get(8)]
         assert sum(int(each.mask.sum()) for each in samples) == acted.sum()
         assert all((each.observations[each.mask > 0.5] == 1.0).all() for each in samples)
+
+
+@pytest.mark.slow
+@pytest.mark.benchmarl
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("communicates", [False, True])
+def test_only_with_communication_a_vehicle_acts_on_what_others_observe(communicates: bool) -> None:
+    for package in ("benchmarl", "torch_geometric", "sb3_contrib"):
+        pytest.importorskip(package, reason="needs the extra 'study'")
+    from benchmarks.methods.online import benchmarl
+
+    options = {"algorithm": "ippo", "communicates": communicates, "worlds": 2, "minibatch": 50, "hidden": 8}
+    learned, ended = benchmarl("lighthouse", 100, 1, options), np.zeros((1, 2), dtype=np.int32)
+
+    def driver(team: str) -> Policy:
+        backend = SimpleNamespace(scenario=load_scenario("lighthouse", {"reward.team": team}))
+        return learned(SimpleNamespace(view=lambda name: ended, backend=backend))  # type: ignore[arg-type]
+
+    seen = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 59)).astype(np.float32)
+    changed = seen.copy()
+    changed[1] = 0.5
+    before, after = driver("own")(seen), driver("own")(changed)
+    assert not np.allclose(before[1], after[1])
+    assert np.allclose(before[0], after[0]) != communicates
+    ended[0, 1] = 1  # what it observes then counts until the episode is over for the team
+    np.testing.assert_array_equal(driver("mean")(changed), after)
+    np.testing.assert_array_equal(driver("own")(seen), driver("own")(changed))
