@@ -41,7 +41,9 @@ PORTS = {
 """TCP ports of a car that should be closed, and what may listen there."""
 
 Send = Callable[[str, int], Any]
-"""Sends a message of a kind to a car, by the message's number."""
+"""Sends a message of a kind to a car, or makes its payload, by the message's number."""
+Sign = Callable[[str, bytes], bytes]
+"""Returns what goes beside a payload under a topic."""
 
 
 class Intruder:
@@ -125,30 +127,19 @@ class Intruder:
         about, nonce = header(time.time_ns()), self.gates.states[car].nonce
         return encode(make(GATE_TYPES[Role.ARM], header=about, session="s", nonce=nonce, armed=True))
 
-    def _gate(self, role: Role, make_payload: Send, signer: Signer | None = None) -> Send:
-        """Return what sends messages to the gate."""
+    def _under(
+        self, *names: str, payload: Send | None = None, signer: Sign | None = None, mode: str = "client"
+    ) -> Send:
+        """Return what puts a payload, or a command that drives, under one key after the other.
 
-        def send(car: str, i: int) -> None:
-            topic, payload = self.profile.topic_of(car, role), make_payload(car, i)
-            self.put(topic, payload, b"" if signer is None else signer.sign(topic, payload))
-
-        return send
-
-    def _both(self, signer: Signer | None = None) -> Send:
-        """Return what arms and drives in turn."""
-        arm = self._gate(Role.ARM, lambda car, _: self._arm(car), signer)
-        command = self._gate(Role.COMMAND, self._command, signer)
-        return lambda car, i: (command if i % 2 else arm)(car, i)
-
-    def _under(self, *names: str, payload: Send | None = None, mode: str = "client") -> Send:
-        """Return what puts a driving command, or a payload, under one key after the other.
-
-        `{car}` and `{wheels}` are filled in.
+        `{car}` and the topics of the car by role, such as `{manual}`, are filled in.
         """
 
         def send(car: str, i: int) -> None:
-            key = names[i % len(names)].format(car=car, wheels=self.profile.topic_of(car, Role.MANUAL))
-            self.put(key, payload(car, i) if payload else self.manual(), mode=mode)
+            topics = {role.value: self.profile.topic_of(car, role) for role in Role}
+            key = names[i % len(names)].format(car=car, **topics)
+            content = payload(car, i) if payload else self.manual()
+            self.put(key, content, signer(key, content) if signer else b"", mode)
 
         return send
 
@@ -197,24 +188,29 @@ class Intruder:
 
     def kinds(self) -> Mapping[str, Send]:
         """Return what sends a message of each kind."""
-        wheels, gate = "{wheels}", self._gate
+
+        def armed_or_driven(car: str, i: int) -> bytes:
+            return self._command(car, i) if i % 2 else self._arm(car)
+
+        both = partial(self._under, "{arm}", "{command}", payload=armed_or_driven)
+        forged = partial(self._under, "{command}", signer=self._forger.sign)
         return {
-            "a command to the wheels": self._under(wheels),
+            "a command to the wheels": self._under("{manual}"),
             "the same under wildcards": self._under(
-                "fleet/**", "**", "fleet/*/mavros/**", "fleet/{car}/**/send", "{wheels}/**", "fleet/*/*/*/*"
+                "fleet/**", "**", "fleet/*/mavros/**", "fleet/{car}/**/send", "{manual}/**", "fleet/*/*/*/*"
             ),
             "by a declared key and publisher": self._declared,
-            "as a peer": self._under(wheels, mode="peer"),
-            "as a router": self._under(wheels, mode="router"),
+            "as a peer": self._under("{manual}", mode="peer"),
+            "as a router": self._under("{manual}", mode="router"),
             "as a deletion": lambda car, _: self.session().delete(self.profile.topic_of(car, Role.MANUAL)),
-            "in the other byte order": self._under(wheels, payload=lambda *_: self._big_endian()),
-            "random bytes to the wheels": self._under(wheels, payload=lambda *_: self._bytes(0, 200)),
+            "in the other byte order": self._under("{manual}", payload=lambda *_: self._big_endian()),
+            "random bytes to the wheels": self._under("{manual}", payload=lambda *_: self._bytes(0, 200)),
             "a repetition of the gate's own": self._under(
-                wheels, payload=lambda car, _: self._seen.get(car) or self.manual()
+                "{manual}", payload=lambda car, _: self._seen.get(car) or self.manual()
             ),
             "under other names of the topic": self._under(
                 *("{car}/mavros/manual_control/send", "self/mavros/manual_control/send", "mavros/manual_control/send"),
-                *("rt/{wheels}", "fleet/{car}/mavros/manual_control/control", "fleet/{car}/lli/ctrl_request"),
+                *("rt/{manual}", "fleet/{car}/mavros/manual_control/control", "fleet/{car}/lli/ctrl_request"),
             ),
             "override of the remote control": self._under(
                 "fleet/{car}/mavros/rc/override", payload=lambda *_: ENCAPSULATION + struct.pack("<18H", *[1900] * 18)
@@ -231,25 +227,27 @@ class Intruder:
             "answers to the bridge's queries": self._answer,
             "an announced ROS publisher": self._announce,
             "administration: no more rules": self._open_rules,
-            "arming, commands without signature": self._both(),
-            "with a forged signature": self._both(self._forger),
-            "signed by a stranger": self._both(self._stranger),
-            "with a signature of random bytes": lambda car, i: self.put(
-                self.profile.topic_of(car, Role.COMMAND), self._command(car, i), self._random.randbytes(72)
+            "arming, commands without signature": both(),
+            "with a forged signature": both(signer=self._forger.sign),
+            "signed by a stranger": both(signer=self._stranger.sign),
+            "with a signature of random bytes": self._under(
+                "{command}", payload=self._command, signer=lambda *_: self._random.randbytes(72)
             ),
-            "of the past and the future": gate(
-                Role.COMMAND, lambda car, i: self._command(car, i, late=(-60.0, 60.0)[i % 2]), self._forger
+            "of the past and the future": forged(
+                payload=lambda car, i: self._command(car, i, late=(-60.0, 60.0)[i % 2])
             ),
-            "beyond all limits": gate(
-                Role.COMMAND, lambda car, i: self._command(car, i, (np.nan, np.inf, 50.0, -50.0)[i % 4]), self._forger
+            "beyond all limits": forged(
+                payload=lambda car, i: self._command(car, i, (np.nan, np.inf, 50.0, -50.0)[i % 4])
             ),
-            "random bytes to the gate": gate(Role.COMMAND, lambda car, i: self._bytes(0, 600)),
-            "up to 200 kB to the gate": gate(Role.ARM, lambda car, i: self._bytes(513, 600 if i % 20 else 200_000)),
+            "random bytes to the gate": self._under("{command}", payload=lambda *_: self._bytes(0, 600)),
+            "up to 200 kB to the gate": self._under(
+                "{arm}", payload=lambda _, i: self._bytes(513, 600 if i % 20 else 200_000)
+            ),
             "armings under wildcards": self._under(
                 "fleet/*/coopenv/arm", "fleet/*/coopenv/*", "fleet/**", payload=lambda car, _: self._arm(car)
             ),
-            "release of the emergency stop": gate(
-                Role.STOP, lambda car, i: encode(make(GATE_TYPES[Role.STOP], data=False))
+            "release of the emergency stop": self._under(
+                "{stop}", payload=lambda *_: encode(make(GATE_TYPES[Role.STOP], data=False))
             ),
         }
 

@@ -1,11 +1,11 @@
 """Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
 
-import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, message_types, needing
@@ -131,22 +131,7 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
 
 def pose(rotation: Any, position: Any) -> Any:
     """Return a geometry_msgs/Pose of a rotation (3, 3), body to map, and a position (3,), m."""
-    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(rotation))
-
-
-def quaternion(rotation: Any) -> list[float]:
-    """Return x, y, z, w of a rotation by its largest component; in plain numbers, as there are 200 a second."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    rows = (
-        (1.0 + a + e + i, h - f, c - g, d - b),
-        (h - f, 1.0 + a - e - i, b + d, c + g),
-        (c - g, b + d, 1.0 - a + e - i, f + h),
-        (d - b, c + g, f + h, 1.0 - a - e + i),
-    )  # 4 q q^T
-    k = max(range(4), key=lambda k: rows[k][k])
-    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[k])), rows[k][0] or 1.0)
-    w, x, y, z = (scale * v for v in rows[k])
-    return [x, y, z, w]
+    return make("geometry_msgs/msg/Pose", position=position, orientation=Rotation.from_matrix(rotation).as_quat())
 
 
 def warm_up(profile: CarProfile = SVEA) -> None:

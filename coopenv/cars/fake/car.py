@@ -1,9 +1,9 @@
 """A fake car: its world, sensors and wheels on one clock, and its end of the network."""
 
-import heapq
+import sched
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -23,41 +23,6 @@ from coopenv.cars.transport.base import Callback, Transport
 
 LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
-
-
-class Schedule:
-    """What several sensors do and when; in ns on one clock."""
-
-    def __init__(self, acts: Iterable[tuple[float, Act]], start: int, rng: np.random.Generator, jitter: float) -> None:
-        """Begin.
-
-        Args:
-            acts: rates, Hz, and what is done so often.
-            start: from when on.
-            rng: of phases and jitter.
-            jitter: share of a period, largest deviation to either side of a regular time.
-        """
-        self._rng, self._jitter = rng, jitter
-        self._waiting: list[tuple[int, int, float, float, Act]] = []  # due, number, regular time and period, ns, act
-        for number, (rate, act) in enumerate(acts):
-            self._wait(number, start + 1e9 / rate * rng.uniform(0.1, 1.0), 1e9 / rate, act)
-
-    @property
-    def next(self) -> int:
-        """When something is due next."""
-        return self._waiting[0][0]
-
-    def until(self, now: int) -> Iterator[tuple[int, Act]]:
-        """Yield (when, act) of all that is due up to now, in the order of time."""
-        while self.next <= now:
-            due, number, regular, period, act = heapq.heappop(self._waiting)
-            self._wait(number, regular + period, period, act)
-            if due >= now - LATE:
-                yield due, act
-
-    def _wait(self, number: int, regular: float, period: float, act: Act) -> None:
-        jitter = period * self._jitter * self._rng.uniform(-1.0, 1.0)
-        heapq.heappush(self._waiting, (int(regular + jitter), number, regular, period, act))
 
 
 class Fake:
@@ -123,7 +88,9 @@ class Fake:
             if self._drives:
                 transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
             transport.announce(presence_of(name))
-        self._schedule = Schedule(acts, clock.steady(), self._rng, settings.jitter)
+        self._events, self._phases, start = sched.scheduler(clock.steady, lambda _: None), self._rng, clock.steady()
+        for number, (rate, act) in enumerate(acts):
+            self._repeat(number, start + 1e9 / rate * self._phases.uniform(0.1, 1.0), 1e9 / rate, act)
 
     def begin(self, seed: int) -> None:
         """Go to the start of a seed; wheels and commands are as if nothing had been."""
@@ -139,7 +106,7 @@ class Fake:
     @property
     def next(self) -> int:
         """When something is due next, steady clock, ns."""
-        return int(min(self._schedule.next, self._wire.next))
+        return int(min(self._events.queue[0].time, self._wire.next))
 
     def add_fault(self, fault: Fault) -> None:
         """Let a fault happen, its start counted from now."""
@@ -157,11 +124,20 @@ class Fake:
                 self._inbox.popleft()()
             except CoopenvError as error:
                 print(f"{self.name}: {error}", file=sys.stderr, flush=True)
-        for due, act in self._schedule.until(now):
-            self._move(due)
-            act(due, self._stamp(due) + self._faults.clock_error(due))
+        self._events.run(blocking=False)
         if self._link is not None and self._link.news.is_set():
             self._link.publish_status()
+
+    def _repeat(self, number: int, regular: float, period: float, act: Act) -> None:
+        """Let something be done at a regular time, ns, jitter aside, and again after each period."""
+        due = int(regular + period * self._settings.jitter * self._phases.uniform(-1.0, 1.0))
+        self._events.enterabs(due, number, self._do, (due, number, regular, period, act))
+
+    def _do(self, due: int, number: int, regular: float, period: float, act: Act) -> None:
+        self._repeat(number, regular + period, period, act)
+        if due >= self._clock.steady() - LATE:
+            self._move(due)
+            act(due, self._stamp(due) + self._faults.clock_error(due))
 
     def close(self) -> None:
         """Tell the wheels to stand, and forget what is under way."""

@@ -1,13 +1,12 @@
 """What differs between fake cars: lasting settings, and faults on request, `NAME[=VALUE][@START[+DURATION]]`."""
 
-import itertools
 import os
 import random
+import sched
 import signal
 from collections.abc import Callable
 from functools import partial
 from math import isinf
-from queue import PriorityQueue
 from typing import Annotated
 
 from pydantic import Field
@@ -138,8 +137,7 @@ class Wire:
         self._settings = settings
         self._transport, self._faults, self._steady = transport, faults, steady
         self.announce, self.watch = transport.announce, transport.watch
-        self._rng, self._numbers = random.Random(seed), itertools.count()
-        self._late: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
+        self._rng, self._late = random.Random(seed), sched.scheduler(steady, lambda _: None)
 
     def publish(
         self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
@@ -157,21 +155,17 @@ class Wire:
 
     def close(self) -> None:
         """Forget what is under way."""
-        self._late = PriorityQueue()
+        for message in self._late.queue:
+            self._late.cancel(message)
 
     @property
     def next(self) -> float:
         """When the next late message is due, ns; inf: none is under way."""
-        return self._late.queue[0][0] if self._late.queue else float("inf")
+        return min((message.time for message in self._late.queue), default=float("inf"))
 
     def flush(self) -> None:
         """Pass on what has been under way for long enough."""
-        while not self._late.empty():
-            first = self._late.get()
-            if first[0] > self._steady():
-                self._late.put(first)
-                return
-            first[2]()
+        self._late.run(blocking=False)
 
     def _pass_on(self, act: Callable[[], None]) -> None:
         now, faults, lasting = self._steady(), self._faults, self._settings
@@ -182,6 +176,6 @@ class Wire:
         if lasting.delay_spread:
             delay += self._rng.expovariate(1.0 / lasting.delay_spread)
         if delay:
-            self._late.put((now + round(delay * 1e9), next(self._numbers), act))
+            self._late.enterabs(now + round(delay * 1e9), 0, act)
         else:
             act()
