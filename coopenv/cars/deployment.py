@@ -24,25 +24,7 @@ from coopenv.cars.profile import (
     is_simple,
     load_profile,
 )
-from coopenv.cars.transport.base import SECURE, UNIX, address_of
-
-
-class Tls(Section):
-    """Certificates of the transport; paths are relative to the file."""
-
-    root_ca: Path
-    """Certificate of the authority that signs the others."""
-    certificate: Path | None = None
-    """Own certificate, if this end listens or the other one asks for it."""
-    key: Path | None = None
-    """Private key of the certificate, readable by its owner alone."""
-
-    @model_validator(mode="after")
-    def _both_or_none(self) -> Self:
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key: give both or none")
-        return self
-
+from coopenv.cars.transport.base import SECURE, UNIX, Tls, address_of
 
 Endpoint = Annotated[str, AfterValidator(lambda text: address_of(text) and text)]  # such as tcp/127.0.0.1:7447
 

@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from coopenv.cars.transport.base import Tls
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port
 
@@ -94,6 +95,11 @@ class Authority:
         private.touch(mode=0o600)
         private.write_bytes(encoded)
         return certificate, private
+
+    def tls(self, name: str = "", host: str = "127.0.0.1") -> Tls:
+        """Return this authority with a new certificate of a name; without a name none."""
+        certificate, key = self.certify(name, host) if name else (None, None)
+        return Tls(root_ca=self.file, certificate=certificate, key=key)
 
     def _signed(self, subject: x509.Name, key: ec.EllipticCurvePrivateKey, host: str | None) -> x509.Certificate:
         now = datetime.datetime.now(datetime.UTC)

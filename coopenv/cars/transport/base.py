@@ -13,9 +13,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
+
+from pydantic import model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown
+from coopenv.base.sections import Section
 
 
 class LinkError(CoopenvError):
@@ -248,23 +251,34 @@ def first_trouble(endpoints: Sequence[str], context: ssl.SSLContext | None, othe
 FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO
 
 
-@dataclass(frozen=True, slots=True)
-class Certificates:
-    """Files in PEM. A listener with a certificate asks clients for theirs (mutual TLS)."""
+class Tls(Section):
+    """Certificates in PEM; paths are relative to the file. A listener with a certificate asks clients for theirs."""
 
-    root_ca: Path  # authority of the others' certificates
-    certificate: Path | None = None  # own one
-    key: Path | None = None  # private key of it
+    root_ca: Path
+    """Certificate of the authority that signs the others."""
+    certificate: Path | None = None
+    """Own certificate, if this end listens or the other one asks for it."""
+    key: Path | None = None
+    """Private key of the certificate, readable by its owner alone."""
 
-    def __post_init__(self) -> None:
-        """Refuse files that cannot be used. Raises CoopenvError: one line names the field and the file."""
-        _check("root_ca", self.root_ca)
-        if self.certificate is not None and self.key is not None:
-            _check("certificate", self.certificate)
-            _check("key", self.key)
-            if self.key.stat().st_mode & FORBIDDEN:
-                raise CoopenvError(f"tls.key: {self.key} can be read by others; run: chmod 600 {self.key}")
-        self.context()
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key: give both or none")
+        return self
+
+    def checked(self, folder: Path) -> Self:
+        """Return them with whole paths. Raises CoopenvError: one cannot be used; the line names field and file."""
+        made = type(self)(**{name: folder / path for name, path in self if path is not None})
+        for name, path in made:
+            try:
+                (path or made.root_ca).open("rb").close()
+            except OSError as error:
+                raise CoopenvError(f"tls.{name}: {path}: cannot be read ({error.strerror or error})") from None
+        if made.key is not None and made.key.stat().st_mode & FORBIDDEN:
+            raise CoopenvError(f"tls.key: {made.key} can be read by others; run: chmod 600 {made.key}")
+        made.context()
+        return made
 
     def context(self) -> ssl.SSLContext:
         """Return what Python connects with. Raises CoopenvError: the files do not hold what they should."""
@@ -291,11 +305,3 @@ class Certificates:
                 entries |= {f"{side}_certificate": str(self.certificate), f"{side}_private_key": str(self.key)}
             entries["enable_mtls"] = True
         return entries
-
-
-def _check(field: str, path: Path) -> None:
-    try:
-        with path.open("rb"):
-            return
-    except OSError as error:
-        raise CoopenvError(f"tls.{field}: {path}: cannot be read ({error.strerror or error})") from None

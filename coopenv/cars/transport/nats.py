@@ -15,9 +15,9 @@ from coopenv.base.installation import install_command, needing
 from coopenv.cars.transport.base import (
     Arrival,
     Callback,
-    Certificates,
     HeartbeatTransport,
     LinkError,
+    Tls,
     address_of,
     first_trouble,
     matcher,
@@ -188,7 +188,7 @@ class Nats(HeartbeatTransport):
             self._thread.join(PATIENCE)
 
 
-def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: float = 2.0) -> Nats:
+def open_nats(connect: Sequence[str], tls: Tls | None = None, timeout: float = 2.0) -> Nats:
     """Connect to a broker.
 
     Args:

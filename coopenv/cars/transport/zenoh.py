@@ -15,8 +15,8 @@ from coopenv.cars.transport.base import (
     UNIX,
     Arrival,
     Callback,
-    Certificates,
     LinkError,
+    Tls,
     Transport,
     address_of,
     first_trouble,
@@ -91,7 +91,7 @@ def open_zenoh(
     mode: Literal["client", "peer", "router"],
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
-    tls: Certificates | None = None,
+    tls: Tls | None = None,
     timeout: float = 2.0,
     config: Path | None = None,
 ) -> Zenoh:
@@ -177,13 +177,9 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
     return Authors(open_ros1(network.connect[0], types, timeout), routes)
 
 
-def certificates_of(deployment: Deployment) -> Certificates | None:
+def certificates_of(deployment: Deployment) -> Tls | None:
     """Return the files of `network.tls`, checked (None: there is no such section); errors as for `open_transport`."""
-    tls = deployment.network.tls
-    if tls is None:
-        return None
-    own, key = (None if file is None else deployment.folder / file for file in (tls.certificate, tls.key))
     try:
-        return Certificates(deployment.folder / tls.root_ca, own, key)
+        return deployment.network.tls and deployment.network.tls.checked(deployment.folder)
     except CoopenvError as error:
         raise DeploymentError(f"network.{error}") from None

@@ -20,7 +20,7 @@ from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.gate.core import write_drive
 from coopenv.cars.keys import load_signer, make_keys
 from coopenv.cars.profile import SVEA, USUAL, MotionCommand, Role
-from coopenv.cars.transport.base import Certificates
+from coopenv.cars.transport.base import Tls
 from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
 from tests.cars.link.gate.bench import CAR
 from tests.cars.link.gate.station import Station, end, start_gate
@@ -221,7 +221,8 @@ def test_in_the_laboratory_each_certificate_sends_its_own(tmp_path: Path) -> Non
         stack.enter_context(closing(open_zenoh("router", listen=[where], config=tmp_path / "lab.json5")))
 
         def join(name: str) -> Zenoh:
-            tls = Certificates(authority.file, *files[name])
+            certificate, key = files[name]
+            tls = Tls(root_ca=authority.file, certificate=certificate, key=key)
             return stack.enter_context(closing(open_zenoh("client", [where], tls=tls)))
 
         ends = {name: join(name) for name in names[1:]}

@@ -19,7 +19,7 @@ from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import base
-from coopenv.cars.transport.base import LEASE, Certificates, HeartbeatTransport, LinkError, matcher
+from coopenv.cars.transport.base import LEASE, HeartbeatTransport, LinkError, matcher
 from coopenv.cars.transport.nats import (
     MOST_WAITING,
     Letter,
@@ -129,7 +129,7 @@ def test_a_broker_that_has_frozen_keeps_neither_senders_nor_memory(tmp_path: Pat
 def test_tls_of_the_broker(tmp_path: Path) -> None:
     fleet, other, port = Authority(tmp_path, "fleet"), Authority(tmp_path, "other"), free_port()
     certificate, key = fleet.certify("broker")
-    station = Certificates(fleet.file, *fleet.certify("station"))
+    station = fleet.tls("station")
     files = ("--tlscert", str(certificate), "--tlskey", str(key), "--tlscacert", str(fleet.file))
     endpoint = [f"tls/127.0.0.1:{port}"]
     with nats_server(port, tmp_path, "--tlsverify", *files):
@@ -139,9 +139,9 @@ def test_tls_of_the_broker(tmp_path: Path) -> None:
         wait_until(lambda: heard)
         ours.close()
         with pytest.raises(LinkError, match="its certificate is refused: "):
-            open_nats(endpoint, Certificates(other.file), timeout=1.0)
+            open_nats(endpoint, other.tls(), timeout=1.0)
         with pytest.raises(LinkError, match=r"no NATS broker there \([^\n]+\)$"):
-            open_nats(endpoint, Certificates(fleet.file), timeout=1.0)
+            open_nats(endpoint, fleet.tls(), timeout=1.0)
 
 
 @pytest.mark.nats

@@ -16,7 +16,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport.base import Address, Arrival, Certificates, LinkError, address_of, trouble_at
+from coopenv.cars.transport.base import Address, Arrival, LinkError, address_of, trouble_at
 from coopenv.cars.transport.zenoh import Zenoh, open_transport, open_zenoh
 from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until
@@ -156,7 +156,7 @@ def fleet(tmp_path: Path) -> Authority:
 def guarded(fleet: Authority) -> Iterator[str]:
     """Yield where a router listens that wants certificates."""
     where = f"tls/127.0.0.1:{free_port()}"
-    with closing(open_zenoh("router", listen=[where], tls=Certificates(fleet.file, *fleet.certify("router")))):
+    with closing(open_zenoh("router", listen=[where], tls=fleet.tls("router"))):
         yield where
 
 
@@ -187,7 +187,7 @@ def test_a_router_with_another_address_in_its_certificate_is_refused(tmp_path: P
     fleet.certify("station")
     wanted = deployment(tmp_path, where, certificate="station.pem", key="station.key")
     with (
-        closing(open_zenoh("router", listen=[where], tls=Certificates(fleet.file, *fleet.certify("r", "127.0.0.2")))),
+        closing(open_zenoh("router", listen=[where], tls=fleet.tls("r", "127.0.0.2"))),
         pytest.raises(LinkError, match=r"its certificate is refused: .*127\.0\.0\.1"),
     ):
         open_transport(wanted, timeout=1.0)
