@@ -79,8 +79,7 @@ class Tabular(Explained, ABC):
     `frame.attrs["units"]`, `dataset["position_rmse_m"].attrs["units"]`.
     """
 
-    _PARTS = ""
-    """Attribute with the names that `result[name]` takes, over which a result is iterated."""
+    _PARTS = ""  # attribute with the names that `result[name]` takes, over which a result is iterated
 
     @abstractmethod
     def columns(self) -> Columns:

@@ -101,9 +101,10 @@ def scenario_path(name_or_path: str | Path) -> Path:
             for name in list_envs():
                 if text == environment_id(name):
                     raise UnknownEnvironmentError(f"{text}: an id, for gymnasium.make; the environment is '{name}'")
-            found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
-            missing = f"no such scenario file: {shortened(str(path), 200)}{suggest(path.stem, list_envs())}"
-            raise UnknownEnvironmentError(found or missing)
+            found = f"no such scenario file: {shortened(str(path), 200)}{suggest(path.stem, list_envs())}"
+            if os.path.isdir(path):  # noqa: PTH112
+                found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}; coopenv view opens that of a run"
+            raise UnknownEnvironmentError(found)
         return path
     if os.path.isfile(text):  # noqa: PTH113 (never raises)
         raise UnknownEnvironmentError(f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}")

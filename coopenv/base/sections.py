@@ -30,9 +30,9 @@ class Section(BaseModel):
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuse a change; overrides of `load_scenario` return a changed copy."""
-        where = f"{type(self).__name__}.{name}"
-        raise CoopenvError(f"{where}: is frozen; {CHANGE}")
+        raise CoopenvError(f"{type(self).__name__}.{name}: is frozen; {CHANGE}")
 
+    __setitem__ = __setattr__
     __dataclass_fields__ = property()  # which `dataclasses.replace` asks for; it raises the error of `__getattr__`
 
     def __getitem__(self, key: str) -> Any:

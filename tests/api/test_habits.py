@@ -183,6 +183,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: setattr(coopenv.load_scenario(ENV), "horizon", 3.0),
         r"^Scenario\.horizon: is frozen; scenario \| \{'dotted\.key': value\} returns a changed scenario",
     ),
+    "a set key": (
+        lambda: coopenv.load_scenario(ENV).__setitem__("horizon", 3.0),
+        r"^Scenario\.horizon: is frozen; scenario \| ",
+    ),
+    "a folder": (lambda: coopenv.load_scenario("."), r"a folder; expected .*; coopenv view opens that of a run$"),
     "a nested one": (
         lambda: setattr(coopenv.load_scenario(ENV).noise, "enabled", False),
         r"^Noise\.enabled: is frozen",
