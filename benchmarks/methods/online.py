@@ -38,7 +38,7 @@ LAYERS = {"activation_class": torch.nn.Tanh, "layer_class": torch.nn.Linear}
 
 
 class BenchMarl(Section):
-    """PPO of BenchMARL with shared parameters: GAE and Adam are the same for both algorithms."""
+    """PPO of BenchMARL with shared parameters."""
 
     algorithm: Literal["ippo", "mappo"]
     """`mappo`: the critic gets `state()`; `ippo`: what the vehicle observes."""
@@ -53,6 +53,8 @@ class BenchMarl(Section):
     """World steps."""
     epochs: int = 4
     learning_rate: float = 5e-4
+    gae_lambda: float = 0.95
+    """Of the generalised advantage estimate; that of `coopenv train`."""
     initial_std: float = 0.3
     """Of the exploration, before tanh."""
 
@@ -95,6 +97,7 @@ def benchmarl(environment: str, decisions: int, seed: int, options: dict[str, An
     config.lr = asked.learning_rate
     algorithm = ALGORITHMS[asked.algorithm].get_from_yaml()
     algorithm.share_param_critic = asked.algorithm == "ippo"  # else one value for all vehicles, whose rewards differ
+    algorithm.lmbda = asked.gae_lambda
     algorithm.scale_mapping = f"biased_softplus_{asked.initial_std}"
     critic = actor = MlpConfig(num_cells=[asked.hidden] * 2, **LAYERS)
     if asked.communicates:

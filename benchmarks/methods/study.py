@@ -87,7 +87,8 @@ def runs(study: StudyFile) -> list[Run]:
 
 
 def _digest(study: StudyFile, environment: str, name: str, seed: int) -> str:
-    known: list[Any] = [open_simulation(environment, {}).model_dump_json(exclude_defaults=True)]
+    scenario = open_simulation(environment, {})
+    known: list[Any] = [scenario.model_dump_json(exclude_defaults=True, exclude={"title", "description", "source"})]
     known += [study.worlds, study.block, name, seed]
     if method := study.methods.get(name):
         known += [study.decisions, method.model_dump(mode="json", exclude={"about"})]

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.methods import __main__ as command
 from benchmarks.methods import report, study
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import scenario_path
 from coopenv.policies import Policy
 from coopenv.scenario import load_scenario
 
@@ -95,6 +96,20 @@ def test_a_changed_method_is_trained_anew(tmp_path: Path) -> None:
     assert {name for name in before if before[name] == longer[name]} == {"route_follower"}
 
 
+def test_a_changed_environment_is_learned_anew_and_its_new_description_is_not(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    text = scenario_path("lighthouse").read_text(encoding="utf-8")
+    study_file = written(tmp_path, SMALL.replace("environments.lighthouse", f"environments.'{own}'"))
+
+    def digest(changed: str) -> str:
+        own.write_text(changed, encoding="utf-8")
+        return study.runs(study.read_study(study_file))[0].digest
+
+    before = digest(text)
+    assert digest(text.replace("Two cars", "A pair of cars")) == before
+    assert digest(text.replace("horizon = 40.0", "horizon = 41.0")) != before
+
+
 def test_results_come_back_from_their_file(tmp_path: Path) -> None:
     runs = study.runs(study.read_study(written(tmp_path, SMALL)))
     figures = {name: 0.1 * i for i, name in enumerate(study.COLUMNS[4:])} | {"travel_time_s": float("nan")}
@@ -144,6 +159,18 @@ def test_the_page_has_a_row_of_every_method(tmp_path: Path) -> None:
     assert "`ppo` wins" in page
     del results[next(iter(results))]
     assert "23 of 24 runs are finished" in report.page(asked, results)
+
+
+def test_the_page_in_the_documents_is_that_of_the_results() -> None:
+    asked, rows = study.read_study(command.HERE / "study.toml"), results_of(command.HERE)
+    results = {
+        study.Run(row["environment"], row["method"], int(row["seed"]), row["digest"]): {
+            name: float(row[name]) for name in study.COLUMNS[4:]
+        }
+        for row in rows
+    }
+    page = (command.HERE.parents[1] / "docs" / "environments" / "methods.md").read_text(encoding="utf-8")
+    assert page == report.page(asked, results)
 
 
 @pytest.mark.parametrize(("shift", "words"), [(10.0, "`b` wins"), (0.5, "No method is apart")])
