@@ -1,11 +1,12 @@
 """Decoded messages as checked values in this project's conventions, from ROS 1 or ROS 2."""
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
@@ -304,3 +305,53 @@ def check_types(profile: CarProfile, where: str) -> None:
     for role, readers in READERS.items():
         if (kind := profile.topics[role].type) not in readers:
             raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} is none of {listed(list(readers))}")
+
+
+TRACKS = (
+    *("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw"),
+    *("command_time", "command_speed", "command_steering"),
+)
+
+
+def tracks_of(samples: Sequence[Sample], start: int) -> dict[str, Any]:
+    """Return what wheels, gyro and motion capture measured, and commands, as arrays by the names of `TRACKS`.
+
+    Times are in s since a start, ns; velocities (m/s, body) and places (m, map) are complex numbers x + iy.
+    """
+    wheel, gyro, truth, command = [], [], [], []
+    for s in samples:
+        value, t = s.value, 1e-9 * (s.stamp - start)
+        if isinstance(value, Twist):
+            wheel += [] if value.linear is None else [(t, complex(*value.linear[:2]))]
+            gyro += [] if value.angular is None else [(t, value.angular[2])]
+        elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
+            truth.append((t, complex(*value.position[:2]), yaw_of(value.rotation)))
+        elif isinstance(value, MotionCommand):
+            command.append((t, value.speed, value.steering))
+    columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 3), *_columns(command, 3)]
+    tracks = dict(zip(TRACKS, columns, strict=True))
+    return tracks | {key: tracks[key].real for key in tracks if key not in ("wheel", "truth")}
+
+
+def sightings_of(
+    samples: Sequence[Sample], start: int, known: Mapping[int, int]
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """Return times (n,), s since a start in ns, targets (n,) by marker, and rays (n, 3) of sightings."""
+    seen = [
+        (1e-9 * (s.stamp - start), known[marker], *ray)
+        for s in samples
+        if isinstance(value := s.value, Detections)
+        for marker, ray in zip(value.markers, value.bearings, strict=True)
+        if marker in known
+    ]
+    table = np.array(seen, dtype=np.float64).reshape(-1, 5)
+    return table[:, 0], table[:, 1].astype(np.int64), table[:, 2:]
+
+
+def yaw_of(rotation: Array) -> float:
+    """Return the heading of a rotation (3, 3), rad."""
+    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def _columns(rows: Sequence[Any], count: int) -> list[Any]:
+    return [np.array([row[n] for row in rows]) for n in range(count)]

@@ -179,6 +179,12 @@ def report_message(sent: VehicleBroadcast, stamp: int, origin: Array) -> Any | N
     return make("coopenv_msgs/msg/RobustReport", header=header(stamp, "map"), **fields)
 
 
+def marker_places(landmarks: Sequence[Any]) -> Array:
+    """Return the positions (L, 3) of the markers of a scenario's landmarks, m."""
+    places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in landmarks]
+    return np.array(places).reshape(-1, 3)
+
+
 NS = 1e-9
 
 
@@ -194,8 +200,7 @@ class NeighbourInbox:
         """
         self._binding, self._refused, scenario = binding, refused, binding.scenario
         self._max_age = binding.profile.topics[Role.ESTIMATE].max_age_ns
-        places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
-        self._landmarks = np.array(places).reshape(-1, 3) - np.array(scenario.map.origin)
+        self._landmarks = marker_places(scenario.landmarks) - np.array(scenario.map.origin)
         self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
         self._receives_from = neighbour_sets(scenario)  # targets by vehicle
         markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]

@@ -12,19 +12,18 @@ Statistical Association 63, 1968.
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, percentile_filter
 from scipy.stats import theilslopes
 
-from coopenv.cars.backend.binding import Binding
+from coopenv.cars.backend.binding import Binding, marker_places
 from coopenv.cars.bags.topic_map import TRUTH, Chosen
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.readings import Sample, sightings_of, tracks_of
 from coopenv.estimation.poses import Array
-from coopenv.scenario.base import rotation_of
 
 Times = NDArray[np.int64]
 
@@ -288,15 +287,11 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
     start = samples[0].stamp if samples else 0
     for car, vehicle in binding.cars.items():
         topics = {entry.role: entry.topic for entry in chosen if entry.car == car}
-        values = {}
-        for role in topics:
-            own = [sample for sample in samples if (sample.car, sample.role) == (car, role)]
-            stamps = np.array([(sample.stamp - start) * 1e-9 for sample in own])
-            values[role] = stamps, [cast(Any, sample.value) for sample in own]
-        moved = {role: _cumulated(*values[role]) for role in topics if role in ODOMETRY}
-        truth = _path(*values[Role.TRUTH]) if Role.TRUTH in topics else None
+        own = {role: [sample for sample in samples if (sample.car, sample.role) == (car, role)] for role in topics}
+        moved = {role: _cumulated(tracks_of(own[role], start)) for role in topics if role in ODOMETRY}
+        truth = _path(tracks_of(own[Role.TRUTH], start)) if Role.TRUTH in topics else None
         camera = next(role for role in CAMERAS if role in topics)
-        seen = _azimuths(*values[camera], binding, vehicle)
+        seen = _azimuths(own[camera], start, binding, vehicle)
         place = np.array(binding.scenario.cameras[vehicle].position[:2])
         leads: dict[Role, Lead | None] = {}
         if truth is not None:
@@ -316,44 +311,30 @@ def leads_of(samples: Sequence[Sample], chosen: Sequence[Chosen], binding: Bindi
 ODOMETRY = (Role.WHEEL, Role.IMU, Role.ODOMETRY)
 
 
-def _cumulated(times: Array, values: Sequence[Twist]) -> tuple[Signal | None, Signal | None]:
+def _cumulated(tracks: Mapping[str, Any]) -> tuple[Signal | None, Signal | None]:
     """Return cumulated distances and turns of a topic; None: it does not measure them."""
-    found = []
-    for name, axis in (("linear", 0), ("angular", 2)):
-        rates = np.array([np.nan if (v := getattr(value, name)) is None else v[axis] for value in values])
-        given = np.isfinite(rates)
-        measured = given.sum() > 1 and np.ptp(rates[given]) > 0.0
-        found.append(Signal.of_rates(times[given], rates[given]) if measured else None)
-    return found[0], found[1]
+    rates = ((tracks["wheel_time"], tracks["wheel"].real), (tracks["gyro_time"], tracks["gyro"]))
+    distance, turn = (Signal.of_rates(t, v) if len(t) > 1 and np.ptp(v) > 0.0 else None for t, v in rates)
+    return distance, turn
 
 
-def _path(times: Array, values: Sequence[CarPose]) -> tuple[Signal, Signal, Signal] | None:
+def _path(tracks: Mapping[str, Any]) -> tuple[Signal, Signal, Signal] | None:
     """Return distance, heading and path (x, y, heading) by motion capture; None: there is none."""
-    known = [(t, v.position, v.rotation) for t, v in zip(times, values, strict=True) if v.rotation is not None]
-    if len(known) < FEWEST:
+    t, place, heading = tracks["truth_time"], tracks["truth"], np.unwrap(tracks["truth_yaw"])
+    if len(t) < FEWEST:
         return None
-    t, p, R = (np.array(part) for part in zip(*known, strict=True))
-    heading = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
-    middle, step = (heading[1:] + heading[:-1]) / 2, np.diff(p, axis=0)
-    forward = step[:, 0] * np.cos(middle) + step[:, 1] * np.sin(middle)
-    distance = np.concatenate([[0.0], np.cumsum(forward)])
-    return Signal(t, distance), Signal(t, heading), Signal(t, np.column_stack([p[:, :2], heading]))
+    forward = (np.diff(place) * np.exp(-0.5j * (heading[1:] + heading[:-1]))).real
+    path = Signal(t, np.column_stack([place.real, place.imag, heading]))
+    return Signal(t, np.concatenate([[0.0], np.cumsum(forward)])), Signal(t, heading), path
 
 
-def _azimuths(times: Array, values: Sequence[Detections], binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
+def _azimuths(samples: Sequence[Sample], start: int, binding: Binding, vehicle: int) -> tuple[Array, Array, Array]:
     """Return times (n,), azimuths (n,) in the body frame, and positions (n, 2) of standing landmarks in view."""
-    standing = {k: m for k, m in enumerate(binding.scenario.landmarks) if k not in binding.leaders.values()}
-    marks = {number: standing[target] for number, target in binding.targets.items() if target in standing}
-    places = {k: np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for k, m in marks.items()}
-    to_body = binding.scenario.cameras[vehicle].to_body()
-    rows = [
-        (time, *(to_body @ ray)[:2], *places[marker][:2])
-        for time, frame in zip(times, values, strict=True)
-        for marker, ray in zip(frame.markers, frame.bearings, strict=True)
-        if marker in places
-    ]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    return table[:, 0], np.arctan2(table[:, 2], table[:, 1]), table[:, 3:]
+    landmarks, led = binding.scenario.landmarks, binding.leaders.values()
+    marks = {number: k for number, k in binding.targets.items() if k < len(landmarks) and k not in led}
+    time, target, ray = sightings_of(samples, start, marks)
+    body = ray @ binding.scenario.cameras[vehicle].to_body().T
+    return time, np.arctan2(body[:, 1], body[:, 0]), marker_places(landmarks)[target, :2]
 
 
 def moves_of(

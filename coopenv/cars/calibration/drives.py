@@ -1,6 +1,6 @@
 """What a calibration reads of a drive: image points, odometry and motion capture of each car, from bags and logs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from coopenv.base.errors import DataError
-from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.readings import CarPose, Detections, Sample, Twist
+from coopenv.cars.backend.binding import marker_places
+from coopenv.cars.profile import Role
+from coopenv.cars.readings import sightings_of, tracks_of, yaw_of
 from coopenv.cars.vision import Calibration, rays
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import rotation_of
 
 if TYPE_CHECKING:
     from coopenv.cars.bags import Bag
@@ -30,10 +30,6 @@ CLIMB, TILT = 0.05, 0.1
 """Mean vertical velocity, m/s, and mean rate of roll and pitch, rad/s, above which a vehicle is no car."""
 ROLES = ((Role.DETECTIONS, Role.BEARINGS), (Role.WHEEL, Role.ODOMETRY), (Role.TRUTH,))
 """Of the topics of camera, wheels and motion capture."""
-TRACKS = (
-    *("wheel_time", "wheel", "gyro_time", "gyro", "truth_time", "truth", "truth_yaw"),
-    *("command_time", "command_speed", "command_steering"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,58 +112,22 @@ def car_of(
 def drive_of_bag(bag: "Bag") -> Drive:
     """Return the drive of bags. Raises DataError: a car has too few sightings."""
     scenario, binding, led = bag.scenario, bag.binding, bag.binding.leaders.values()
-    marks = [(i, m) for i, m in enumerate(scenario.landmarks) if m.motion.kind == "static" and i not in led]
-    places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for _, m in marks]
-    index = {i: n for n, (i, _) in enumerate(marks)}
-    number = {marker: index[target] for marker, target in binding.targets.items() if target in index}
+    static = [i for i, m in enumerate(scenario.landmarks) if m.motion.kind == "static" and i not in led]
+    number = {marker: static.index(target) for marker, target in binding.targets.items() if target in static}
     cars = tuple(_of_samples(bag, name, vehicle, number) for name, vehicle in binding.cars.items())
-    return Drive(cars, tuple(m.name for _, m in marks), np.array(places).reshape(-1, 3), scenario)
-
-
-def tracks_of(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Return what wheels, gyro and motion capture measured, and commands, by the names of `CarDrive`.
-
-    Times are in s since the first sample.
-    """
-    wheel, gyro, truth, command = [], [], [], []
-    for s in samples:
-        value, t = s.value, NS * (s.stamp - samples[0].stamp)
-        if isinstance(value, Twist):
-            wheel += [] if value.linear is None else [(t, complex(*value.linear[:2]))]
-            gyro += [] if value.angular is None else [(t, value.angular[2])]
-        elif isinstance(value, CarPose) and value.rotation is not None and s.role is Role.TRUTH:
-            truth.append((t, complex(*value.position[:2]), _yaw(value.rotation)))
-        elif isinstance(value, MotionCommand):
-            command.append((t, value.speed, value.steering))
-    columns = [*_columns(wheel, 2), *_columns(gyro, 2), *_columns(truth, 3), *_columns(command, 3)]
-    tracks = dict(zip(TRACKS, columns, strict=True))
-    return tracks | {key: tracks[key].real for key in tracks if key not in ("wheel", "truth")}
+    names = tuple(scenario.landmarks[i].name for i in static)
+    return Drive(cars, names, marker_places(scenario.landmarks)[static], scenario)
 
 
 def _of_samples(bag: "Bag", name: str, vehicle: int, number: dict[int, int]) -> CarDrive:
     samples, added = [s for s in bag.log.samples if s.car == name], bag.log.added
-    seen = [
-        (NS * (s.stamp - samples[0].stamp), number[marker], *ray)
-        for s in samples
-        if isinstance(value := s.value, Detections)
-        for marker, ray in zip(value.markers, value.bearings, strict=True)
-        if marker in number
-    ]
-    time, target, *ray = _columns(seen, 5)
+    time, target, ray = sightings_of(samples, samples[0].stamp, number)
     topics = (next((added[name, role] for role in roles if (name, role) in added), ("", 0.0)) for roles in ROLES)
-    tracks = {key: value for key, value in tracks_of(samples).items() if "command" not in key}
-    found = {"time": time, "target": target.astype(np.int64), "topics": tuple(topics), **tracks}
+    tracks = {key: value for key, value in tracks_of(samples, samples[0].stamp).items() if "command" not in key}
+    found = {"time": time, "target": target, "topics": tuple(topics), **tracks}
     lens = bag.log.lenses.get(name)
     lens = lens if lens and len(lens.distortion) == 5 else None  # only that model's coefficients are estimated
-    return car_of(bag.scenario, name, vehicle, lens, np.stack(ray, axis=-1), bag.where, **found)
-
-
-def _columns(rows: Sequence[Any], count: int) -> list[Any]:
-    return [np.array([row[n] for row in rows]) for n in range(count)]
-
-
-def _yaw(rotation: Array) -> float:
-    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    return car_of(bag.scenario, name, vehicle, lens, ray, bag.where, **found)
 
 
 def drive_of_recording(recording: "Recording", path: Path) -> Drive:
@@ -202,7 +162,7 @@ def _of_vehicles(r: "Recording", scenario: Scenario, static: NDArray[np.int64], 
             "gyro": turn[:, 2],
             "truth_time": r.t[known],
             "truth": place[:, 0] + 1j * place[:, 1],
-            "truth_yaw": np.array([_yaw(R) for R in r.truth.rotation[known, i]]),
+            "truth_yaw": np.array([yaw_of(R) for R in r.truth.rotation[known, i]]),
             **({"height": float(np.median(place[:, 2]))} if len(place) else {}),
         }
         yield car_of(scenario, setup.name, i, lens, ray, str(path), **found)

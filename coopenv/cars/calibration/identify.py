@@ -9,13 +9,12 @@ from scipy.stats import ks_2samp
 
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.cars.calibration.batch import deviation, stated_rate
-from coopenv.cars.calibration.drives import tracks_of
 from coopenv.cars.calibration.findings import Row, tables_text
 from coopenv.cars.calibration.response import DEAD_BAND, KINDS, Response, constants_of
 from coopenv.cars.fake.faults import USUAL, FakeSettings
 from coopenv.cars.fake.replay import Sent, replay
 from coopenv.cars.profile import MotionCommand, Role
-from coopenv.cars.readings import CarPose, Detections, Sample
+from coopenv.cars.readings import CarPose, Detections, Sample, tracks_of
 from coopenv.estimation.poses import Array
 from coopenv.scenario import load_scenario
 
@@ -62,7 +61,9 @@ def identify(bag: "Bag", car: str | None = None) -> Identified:
     samples = [s for s in bag.log.samples if s.car == car]
     vehicle, profile = bag.binding.cars[car], bag.binding.profile
     limits = bag.scenario.limits[vehicle]
-    response = Response(tracks_of(samples), limits.wheelbase, profile.command.timeout, f"{bag.where}: {car}")
+    response = Response(
+        tracks_of(samples, bag.log.samples[0].stamp), limits.wheelbase, profile.command.timeout, f"{bag.where}: {car}"
+    )
     given = np.array([_given(limits, kind.name) for kind in KINDS])
     found = constants_of(response, given, limits.dead_band)
     rows = []
