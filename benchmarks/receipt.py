@@ -74,7 +74,7 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
         pass
 
     @device_function
-    def no_increment(memory: Any, world: int, i: int, n: int, d: Any, N: Any):  # type: ignore[no-untyped-def]
+    def no_increment(memory: Any, world: int, i: int, n: int, d: Any):  # type: ignore[no-untyped-def]
         pass
 
     return {

@@ -94,7 +94,7 @@ LINES_AND_FILES = {
     "cli": (2615, 8),
     "estimation": (1810, 8),
     "evaluation": (495, 3),
-    "observers": (11865, 47),
+    "observers": (11880, 47),
     "policies": (1885, 11),
     "runs": (3365, 13),
     "scenario": (3765, 15),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -174,6 +175,9 @@ def test_what_is_left_out_is_part_of_the_observer() -> None:
     assert not found["nothing"] and len(found) > 10
     assert all(hasattr(module, name) for changes in found.values() for module, name, _ in changes)
     assert {name for changes in found.values() for _, name, _ in changes if name.isupper()} <= {*receipt.numbers()}
+    for module, name, put in (change for changes in found.values() for change in changes if not change[1].isupper()):
+        original, replacement = (getattr(f, "func", f) for f in (getattr(module, name), put))
+        assert signature(original).parameters.keys() == signature(replacement).parameters.keys(), name
 
 
 class Source(dict[str, np.ndarray]):

@@ -94,6 +94,17 @@ def add_to_calibration(memory: Any, world: int, i: int, q: int):
 
 
 @device_function
+def set_walk(memory: Any, world: int, i: int):
+    """Let the odometry's scale walk from the velocity's second fault on, by as much as between the last two."""
+    if memory.source[world, i, VELOCITY].exclusions > 1:
+        v = memory.belief[world, i].mean_v
+        along = wp.dot(memory.source[world, i, VELOCITY].offset, v)
+        square = along * along / wp.max(wp.length_sq(v) * wp.length_sq(v), wp.float64(constants.MIN_VARIANCE))
+        memory.source[world, i, VELOCITY].walk = square / memory.source[world, i, VELOCITY].time
+    memory.source[world, i, VELOCITY].time = wp.float64(0.0)
+
+
+@device_function
 def inflate_by_drift(memory: Any, world: int, i: int, q: int):
     """Add to the covariance the square of the own error by a sender's drift."""
     for o in range(memory.belief[world, i].first_sender):
@@ -121,6 +132,8 @@ def exclude(memory: Any, world: int, i: int, q: int):
     """Exclude a source; an own sensor is used on, with an uncertain scale, bias or mounting."""
     memory.source[world, i, q].exclusions += 1
     if is_own(q):
+        if q == VELOCITY:
+            set_walk(memory, world, i)
         add_to_calibration(memory, world, i, q)
         inflate_by_fault(memory, world, i, q)
         return

@@ -95,7 +95,8 @@ class Source:
     drift_information: mat33d  # the decaying sum of these weights
     drift_ratio: wp.float64  # like `ratio`, of a drift of the sender
     drift_time: wp.float64  # s for which it has been likely; of an excluded source, for which it drifted, 0: it did not
-    time: wp.float64  # s for which it has been excluded and in view
+    time: wp.float64  # s for which it has been excluded and in view; of the velocity, since its last fault
+    walk: wp.float64  # variance that the odometry's scale gains in a second, because the velocity's fault has returned
 
 
 @wp.struct
@@ -349,7 +350,7 @@ def robust_rules() -> dict[str, Rule]:
     large = (
         "hypothesis.cost hypothesis.misfit hypothesis.prior_distance fault_mixture sensitivity information "
         "drift_effect source.drift source.drift_vector source.drift_information source.drift_ratio source.drift_time "
-        "source.vector source.ratio source.sum source.information source.covariance source.offset"
+        "source.walk source.vector source.ratio source.sum source.information source.covariance source.offset"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),

@@ -9,7 +9,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import errors_by_rows, moved, odometry_noise, with_noise
 from coopenv.observers.robust.belief import propagate, set_block
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Member, Pose, mat33d, mat66d, vec2d, vec3d, vec4d, vec6d
-from coopenv.observers.robust.sources import propagate_sources
+from coopenv.observers.robust.sources import VELOCITY, propagate_sources
 from coopenv.world.warp_internals import device_function, subroutine
 
 
@@ -81,8 +81,9 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Inflate the covariance of the odometry's errors by their walk over dt."""
+    """Inflate the covariance of the odometry's errors by their walk over dt, as declared and as found, see `Source`."""
     walk = walk_variances(model, i)
+    walk[3] += memory.source[world, i, VELOCITY].walk
     for k in range(4):
         memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
 
@@ -154,13 +155,13 @@ def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt:
 
 
 @wp.func
-def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
+def jump_variance(change: Any, std: Any, period: Any):
     """Return the variance, per axis, of an increment in which the twist has changed by `change` between two samples.
 
-    A change beyond the samples' noise and a `smooth` acceleration is sudden, as in a collision, at any time of the
-    period.
+    A change beyond the samples' noise and a smooth acceleration is sudden, as in a collision, at any time.
     """
     square = wp.dot(change, change)
+    smooth = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
     gate = wp.max(wp.float64(constants.JUMP_GATE) * std * std, smooth * smooth * period * period)
     return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
 
@@ -185,10 +186,8 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         p = p + R * (half * change_v)
         R = R * exp_so3(half * change_w)
         period = model.odometry_period
-        angular = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
-        linear = wp.float64(constants.MAX_SMOOTH_ACCELERATION)
-        noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
-        noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
+        noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period)
+        noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period)
         share = dt / (dt + wp.float64(constants.MEAN_TIME))
         memory.belief[world, i].mean_v = memory.belief[world, i].mean_v + share * (v - memory.belief[world, i].mean_v)
     else:

@@ -264,6 +264,7 @@ def end_block(memory: Any, world: int, i: int, time: Any):
     located = gate_locates_fault(memory, world, i)
     count = eliminate_senders(memory, world, i, wp.float64(constants.MONITOR_TIME) / time)
     kept = wp.exp(-time / wp.float64(constants.MONITOR_TIME))
+    memory.source[world, i, VELOCITY].time += time
     for q in range(SOURCES):
         if is_active(memory, world, i, q):
             V = mat33d()
