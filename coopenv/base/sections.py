@@ -33,7 +33,6 @@ class Section(BaseModel):
         raise CoopenvError(f"{type(self).__name__}.{name}: is frozen; {CHANGE}")
 
     __setitem__ = __setattr__
-    __dataclass_fields__ = property()  # which `dataclasses.replace` asks for; it raises the error of `__getattr__`
 
     def __getitem__(self, key: str) -> Any:
         """Return the value of a dotted key, as overrides name it; an entry of a list by index or name."""
@@ -46,8 +45,6 @@ class Section(BaseModel):
             try:
                 return super().__getattr__(name)
             except AttributeError:
-                if name == "__dataclass_fields__":
-                    raise AttributeError(f"{type(self).__name__} is not a dataclass; {CHANGE}") from None
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
                 known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; as data: model_dump()" if keys else ""
                 raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None

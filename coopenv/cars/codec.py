@@ -5,7 +5,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import install_command, message_types, needing
@@ -131,6 +130,8 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
 
 def pose(rotation: Any, position: Any) -> Any:
     """Return a geometry_msgs/Pose of a rotation (3, 3), body to map, and a position (3,), m."""
+    from scipy.spatial.transform import Rotation  # the extra `gate` has no SciPy
+
     return make("geometry_msgs/msg/Pose", position=position, orientation=Rotation.from_matrix(rotation).as_quat())
 
 
