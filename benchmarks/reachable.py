@@ -14,7 +14,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from functools import partial
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +60,7 @@ class Outcomes(NamedTuple):
 
 
 class Recorded:
-    """A policy in whose place its actions and the stated deviations are kept."""
+    """A policy whose actions and observed stated deviations are kept."""
 
     def __init__(self, policy: Policy, scenario: Scenario) -> None:
         self._policy, self._layout = policy, observation_layout(scenario)
@@ -78,8 +78,8 @@ class Recorded:
         return self.actions[-1]
 
 
-class Plans:
-    """A policy without eyes: actions (K, rows, A), the last ones from then on."""
+class OpenLoop:
+    """A policy that repeats given actions (K, rows, A), and the last ones from then on, whatever it observes."""
 
     def __init__(self, actions: np.ndarray) -> None:
         self._actions, self._next = actions, 0
@@ -116,26 +116,26 @@ def outcomes(episodes: Episodes, std: np.ndarray) -> Outcomes:
     return Outcomes(percentile(std), percentile(episodes.position_error), arrived, collided)
 
 
-def searched(engine: Engine, actions: np.ndarray, seed: int, rounds: int, on_round: Callable[[int], None]) -> Outcomes:
-    """Search from actions (K, N, A) on; return the outcome of the best plan, one entry."""
+def searched(engine: Engine, actions: np.ndarray, seed: int, rounds: int, on_round: Callable[[], None]) -> Outcomes:
+    """Search from actions (K, N, A) on, in two copies of a world at least; return the best plan's outcome, (1,)."""
     rng, copies, (K, N, A) = np.random.default_rng(seed), engine.world.worlds, actions.shape
     time = np.arange(K) * engine.backend.scenario.ticks_per_decision / engine.backend.scenario.rates.camera
     knots = np.arange(0.0, time[-1] + KNOT, KNOT)
     weights = np.stack([np.interp(time, knots, row) for row in np.eye(len(knots))], axis=1)  # (K, knots)
     mean, std = np.zeros((len(knots), N, A)), np.full((len(knots), N, A), SPREAD)
     best, change = None, mean
-    for n in range(rounds):
+    for _ in range(rounds):
         changes = mean + std * rng.standard_normal((copies, *mean.shape))
         changes[0], changes[1] = change, mean
         plans = np.clip(actions[:, None] + np.einsum("tk,wkna->twna", weights, changes), -1.0, 1.0)
-        found, _ = driven(engine, Plans(plans.reshape(K, copies * N, A)), seed)
+        found, _ = driven(engine, OpenLoop(plans.reshape(K, copies * N, A)), seed)
         order = np.argsort(found.cost, kind="stable")
         if best is None or found.cost[order[0]] < best.cost[0]:
             best, change = Outcomes(*(values[order[:1]] for values in found)), changes[order[0]]
         elite = changes[order[: max(2, round(ELITE * copies))]]
         mean = KEPT * mean + (1.0 - KEPT) * elite.mean(axis=0)
         std = KEPT * std + (1.0 - KEPT) * elite.std(axis=0)
-        on_round(n + 1)
+        on_round()
     assert best is not None
     return best
 
@@ -148,19 +148,15 @@ def measured(scenario: Scenario, agents: Sequence[str], asked: argparse.Namespac
         closing(Engine(scenario, asked.copies)) as many,
         Progress(Console(stderr=True), "searching", total=asked.worlds * asked.rounds) as progress,
     ):
-        for world, seed in enumerate(held_out_seeds(asked.block, asked.worlds)):
+        done = count(1)
+        for seed in held_out_seeds(asked.block, asked.worlds):
             plans = {name: driven(single, load_agent(name, scenario), seed) for name in agents}
             for name, (outcome, _) in plans.items():
                 found.setdefault(name, []).append(outcome)
             _, actions = min(plans.values(), key=lambda plan: float(plan[0].cost[0]))
-            on_round = partial(_report, progress, world * asked.rounds)
-            best = searched(many, actions[:, 0], seed, asked.rounds, on_round)
+            best = searched(many, actions[:, 0], seed, asked.rounds, lambda: progress.update(next(done)))
             found.setdefault(SEARCH, []).append(best)
     return {name: Outcomes(*map(np.concatenate, zip(*rows, strict=True))) for name, rows in found.items()}
-
-
-def _report(progress: Progress, before: int, done: int) -> None:
-    progress.update(before + done)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -175,6 +171,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, help="within which all have to arrive (default: the horizon)")
     asked = parser.parse_args(arguments)
     try:
+        if min(asked.worlds, asked.copies, asked.rounds * 2) < 2:
+            raise CoopenvError("--worlds and --copies are at least 2, --rounds at least 1")
         overrides = {} if asked.seconds is None else {"horizon": asked.seconds}
         scenario = open_simulation(asked.environment, overrides)
         if "position_std" not in observation_layout(scenario):
@@ -185,14 +183,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     table = number_table(("",), ["stated e95\n[cm]", "e95\n[cm]", "over the\nsearch", "arrived\n[%]", "collided\n[%]"])
     for name, own in found.items():
-        ratio = own.e95 / found[SEARCH].e95
-        cells = [
-            (100.0 * own.stated, 1),
-            (100.0 * own.e95, 1),
-            (ratio, 2),
-            (100.0 * own.arrived, 0),
-            (100.0 * own.collided, 0),
-        ]
+        shares = 100.0 * own.arrived, 100.0 * own.collided
+        values = 100.0 * own.stated, 100.0 * own.e95, own.e95 / found[SEARCH].e95, *shares
+        cells = zip(values, (1, 1, 2, 0, 0), strict=True)
         table.add_row(name, *(f"{v.mean():.{digits}f}\n±{standard_error(v):.{digits}f}" for v, digits in cells))
     console = Console()
     console.print(f"{asked.environment}: mean over {asked.worlds} worlds of block {asked.block}, with standard errors.")

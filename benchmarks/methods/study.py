@@ -24,6 +24,7 @@ from coopenv.backends.sources import open_simulation
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text
 from coopenv.base.sections import Section, read_toml, validated
+from coopenv.evaluation.metrics import interval
 
 FIGURES = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m", "return")
 """Of the metrics of `coopenv evaluate`, those that are kept."""
@@ -103,8 +104,8 @@ def read_study(path: Path) -> StudyFile:
         CoopenvError: it is not valid; one line that names file and key.
     """
     study = validated(StudyFile, read_toml(path), str(path))
-    for name in sorted({*study.references} & {*study.methods}):
-        raise CoopenvError(f"{path}: {name} is a method and a reference: rename one")
+    if both := sorted({*study.references} & {*study.methods}):
+        raise CoopenvError(f"{path}: {both[0]} is a method and a reference: rename one")
     return study
 
 
@@ -159,8 +160,7 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 def with_interval(values: np.ndarray, seed: int = 0) -> tuple[float, float, float]:
     """Return the interquartile mean of runs (S,) and its 95 % interval, by resampling runs."""
     drawn = np.random.default_rng(seed).choice(values, (RESAMPLES, len(values)))
-    low, high = np.percentile(interquartile_mean(drawn), (2.5, 97.5))
-    return float(interquartile_mean(values)), float(low), float(high)
+    return float(interquartile_mean(values)), *interval(interquartile_mean(drawn))
 
 
 def improvement(own: Sequence[np.ndarray], other: Sequence[np.ndarray], seed: int = 0) -> tuple[float, float, float]:
@@ -184,8 +184,7 @@ def improvement(own: Sequence[np.ndarray], other: Sequence[np.ndarray], seed: in
 
     value = probability(zip(own, other, strict=True))
     pairs = [(drawn(mine), drawn(theirs)) for mine, theirs in zip(own, other, strict=True)]
-    low, high = np.percentile(probability(pairs), (2.5, 97.5))
-    return float(value), float(low), float(high)
+    return float(value), *interval(probability(pairs))
 
 
 def _larger(own: np.ndarray, other: np.ndarray) -> np.ndarray:

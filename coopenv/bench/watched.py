@@ -107,15 +107,15 @@ class _Worker:
         memory = sum(member.memory_info().rss for member in family) / 2**20
         return sum(time.user + time.system for time in times), monotonic(), memory
 
-    def excess(self, limits: Limits) -> str:
-        """Return the limit that the present part exceeds, in words; empty: none."""
+    def excess(self, limits: Limits) -> tuple[str, bool] | None:
+        """Return the limit that the present part exceeds, in words, and whether it ends all like it; None: no limit."""
         with suppress(psutil.Error):  # it has ended, and its pipe with it
             time, clock, memory = (now - then for now, then in zip(self.measured(), self.before, strict=True))
             if time > limits.seconds or clock > PATIENCE * limits.seconds:
-                return f"more than {limits.seconds:g} s on one record (--seconds){NOT_RUN}"
+                return f"more than {limits.seconds:g} s on one record (--seconds){NOT_RUN}", True
             if memory > limits.mebibytes:
-                return f"more than {limits.mebibytes:g} MiB of memory (--memory)"
-        return ""
+                return f"more than {limits.mebibytes:g} MiB of memory (--memory)", False
+        return None
 
     def end(self) -> str:
         """Kill it and the processes that it has started, and return how it ended."""
@@ -191,8 +191,8 @@ class Pool:
                     self._fail(worker, "")
                 else:
                     finished = self._take(worker, message) or finished
-            elif worker.started and self.limits is not None and (reason := worker.excess(self.limits)):
-                self._fail(worker, reason)
+            elif worker.started and self.limits is not None and (excess := worker.excess(self.limits)):
+                self._fail(worker, *excess)
         return finished
 
     def _take(self, worker: _Worker, message: Any) -> bool:
@@ -212,14 +212,14 @@ class Pool:
             worker.number = -1
         return worker.number < 0
 
-    def _fail(self, worker: _Worker, reason: str) -> None:
-        """End a worker; what remains of its task waits for another one."""
+    def _fail(self, worker: _Worker, reason: str, everywhere: bool = False) -> None:
+        """End a worker; what remains of its task waits for another one. `everywhere` as for `Divided.ending`."""
         number, ended = worker.number, worker.end()
         self.workers.remove(worker)
         if not worker.started or self.limits is None:
             raise CoopenvError(f"a process died: out of memory, or killed, or an observer ended it ({ended})")
         task, part, reason = self.tasks[number], self.done[number], reason or ended
         for other in (number, *self.waiting):
-            self.tasks[other] = self.tasks[other].ending(task, part, reason, reason.endswith(NOT_RUN))
+            self.tasks[other] = self.tasks[other].ending(task, part, reason, everywhere)
         self.tasks[number], self.done[number] = self.tasks[number].rest(part), 0
         self.waiting.appendleft(number)

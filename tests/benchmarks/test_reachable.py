@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.reachable import Plans, driven, main, searched
+from benchmarks.reachable import OpenLoop, driven, main, searched
 from coopenv.api.engine import Engine
 from coopenv.evaluation import held_out_seeds
 from coopenv.policies import load_agent
@@ -20,10 +20,10 @@ def test_a_repeated_plan_leads_where_its_agent_was_and_the_search_finds_no_worse
     (seed,) = held_out_seeds(41, 1)
     with closing(Engine(scenario, 1)) as single, closing(Engine(scenario, 6)) as many:
         outcome, actions = driven(single, load_agent("look_ahead", scenario), seed)
-        again, _ = driven(many, Plans(np.repeat(actions[:, 0], 6, axis=0).reshape(len(actions), -1, 2)), seed)
+        again, _ = driven(many, OpenLoop(np.repeat(actions[:, 0], 6, axis=0).reshape(len(actions), -1, 2)), seed)
         assert_allclose(again.e95, outcome.e95[0], rtol=1e-6)
         assert_allclose(again.stated, outcome.stated[0], rtol=1e-6)
-        best = searched(many, actions[:, 0], seed, 2, lambda n: None)
+        best = searched(many, actions[:, 0], seed, 2, lambda: None)
     assert best.cost[0] <= outcome.cost[0] + 1e-6
 
 
@@ -33,6 +33,9 @@ def test_a_repeated_plan_leads_where_its_agent_was_and_the_search_finds_no_worse
         (["nowhere"], "nowhere"),
         (["busy_intersection"], "position_std"),
         (["scout_platoon", "--agents", "nobody"], "nobody"),
+        (["scout_platoon", "--worlds", "1"], "--worlds"),
+        (["scout_platoon", "--copies", "1"], "--copies"),
+        (["scout_platoon", "--rounds", "0"], "--rounds"),
     ],
 )
 def test_mistakes_are_one_line(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
