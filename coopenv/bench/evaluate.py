@@ -88,12 +88,13 @@ def run(
         if figures is not None or film:
             from coopenv.bench import evaluate_figures
 
+            scenes = evaluate_figures.scenes_of(evaluation, log)
         if figures is not None:
             with Progress(log, "drawing figures"):
                 evaluate_figures.save_figures(evaluation, new, figures, width)
-            evaluate_figures.write_replays(evaluation, new, log)
+            evaluate_figures.write_replays(evaluation, scenes, new, log)
         if film:
-            evaluate_figures.write_film(evaluation, new, log)
+            evaluate_figures.write_film(scenes, new, log)
     return evaluation
 
 

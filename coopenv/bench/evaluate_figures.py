@@ -1,9 +1,8 @@
 """Figures of an evaluation: error along the way, time against error, where drivers looked."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import closing
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +10,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from PIL import Image
 from rich.console import Console
 
 from coopenv.api.engine import Engine
-from coopenv.bench.cards import Entrant, Evaluation
+from coopenv.bench.cards import Evaluation
 from coopenv.evaluation import held_out_seeds
-from coopenv.evaluation.episodes import Episodes, play
+from coopenv.evaluation.episodes import Episodes
 from coopenv.evaluation.metrics import Quantile, interval, resamples
+from coopenv.runs import films
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress
-from coopenv.runs.films import video_path, write_pictures
+from coopenv.runs.films import Shot, video_path
 from coopenv.runs.scenes import frame_stride, scene_of, write_page
 from coopenv.viz import style
 from coopenv.viz.figures import inches_of, restyle
-from coopenv.viz.scene import Origin
+from coopenv.viz.scene import Origin, SceneRecord
 from coopenv.viz.style import INK, NORMAL, SMALL
 from coopenv.viz.topview import TopView
 
@@ -148,69 +147,40 @@ def _note(evaluation: Evaluation, words: str) -> str:
 
 
 COLUMNS = 3
-WIDEST = 1920  # px
+"""Pictures in a row of the film."""
 
 
-def write_film(evaluation: Evaluation, folder: Path, log: Console) -> None:
-    """Film the first world of an evaluation, one picture per driver, until the last has ended."""
-    scenario = evaluation.entrants[0].scenario
-    seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
-    path, stride = video_path(folder), frame_stride(scenario)
-    with Progress(log, f"filming {path.name}", scenario.horizon_ticks) as progress:
-
-        def whole() -> Iterator[np.ndarray]:
-            for done, pictures in enumerate(_together([pictures_of(entrant, seed) for entrant in evaluation.entrants])):
-                yield tiled(pictures)
-                progress.update(done * stride)
-
-        write_pictures(path, scenario.rates.camera / stride, whole())
+def scenes_of(evaluation: Evaluation, log: Console) -> list[SceneRecord]:
+    """Return every driver's episode in the first world of an evaluation."""
+    seed, scenes = held_out_seeds(evaluation.block, evaluation.worlds)[0], []
+    for entrant in evaluation.entrants:
+        source = Origin.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
+        with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
+            scenes.append(scene_of(engine, source, entrant.policy, progress.update))
+    return scenes
 
 
-def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
-    """Yield the pictures, (H, W, 3) uint8, of a driver's episode: its name, the error and the time above the map."""
-    scenario = entrant.scenario
-    with closing(Engine(scenario)) as engine:
-        titled = engine.backend.scenario.model_copy(update={"title": entrant.name})
-        with closing(TopView(titled, panel=False)) as view:
-            for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
-                if tick % frame_stride(scenario) == 0:
-                    yield view.draw(engine)
+def write_film(scenes: Sequence[SceneRecord], folder: Path, log: Console) -> None:
+    """Write the film of all drivers, side by side and below each other, until the last episode has ended."""
+    shots = [Shot(record, TopView(record.scenario, panel=False), record.source.policy) for record in scenes]
+    rows = [shots[first : first + COLUMNS] for first in range(0, len(shots), COLUMNS)]
+    path, scenario = video_path(folder), scenes[0].scenario
+    with Progress(log, f"filming {path.name}", 1.0) as progress:
+        fps = scenario.rates.camera / frame_stride(scenario)
+        films.write_film(rows, path, fps, width=None, on_progress=progress.update)
 
 
-def _together(films: list[Iterator[np.ndarray]]) -> Iterator[list[np.ndarray]]:
-    """Yield the pictures of all films at each moment; one that is over stays at its last."""
-    last: list[np.ndarray] = []
-    for pictures in zip_longest(*films):
-        last = [old if new is None else new for new, old in zip(pictures, last or pictures, strict=True)]
-        yield last
-
-
-def tiled(pictures: list[np.ndarray]) -> np.ndarray:
-    """Return pictures of one size beside and below each other, at most `COLUMNS` in a row and `WIDEST` wide."""
-    columns = min(COLUMNS, len(pictures))
-    padded = [*pictures, *[np.full_like(pictures[0], 255)] * (-len(pictures) % columns)]
-    whole = np.vstack([np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)])
-    if whole.shape[1] <= WIDEST:
-        return whole
-    size = WIDEST, round(whole.shape[0] * WIDEST / whole.shape[1])
-    return np.asarray(Image.fromarray(whole).resize(size, Image.Resampling.LANCZOS))
-
-
-def write_replays(evaluation: Evaluation, folder: Path, log: Console) -> None:
+def write_replays(evaluation: Evaluation, scenes: Sequence[SceneRecord], folder: Path, log: Console) -> None:
     """Write a page per driver; none, and a line, where the extra `view` is missing.
 
     `replay.html` is that of the first driver that has learnt, else of the first of all.
     """
-    entrants, files = evaluation.entrants, dict[str, str]()
-    shown = next((entrant for entrant in entrants if entrant.kind == "learned"), entrants[0])
-    for number, entrant in enumerate(entrants):
-        plain = re.sub(r"[^\w.-]+", "_", entrant.name)
-        file = REPLAY_FILE if entrant is shown else f"replay_{plain}.html"
-        files[entrant.name] = file if file not in files.values() else f"replay_{plain}_{number}.html"
-    seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
-    for entrant in sorted(entrants, key=lambda e: e is not shown):
-        source = Origin.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
-        with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
-            record = scene_of(engine, source, entrant.policy, progress.update)
-        if write_page(record, folder / files[entrant.name], log, files) is None:
+    kinds, files = [entrant.kind for entrant in evaluation.entrants], dict[str, str]()
+    shown = kinds.index("learned") if "learned" in kinds else 0
+    for number, record in enumerate(scenes):
+        plain = re.sub(r"[^\w.-]+", "_", record.source.policy)
+        file = REPLAY_FILE if number == shown else f"replay_{plain}.html"
+        files[record.source.policy] = file if file not in files.values() else f"replay_{plain}_{number}.html"
+    for record in (scenes[shown], *scenes[:shown], *scenes[shown + 1 :]):
+        if write_page(record, folder / files[record.source.policy], log, files) is None:
             return

@@ -22,8 +22,8 @@ SUFFIXES = (".mp4", ".gif", ".webp")
 """Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
 VIDEO_FILES = ("video.mp4", "video.gif")
 """Names of a film in a folder of results, with and without the extra."""
-SMALL = 480
-"""Largest width of a GIF or WebP where none is asked for, pixels: its pictures are held in memory until the end."""
+WIDEST, SMALL = 1920, 480
+"""Largest widths where none is asked for, pixels: of MP4; of GIF and WebP, held in memory until the end."""
 
 
 def check_film(path: Path) -> None:
@@ -76,7 +76,7 @@ def write_film(
     """Write a film of scenes that begin together; return how many pictures it has. The views are closed.
 
     Args:
-        shots: rows of the picture; all shots of a row are equally high, all rows equally wide.
+        shots: rows of the picture; all shots of a row are equally high. Narrower rows end in white.
         path: of the film, which is replaced as a whole; its suffix is the format.
         fps: pictures a second; frames of a scene are repeated where it has fewer.
         speed: times real time.
@@ -93,8 +93,10 @@ def write_film(
 
     def pictures() -> Iterator[np.ndarray]:
         for k in range(count):
-            rows = ([_picture(shot, int(frames[min(k, len(frames) - 1)])) for shot, frames in row] for row in chosen)
-            yield np.vstack([np.hstack(row) for row in rows])
+            parts = ([_picture(shot, int(frames[min(k, len(frames) - 1)])) for shot, frames in row] for row in chosen)
+            rows = [np.hstack(row) for row in parts]
+            widest = max(row.shape[1] for row in rows)
+            yield np.vstack([np.pad(r, ((0, 0), (0, widest - r.shape[1]), (0, 0)), constant_values=255) for r in rows])
             on_progress((k + 1) / count)
 
     with ExitStack() as stack:
@@ -180,13 +182,13 @@ def frames_at(time: np.ndarray, fps: float, speed: float) -> np.ndarray:
 def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width: int | None = None) -> None:
     """Write pictures, (H, W, 3) uint8, as they come, as a film in the format that its path names; none: no file.
 
-    Those that are wider than `width` pixels are made smaller (None: MP4 of any width, the others of at most `SMALL`).
+    Those that are wider than `width` pixels are made smaller (None: than `WIDEST` or `SMALL`).
 
     Raises:
         OutputError: the film cannot be written.
     """
     mp4 = path.suffix == ".mp4"
-    widest = width or (None if mp4 else SMALL)
+    widest = width or (WIDEST if mp4 else SMALL)
     images = (_no_wider(Image.fromarray(picture), widest) for picture in pictures)
     if mp4:
         _write_mp4(path, fps, images)
@@ -199,10 +201,9 @@ def write_pictures(path: Path, fps: float, pictures: Iterable[np.ndarray], width
             kept[0].save(path, save_all=True, append_images=kept[1:], duration=duration, loop=0, **quality)
 
 
-def _no_wider(image: Image.Image, width: int | None) -> Image.Image:
-    if width is None or image.width <= width:
-        return image
-    return image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
+def _no_wider(image: Image.Image, width: int) -> Image.Image:
+    image.thumbnail((width, image.height), Image.Resampling.LANCZOS, reducing_gap=None)
+    return image
 
 
 def _write_mp4(path: Path, fps: float, images: Iterable[Image.Image]) -> None:

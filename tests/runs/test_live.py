@@ -220,6 +220,15 @@ def test_films_stand_side_by_side_with_who_is_lost(record: SceneRecord, tmp_path
     assert left[0] > left[1] + 60.0 and right[1] > right[0] + 60.0  # vermilion, green
 
 
+def test_a_short_row_of_a_film_ends_in_white(record: SceneRecord, tmp_path: Path) -> None:
+    shots = [Shot(record, TopView(record.scenario, panel=False)) for _ in range(3)]
+    write_film([shots[:2], shots[2:]], tmp_path / "film.webp", fps=1.0, width=400)
+    with Image.open(tmp_path / "film.webp") as film:
+        picture = np.asarray(film.convert("RGB"), float)
+    upper, lower = np.vsplit(picture[: len(picture) // 2 * 2], 2)
+    assert np.abs(upper[:, :200] - lower[:, :200]).mean() < 4.0 and lower[:, 204:].min() > 240.0
+
+
 def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     assert write_film(top_view_film(record), tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16

@@ -14,7 +14,6 @@ from PIL import Image
 
 from coopenv.base.installation import data_directory
 from coopenv.bench.cards import shown
-from coopenv.bench.evaluate_figures import tiled
 from coopenv.cli import main
 from coopenv.evaluation import METRICS
 from tests.helpers.commands import refused
@@ -127,11 +126,3 @@ def test_mistakes_are_one_line(options: list[str], message: str) -> None:
 )
 def test_figures_have_the_digits_that_their_interval_allows(values: tuple[float, ...], expected: object) -> None:
     assert shown(dict(zip(("mean", "ci_low", "ci_high"), values, strict=True)), 1.0) == expected
-
-
-def test_pictures_stand_in_rows_of_three() -> None:
-    pictures = [np.full((10, 20, 3), shade, np.uint8) for shade in (10, 20, 30, 40)]
-    whole = tiled(pictures)
-    assert whole.shape == (20, 60, 3)
-    assert (whole[:10, 40:] == 30).all() and (whole[10:, :20] == 40).all() and (whole[10:, 20:] == 255).all()
-    assert tiled([np.zeros((672, 1300, 3), np.uint8)] * 2).shape[1] == 1920
