@@ -98,7 +98,7 @@ class Engine:
         self._table = results_table(scenario, self.layout, device)
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
-        scripted = load_reference("coopenv.policies.scripted:ScriptedVehicles")  # policies stand on environments
+        scripted = load_reference("coopenv.policies.loader:ScriptedVehicles")  # policies stand on environments
         self.scripted: Any = scripted(scenario) if any(scenario.drivers) else None
         """Drivers in place of actions; None without any."""
         self.begun = False

@@ -23,14 +23,13 @@ from rich.table import Table
 from coopenv.base.errors import CoopenvError, ScenarioWarning, check_one_of, listed
 from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.base.installation import data_directory, is_reference, versions
-from coopenv.bench.executors import Local
+from coopenv.bench.executors import Limits, Local
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import judge_all
 from coopenv.bench.observers.rows import spread
 from coopenv.bench.observers.sources import SimulatedRecords, find_source
 from coopenv.bench.observers.tables import mean_of, short_name
-from coopenv.bench.watched import Limits
 from coopenv.estimation.metrics import DIVERGED_POSITION
 from coopenv.observers.registry import find, named
 from coopenv.runs.console import number_table

@@ -202,7 +202,7 @@ def bench_v1(
     from coopenv.base.format import json_text
     from coopenv.base.installation import available_cores
     from coopenv.bench import frozen
-    from coopenv.bench.watched import Limits
+    from coopenv.bench.executors import Limits
     from coopenv.runs.console import Progress
 
     check_file(out)

@@ -23,7 +23,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
 from coopenv.backends.base import Backend, Command
 from coopenv.backends.mcap import write_recording
-from coopenv.backends.mcap.reader import read_recording
+from coopenv.backends.mcap.recordings import read_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.backends.replay import Replay

@@ -14,8 +14,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import ONE_THREAD
-from coopenv.bench.executors import Local, find_executor, reach
-from coopenv.bench.watched import Limits
+from coopenv.bench.executors import Limits, Local, find_executor, reach
 
 THREADS = list(ONE_THREAD)
 

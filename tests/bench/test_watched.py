@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.executors import find_executor
+from coopenv.bench.executors import NOT_RUN, Limits, _work, find_executor
 from coopenv.bench.frozen import Frozen, report
-from coopenv.bench.watched import NOT_RUN, Limits, _work
 from coopenv.cli import main
 from tests.helpers.processes import DEADLOCK
 
@@ -163,7 +162,7 @@ def test_a_worker_that_gets_no_task_ends_in_silence(capfd: pytest.CaptureFixture
 def test_the_first_worker_is_deaf_to_ctrl_c(tmp_path: Path) -> None:
     """In a fresh process, in which nothing of `multiprocessing` runs yet."""
     (tmp_path / "first.py").write_text(
-        "from coopenv.bench.watched import _Worker\n"
+        "from coopenv.bench.executors import _Worker\n"
         "if __name__ == '__main__':\n"
         "    worker = _Worker()\n"
         "    print(open(f'/proc/{worker.process.pid}/status').read().split('SigBlk:')[1].split()[0])\n"

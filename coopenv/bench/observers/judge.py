@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.bench.executors import Executor, Local
+from coopenv.bench.executors import Executor, Local, Pool
 from coopenv.bench.observers.sources import RecordSource
-from coopenv.bench.watched import Pool
 from coopenv.estimation.metrics import (
     CONVERGED,
     SETTLED,

@@ -3,23 +3,28 @@
 import sched
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.fault_text import Fault
 from coopenv.cars.backend.binding import Binding
-from coopenv.cars.codec import decode, pose, warm_up
+from coopenv.cars.codec import decode, pose, stamp_of, warm_up
 from coopenv.cars.fake.camera import FakeCamera
 from coopenv.cars.fake.faults import USUAL, CarFaults, FakeSettings, Wire, end_process, fake_fault, fault_topic
 from coopenv.cars.fake.sensors import LEADER_RATE, TRUTH_RATE, Act, CarSensors, SensorPublisher
 from coopenv.cars.fake.world import Actuators, CarWorld, Neighbours
-from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive
+from coopenv.cars.gate.core import PERIOD, GateClock, Malformed, read_drive, write_drive
 from coopenv.cars.gate.process import CLOCK, GateConnection
 from coopenv.cars.profile import RESET_TOPIC, MotionCommand, Role, presence_of
+from coopenv.cars.readings import READERS, CarPose, Sample, read
 from coopenv.cars.transport.base import Callback, Transport
+from coopenv.cars.vision import Calibration
 
 LATE = 50_000_000
 """ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
@@ -201,3 +206,43 @@ class Fake:
 
     def _fault(self, payload: bytes, _at: int) -> None:
         self.add_fault(fake_fault(str(decode(payload, "std_msgs/msg/String").data)))
+
+
+Sent = Mapping[Role, Sequence[Sample]]
+"""Samples by role in the order of their stamps, by the sender's clock, with times of reception."""
+
+
+def replay(
+    binding: Binding,
+    car: str,
+    commands: Sequence[tuple[int, MotionCommand]],
+    settings: FakeSettings,
+    seed: int,
+    start: CarPose | None = None,
+) -> Sent:
+    """Return what a fake sends under commands at times in ns, up to the last one; `start` is its pose (None: any)."""
+    now = commands[0][0]
+    clock = GateClock(lambda: now, lambda: now)
+    arrived: list[tuple[str, bytes, int]] = []
+    network: Any = SimpleNamespace(**dict.fromkeys(("subscribe", "announce", "watch", "close"), lambda *_: None))
+    network.publish = lambda topic, payload, *_, **__: arrived.append((topic, payload, now))  # without other ends
+    fake = Fake(binding, car, network, seed=seed, clock=clock, settings=settings)
+    if start is not None and start.rotation is not None:
+        fake.world.put(fake.world.agent, start.rotation, start.position - np.array(binding.scenario.map.origin))
+    waiting = list(reversed(commands))
+    while waiting:
+        now = max(now + 1, min(fake.next, waiting[-1][0]))
+        fake.advance()
+        while waiting and waiting[-1][0] <= now:
+            at, drive = waiting.pop()
+            fake.obey(write_drive(at, binding.profile.command, drive), at)
+    roles = {binding.profile.topic_of(car, role): role for role in READERS}
+    found: dict[Role, list[Sample]] = {}
+    lens = Calibration.of(binding.scenario.cameras[binding.cars[car]])
+    for topic, payload, received in arrived:
+        with suppress(CoopenvError):  # of no use to readers either
+            role = roles[topic]
+            message = decode(payload, binding.profile.topics[role].type)
+            value = read(role, message, lens, known=binding.targets, vision=binding.profile.vision)
+            found.setdefault(role, []).append(Sample(car, role, stamp_of(message), received, value))
+    return {role: sorted(samples, key=lambda sample: sample.stamp) for role, samples in found.items()}

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 import coopenv
-from coopenv.backends.mcap.writer import write_recording
+from coopenv.backends.mcap.recordings import write_recording
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.changes import DIRECTION, usual_sender
 from coopenv.bench.observers.command import figure_files
