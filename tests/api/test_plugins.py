@@ -22,7 +22,6 @@ from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs.recorder import record
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
-from tests.oracles.riccati import Riccati
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),
@@ -64,7 +63,7 @@ class Locked(DeadReckoning):
 @pytest.fixture(autouse=True)
 def plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(registry, "_registered", {})
-    on_the_host = {"riccati_on_the_host": Riccati, "robust_on_the_host": find("robust")}
+    on_the_host = {f"{name}_on_the_host": find(name) for name in ("riccati", "robust")}
     for name, factory in {**on_the_host, "late": Late, "nan": Nan, "locked": Locked}.items():
         register(name, factory)
     yield
