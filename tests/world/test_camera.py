@@ -18,7 +18,7 @@ from coopenv.world import camera
 from coopenv.world.model import entry_struct, precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
-from tests.oracles import geometry, philox
+from tests.oracles import geometry
 
 call = Calls(__name__, {camera.segment_hits_box: "3 3 1 33 3 3 > b"})
 PIXY = {"fx": 213.161906, "fy": 213.521038, "cx": 154.841998, "cy": 114.98398}
@@ -366,21 +366,18 @@ def paper_frame(axis: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
-def test_paper_noise_draw_by_draw(axis: tuple[float, float, float]) -> None:
-    """(x, y) = p_xy / p_z + U(-scale, scale)^2, then back to a unit vector on the same side; from the same words."""
-    scale, seed, ticks = 0.02, 77, 20
-    made = scenario([vehicle((0, 0, 0))], noise={"bearing": {"model": "paper", "scale": scale, "axis": list(axis)}})
-    states = run(start(made, [seed]), ticks)
-    place = np.array([p.position for p in made.landmarks])
-    frame = paper_frame(np.array(axis))
-    for tick, state in enumerate(states):
-        for j, z in enumerate(place):
-            words = philox.philox4x32((tick, j, 6, 0), (seed, 0))
-            u = 2 * ((np.array(words[:2], float) + 0.5) / 2**32) - 1
-            g = frame.T @ z
-            image = np.append(g[:2] / g[2] + scale * u, 1.0)
-            expected = frame @ image * np.sign(g[2])
-            assert_allclose(state["bearing"][0, 0, j], expected / np.linalg.norm(expected), atol=1e-13)
+def test_paper_noise_is_uniform_in_the_image_plane(axis: tuple[float, float, float]) -> None:
+    """(x, y) = p_xy / p_z + U(-scale, scale)^2, then back to a unit vector on the same side."""
+    scale, frame = 0.02, paper_frame(np.array(axis))
+    b, true = bearings({"model": "paper", "scale": scale, "axis": list(axis)}, dtype="float64")
+    assert_allclose(np.linalg.norm(b, axis=-1), 1.0, atol=1e-13)
+    image, exact = b @ frame, true @ frame
+    assert (np.sign(image[..., 2]) == np.sign(exact[:, 2])).all()
+    off = (image[..., :2] / image[..., 2:] - exact[:, :2] / exact[:, 2:]) / scale
+    assert np.abs(off).max() <= 1.0 + 1e-9
+    for column in off.reshape(len(off), -1).T:
+        assert stats.kstest(column, "uniform", args=(-1.0, 2.0)).pvalue > 1e-4
+    assert np.abs(np.corrcoef(off.reshape(len(off), -1).T) - np.eye(off[0].size)).max() < 5 / np.sqrt(len(off))
 
 
 def test_paper_noise_in_the_plane_of_the_axis_is_finite() -> None:
