@@ -48,7 +48,7 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
         assert list(first) == [agent for agent, alive in zip(single.possible_agents, there, strict=True) if alive]
         assert np.array_equal(batch.world_major(observations)[world][there], np.stack(list(first.values())))
     slow = batch.scenario.backend != "simulated"  # cars are stepped on the host
-    for _ in range(8 if slow else 40):
+    for _ in range(4 if slow else 20):
         actions = batch.world_major(actions_for(batch, rng))
         observations, rewards, terminated, truncated, infos = batch.step(actions.reshape(-1, 2))
         assert batch.observation_space.contains(observations) and rewards.dtype == np.float32

@@ -1,42 +1,50 @@
-"""All kinds of hostile input: some of it here, and as much as it takes marked as slow."""
+"""All kinds of hostile input: some of it here, and as much as it takes marked as slow.
+
+A case that crashes or hangs ends the process with a traceback; its number is then in the file `case` of the test.
+"""
 
 from __future__ import annotations
 
+import faulthandler
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
 import pytest
 
-from tests.fuzz.harness import run_cases
-from tests.fuzz.large import CASES as LARGE
-from tests.fuzz.some import CASES, KINDS
+from tests.fuzz import large, mcap, mrclam, scenarios, states
 
-ALL = {"states": 1000, "scenarios": 3000, "mrclam": 500, "mcap": 2000}
-"""How many cases of a kind the slow tests run."""
-
-
-def test_some() -> None:
-    outcome = run_cases("tests.fuzz.some", range(len(CASES)), hang_s=60.0)
-    assert not outcome.failures, "\n".join(f"{CASES[n]}: {why}" for n, why in sorted(outcome.failures.items())[:5])
-    for kind, (_, count) in KINDS.items():
-        for word in ("accepted", "refused"):  # or the cases would show nothing
-            assert outcome.taken[f"{kind} {word}"] > count // 20
-    assert outcome.taken["large accepted"] == len(LARGE)
+KINDS = {"states": (states, 40, 1000), "scenarios": (scenarios, 20, 3000)}
+KINDS |= {"mrclam": (mrclam, 60, 500), "mcap": (mcap, 40, 2000)}
+"""A module of cases, and how many of them run here and in the slow tests."""
+LONGEST = 60.0
+"""A case may take so long, s."""
 
 
-@pytest.mark.slow
+def outcomes(module: Any, numbers: Iterable[int], note: Path) -> Counter[str]:
+    """Return how often input was taken in which way, such as "accepted" and "refused"; a case raises what is wrong."""
+    module.prepare()
+    found = Counter[str]()
+    try:
+        for number in numbers:
+            note.write_text(f"{module.__name__} {number}", encoding="utf-8")
+            faulthandler.dump_traceback_later(LONGEST, exit=True)
+            found[module.case(number)] += 1
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+    return found
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_all(kind: str) -> None:
-    first, last = KINDS[kind][1], ALL[kind]
-    outcome = run_cases(f"tests.fuzz.{kind}", range(first, last))
-    print(dict(outcome.taken), f"longest {outcome.longest_s:.2f} s")  # with pytest -s
-    assert not outcome.failures, "\n".join(f"{kind} {n}: {why}" for n, why in sorted(outcome.failures.items())[:5])
-    assert sum(outcome.taken.values()) == last - first
-    for word in ("accepted", "refused"):
-        assert outcome.taken[word] > (last - first) // 20
+@pytest.mark.parametrize("all_of_them", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_hostile_input(kind: str, all_of_them: bool, tmp_path: Path) -> None:
+    module, some, most = KINDS[kind]
+    numbers = range(some, most) if all_of_them else range(some)
+    found = outcomes(module, numbers, tmp_path / "case")
+    for word in ("accepted", "refused"):  # or the cases would show nothing
+        assert found[word] > len(numbers) // 20
 
 
-def test_a_crash_a_hang_and_an_error_are_failures_of_their_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tests.fuzz.harness.HANG_S", 2.0)
-    outcome = run_cases("tests.fuzz.failing", range(6))
-    assert outcome.taken == {"accepted": 3}
-    assert outcome.failures.keys() == {1, 2, 4}
-    assert "ended the process (-11)" in outcome.failures[1]
-    assert "hangs" in outcome.failures[2] and "ZeroDivisionError" in outcome.failures[4]
+def test_large_scenarios(tmp_path: Path) -> None:
+    assert outcomes(large, range(len(large.CASES)), tmp_path / "case") == {"accepted": len(large.CASES)}

@@ -45,7 +45,7 @@ def test_agent_drives(agent: str, name: str) -> None:
     observations, _ = envs.reset(seed=1000)
     for each, count in ((policy, len(rows)), (again, len(rows)), (alone, some)):
         restart(each, np.ones(count, dtype=bool))
-    for _ in range(15):
+    for _ in range(6):
         actions = np.asarray(policy(observations))
         assert envs.action_space.contains(actions.astype(np.float32))
         np.testing.assert_array_equal(again(observations), actions)

@@ -129,7 +129,7 @@ def test_switches_change_what_is_shown_and_the_view_goes_along_with_the_picked_v
 def test_names_state_the_errors_of_another_observer_at_the_same_time(viewer: Viewer) -> None:
     wish(viewer, ("play", None), ("seek", 3.0))
     before = [label.text for label in viewer._picture._labels._cars]
-    wish(viewer, ("observer", "dead_reckoning"))
+    wish(viewer, ("observer", "riccati"))
     texts = [label.text for label in viewer._picture._labels._cars]
     assert texts == [f"f{i + 1}  {error:.2f} m" for i, error in enumerate(viewer._frame.position_error)] != before
 

@@ -185,7 +185,7 @@ def test_from_frames_to_an_estimate_through_processes(fleet: Path) -> None:
         with closing(env):
             env.reset(seed=3, options={"arm": True})
             infos: dict[str, Any] = {}
-            for _ in range(60):
+            for _ in range(30):
                 infos = env.step(dict.fromkeys(env.agents, np.array([0.2, 0.0])))[-1]
             assert frames
             for info in infos.values():

@@ -99,9 +99,7 @@ def by_window(
     [
         ("lane:8", {}, 2.0),
         ("random:12,seed=4", {}, 2.0),
-        ("tree:9", {}, 2.0),
         ("ring:5", {}, 1.6),
-        ("lane:10", {"noise.velocity": 0.02, "noise.odometry_scale": 0.1}, 1.6),
         ("roots:12", {"noise.velocity": 0.01, "noise.odometry_scale": 0.1}, 1.6),
         ("lane:12,seen=5", {"noise.odometry_scale": 0.05}, 1.6),
         ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}, 1.6),

@@ -44,10 +44,9 @@ def misled(record):
     return (result.position_error[-1] > [0.2, 0.2, 0.3, 0.6, 0.6]).any() or (result.anees(8.0) > 6.0).any()
 
 
-@pytest.mark.parametrize("fault", ["v2x_loss", "v2x_delay", "lying_neighbour", "landmarks_lost"])
-def test_faults_do_not_mislead(fault):
-    seeds = range(4 if fault == "landmarks_lost" else 2)
-    results = [run("robust", VARIANTS[fault].applied(small_errors(12.0, seed), seed)) for seed in seeds]
+def test_landmarks_that_are_lost_do_not_mislead():
+    """Other faults are those of tests/observers/robust/test_depth.py and test_lies.py."""
+    results = [run("robust", VARIANTS["landmarks_lost"].applied(small_errors(12.0, seed), seed)) for seed in range(4)]
     assert not any(result.failure for result in results)
     off, limit = np.array([result.position_error[-1] for result in results]), np.array([0.1, 0.1, 0.15, 0.3, 0.8])
     assert (off.mean(axis=0) < limit).all() and (off < 2.0 * limit).all(), off
