@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -72,23 +73,70 @@ def test_the_help_of_every_command_loads_nothing_heavy_and_is_whole() -> None:
     assert {name.removeprefix("coopenv.") for name in loaded if name.startswith("coopenv.")} <= LIGHT
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["list"],
-        ["list", "observers"],
-        ["list", "agents"],
-        ["list", "scenes"],
-        ["list", "variants"],
-        ["describe", "facade"],
-        ["describe", "busy_intersection", "--json"],
-        ["describe", "large_crossing", "--all"],
-    ],
-)
-def test_looking_around_loads_no_simulation(command: list[str]) -> None:
-    as_command = "import sys; sys.orig_argv[1:3] = ['-m', 'coopenv']"  # so that nothing is registered with Gymnasium
-    loaded = modules_after(f"{as_command}\nfrom coopenv.cli import main; assert main({command}) == 0")
-    assert not (HEAVY | {"gymnasium", "pettingzoo"}) & {name.partition(".")[0] for name in loaded}
+FORKED = """
+import json, os, sys
+sys.orig_argv[1:3] = ["-m", "coopenv"]  # so that nothing is registered with Gymnasium
+from coopenv.cli import main
+for command in json.loads(sys.argv[1]):
+    if os.fork() == 0:
+        with open(os.devnull, "w") as sys.stdout, open(os.devnull, "w") as sys.stderr:
+            status = main(command.split())
+        loaded = {name.partition(".")[0] for name in sys.modules}
+        print(json.dumps([command, status, sorted(loaded)]), file=sys.__stdout__, flush=True)
+        os._exit(0)
+    os.wait()
+"""
+LOOKING = ["list", "list observers", "list agents", "list scenes", "list variants", "describe facade"]
+LOOKING += ["describe busy_intersection --json", "describe large_crossing --all"]
+WRONG = {
+    "run nosuch": {"numpy"},
+    "run tre:5": {"numpy"},
+    "run lane:x": set(),
+    "run facade --policy nosuch": set(),
+    "run facade --set noise.enabledd=false": set(),
+    "record facade --out x.mcap --observer nosuch": {"numpy"},
+    "view nosuch": {"numpy"},
+    "film nosuch --out x.mp4": {"numpy"},
+    "train nosuch": {"numpy"},
+    "watch nosuch": set(),
+    "evaluate facade --agents peek,nosuch": set(),
+    "bench observers facade --observers riccati,nosuch": {"numpy"},
+    "bench observers facade --observers nosuch.py:Mine": set(),
+    "bench observers nosuch.bag": {"numpy"},
+    "bench v1 examples/own_observer.py:Eky": set(),
+    "bench learning nosuch.toml": {"numpy"},
+    "evaluate facade --agents nosuch.py:Mine": set(),
+    "train facade --set nosuch=3": set(),
+    "train facade --agent nosuch": set(),
+    "run nosuch.mcap": {"numpy"},
+    "bundle nosuch": {"numpy"},
+    "export nosuch": {"numpy"},
+    "calibrate nosuch": {"numpy"},
+    "svea run nosuch.toml": {"numpy"},
+}
+"""Command with a name that there is not, and what it does not load besides."""
+
+
+@pytest.fixture(scope="module")
+def ended() -> dict[str, tuple[int, list[str]]]:
+    """Return the status of commands, each in a fork of one interpreter, and the packages that it has loaded."""
+    orders = json.dumps([*LOOKING, *WRONG])
+    result = subprocess.run([sys.executable, "-c", FORKED, orders], stdout=subprocess.PIPE, text=True, check=True)
+    return {command: (status, loaded) for command, status, loaded in map(json.loads, result.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("command", LOOKING)
+def test_looking_around_loads_no_simulation(command: str, ended: dict[str, tuple[int, list[str]]]) -> None:
+    status, loaded = ended[command]
+    assert status == 0 and not (HEAVY | {"gymnasium", "pettingzoo"}) & {*loaded}
+
+
+@pytest.mark.parametrize("command", WRONG)
+def test_a_wrong_name_is_refused_before_anything_is_loaded(
+    command: str, ended: dict[str, tuple[int, list[str]]]
+) -> None:
+    status, loaded = ended[command]
+    assert status == 2 and not (HEAVY | {"gymnasium", "pettingzoo"} | WRONG[command]) & {*loaded}
 
 
 def test_a_city_is_checked_in_few_calls() -> None:
@@ -106,41 +154,6 @@ def test_a_city_is_checked_in_few_calls() -> None:
     finally:
         sys.setprofile(None)
     assert calls < 130_000
-
-
-@pytest.mark.parametrize(
-    ("command", "modules"),
-    [
-        (["run", "nosuch"], {"numpy"}),
-        (["run", "tre:5"], {"numpy"}),
-        (["run", "lane:x"], set()),
-        (["run", "facade", "--policy", "nosuch"], set()),
-        (["run", "facade", "--set", "noise.enabledd=false"], set()),
-        (["record", "facade", "--out", "x.mcap", "--observer", "nosuch"], {"numpy"}),
-        (["view", "nosuch"], {"numpy"}),
-        (["film", "nosuch", "--out", "x.mp4"], {"numpy"}),
-        (["train", "nosuch"], {"numpy"}),
-        (["watch", "nosuch"], set()),
-        (["evaluate", "facade", "--agents", "peek,nosuch"], set()),
-        (["bench", "observers", "facade", "--observers", "riccati,nosuch"], {"numpy"}),
-        (["bench", "observers", "facade", "--observers", "nosuch.py:Mine"], set()),
-        (["bench", "observers", "nosuch.bag"], {"numpy"}),
-        (["bench", "v1", "examples/own_observer.py:Eky"], set()),
-        (["bench", "learning", "nosuch.toml"], {"numpy"}),
-        (["evaluate", "facade", "--agents", "nosuch.py:Mine"], set()),
-        (["train", "facade", "--set", "nosuch=3"], set()),
-        (["train", "facade", "--agent", "nosuch"], set()),
-        (["run", "nosuch.mcap"], {"numpy"}),
-        (["bundle", "nosuch"], {"numpy"}),
-        (["export", "nosuch"], {"numpy"}),
-        (["calibrate", "nosuch"], {"numpy"}),
-        (["svea", "run", "nosuch.toml"], {"numpy"}),
-    ],
-)
-def test_a_wrong_name_is_refused_before_anything_is_loaded(command: list[str], modules: set[str]) -> None:
-    as_command = "import sys; sys.orig_argv[1:3] = ['-m', 'coopenv']"  # so that nothing is registered with Gymnasium
-    loaded = modules_after(f"{as_command}\nfrom coopenv.cli import main; assert main({command}) == 2")
-    assert not (HEAVY | {"gymnasium", "pettingzoo"} | modules) & {name.partition(".")[0] for name in loaded}
 
 
 def test_make_finds_environments_after_the_import_alone() -> None:
