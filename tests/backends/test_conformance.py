@@ -121,22 +121,19 @@ def make(request: pytest.FixtureRequest, folder: Path) -> Make:
     return partial(imported, path, topics)
 
 
-@pytest.mark.parametrize("observation", ["flat", "dict"])
-def test_spaces_are_those_of_the_simulator(make: Make, observation: Any) -> None:
-    expected, env = simulated(observation=observation), make(observation=observation)
-    try:
-        assert env.possible_agents == expected.possible_agents
-        for agent in env.possible_agents:
-            assert env.observation_space(agent) == expected.observation_space(agent)
-            assert env.action_space(agent) == expected.action_space(agent)
-        assert env.state_space == expected.state_space
-        assert env.observation_layout == expected.observation_layout
-    finally:
-        env.close()
+def assert_spaces_of_the_simulator(env: Env, observation: Any) -> None:
+    expected = simulated(observation=observation)
+    assert env.possible_agents == expected.possible_agents
+    for agent in env.possible_agents:
+        assert env.observation_space(agent) == expected.observation_space(agent)
+        assert env.action_space(agent) == expected.action_space(agent)
+    assert env.state_space == expected.state_space
+    assert env.observation_layout == expected.observation_layout
 
 
 def test_it_passes_the_official_test(make: Make) -> None:
     env = make()
+    assert_spaces_of_the_simulator(env, "flat")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         parallel_api_test(env, num_cycles=10)
@@ -160,6 +157,7 @@ def masks_and_ages(env: Env, agent: str, seen: dict[str, np.ndarray], info: dict
 def test_masks_and_ages_mean_the_same(make: Make) -> None:
     env = make(observation="dict")
     try:
+        assert_spaces_of_the_simulator(env, "dict")
         env.reset(seed=5)
         ever_seen, ever_heard, steps = False, False, 0
         known, errors = env.engine.backend.capabilities.truth, dict[str, float]()

@@ -199,11 +199,10 @@ def described(name: str, width: int, **overrides: Any) -> str:
     return printed(*describe_scenario(coopenv.load_scenario(name, overrides)), width=width)
 
 
-@pytest.mark.parametrize("width", [80, 100])
 @pytest.mark.parametrize("name", coopenv.list_envs())
-def test_everything_fits_and_nothing_is_cut_off(name: str, width: int) -> None:
-    text = described(name, width)
-    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+def test_everything_fits_and_nothing_is_cut_off(name: str) -> None:
+    text = described(name, 80)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80
     assert "…" not in text
     tokens = set(text.split())
     scenario = coopenv.load_scenario(name)

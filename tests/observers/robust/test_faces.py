@@ -89,7 +89,7 @@ def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> N
     if scenario.backend == "highway":
         pytest.importorskip("highway_env", reason="needs the extra highway")
     vehicles = len(scenario.vehicles)
-    engine = Engine(scenario, {"highway": 24, "sumo": 6}.get(scenario.backend, 256 // min(vehicles, 4)), "float64")
+    engine = Engine(scenario, {"highway": 24, "sumo": 6}.get(scenario.backend, 128 // min(vehicles, 4)), "float64")
     engine.reset(range(engine.world.worlds))
     R_hat, p_hat = estimates(engine.world)
     assert all(v.initial_estimate.position is None and v.initial_estimate.yaw is None for v in scenario.vehicles)
@@ -102,7 +102,7 @@ def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> N
             assert (abs(mean - 3.0) < 4.5 * np.sqrt(variance / count)).all(), mean
     degrees = 6 * engine.world.worlds
     low, high = chi2.ppf([1e-6, 1.0 - 1e-6], degrees) / degrees  # of few worlds
-    for _ in range(20):
+    for _ in range(12):
         engine.step(np.zeros(engine.view("actions").shape), ticks=1)
         anees = np.nanmean(nees_of(engine.world)[0], axis=0)
         assert (anees > min(0.5, low)).all() and (anees < max(2.0, high)).all(), anees
