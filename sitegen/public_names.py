@@ -70,7 +70,7 @@ def _commands(name: str, command: Any) -> Iterator[str]:
 def report() -> str:
     """Return the text of the file: one name a line, each once."""
     commands = _commands("$ coopenv", typer.main.get_command(app))
-    lines = [*_python(), *commands, *map(environment_id, list_envs())]
+    lines = [*_python(), *commands, *map(environment_id, [*list_envs(), "scenario"])]
     return "\n".join(dict.fromkeys(" ".join(line.split()) for line in lines)) + "\n"
 
 

@@ -1,6 +1,7 @@
-"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`, and by its own name.
+"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0` and `coopenv/<name>`.
 
-Entry points are strings, and what they need is imported when an environment is made: `import coopenv` costs little.
+`coopenv/Scenario-v0` takes any scenario, such as `name_or_path="ring:5"`. Entry points are strings, and what they need
+is imported when an environment is made: `import coopenv` costs little.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
 
 
-def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> CooperativeLocalisationEnv:
+def make_parallel(name_or_path: Any, max_cycles: int | None = None, **options: Any) -> CooperativeLocalisationEnv:
     """Entry point of PettingZoo's parallel registry.
 
     Args:
-        name: environment.
+        name_or_path: environment.
         max_cycles: decision steps per episode instead of the scenario's horizon.
         options: those of `coopenv.parallel_env`.
     """
@@ -31,29 +32,29 @@ def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> C
     from coopenv.scenario import load_scenario
 
     if max_cycles is not None:
-        rate = load_scenario(name, options.get("overrides")).rates.decision
+        rate = load_scenario(name_or_path, options.get("overrides")).rates.decision
         options["overrides"] = {**(options.get("overrides") or {}), "horizon": max_cycles / rate}
-    return parallel_env(name, **options)
+    return parallel_env(name_or_path, **options)
 
 
-def make_aec(name: str, **options: Any) -> AECEnv[str, Any, Any]:
+def make_aec(name_or_path: Any, **options: Any) -> AECEnv[str, Any, Any]:
     """Entry point of PettingZoo's AEC registry; arguments as for `make_parallel`."""
     from pettingzoo.utils import parallel_to_aec
 
-    return parallel_to_aec(make_parallel(name, **options))
+    return parallel_to_aec(make_parallel(name_or_path, **options))
 
 
 def register_all() -> None:
     """Register what is not registered yet."""
-    for name in list_envs():
-        for identity in (environment_id(name), f"coopenv/{name}", name):
-            if identity not in gymnasium.registry:
-                gymnasium.register(
-                    identity,
-                    entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
-                    vector_entry_point="coopenv.api.make:make_rows",
-                    kwargs={"name_or_path": name},
-                )
-            for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):
-                if identity not in registry:
-                    pettingzoo.register(kind, identity, entry_point=f"{__name__}:make_{kind}", kwargs={"name": name})
+    given = {identity: {"name_or_path": n} for n in list_envs() for identity in (environment_id(n), f"coopenv/{n}")}
+    for identity, kwargs in {**given, environment_id("scenario"): {}}.items():
+        if identity not in gymnasium.registry:
+            gymnasium.register(
+                identity,
+                entry_point="coopenv.policies.single_vehicle:SingleVehicleEnv",
+                vector_entry_point="coopenv.api.make:make_rows",
+                kwargs=kwargs,
+            )
+        for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):
+            if identity not in registry:
+                pettingzoo.register(kind, identity, entry_point=f"{__name__}:make_{kind}", kwargs=kwargs)

@@ -1,6 +1,7 @@
 """Errors, files, numbers and seeds that all other packages use, and names that are loaded at their first use."""
 
 import ast
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -31,11 +32,13 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         return value
 
     def below(name: str) -> str:
-        """Return in which package below this one a public name is."""
+        """Return in which package below this one a public name is, or that it is a command."""
         for file in Path(str(module.__file__)).parent.glob("*/__init__.py"):
-            lists = [n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.Assign)]
-            if any(ast.unparse(n.targets[0]) == "__all__" and name in ast.literal_eval(n.value) for n in lists):
+            text = file.read_text(encoding="utf-8")
+            if re.search(rf'^__all__ = \[[^\]]*"{name}"', text, re.MULTILINE):
                 return f" (from {package}.{file.parent.name} import {name})"
+            if re.search(rf"^(from {package}\.cli\.\w+ import .*\b|def ){name}\b", text, re.MULTILINE):
+                return f" (in the shell: {package} {name})"
         return ""
 
     def public_names() -> list[str]:

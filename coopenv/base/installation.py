@@ -8,7 +8,7 @@ import platform
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
@@ -83,33 +83,34 @@ def scenario_path(name_or_path: str | Path) -> Path:
     Raises:
         UnknownEnvironmentError: there is no such environment or file.
     """
-    text = str(name_or_path)
-    if text in list_envs():
+    text, names = str(name_or_path), list_envs()
+    if text in names:
         return data_directory("envs") / f"{text}.toml"
-    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text or os.path.isdir(text):  # noqa: PTH112 (never raises)
-        try:
-            path = Path(text).expanduser()
-            there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
-        except (OSError, RuntimeError, ValueError) as error:  # too long, an unknown user's home, a null character
-            reason = getattr(error, "strerror", None) or error
-            raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
-        if is_bag:
-            raise UnknownEnvironmentError(
-                f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
-            )
-        if not there:
-            for name in list_envs():
-                if text == environment_id(name):
-                    raise UnknownEnvironmentError(f"{text}: an id, for gymnasium.make; the environment is '{name}'")
-            found = f"no such scenario file: {shortened(str(path), 200)}{suggest(path.stem, list_envs())}"
-            if os.path.isdir(path):  # noqa: PTH112
-                found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}; coopenv view opens that of a run"
-            raise UnknownEnvironmentError(found)
+    for name in names:
+        if text in (environment_id(name), f"coopenv/{name}"):
+            raise UnknownEnvironmentError(f"{text}: an id, for gymnasium.make; the environment is '{name}'")
+    if not (re.search(r"[/\\]|\.\w+$", text) or os.path.exists(text)):  # noqa: PTH110 (never raises)
+        known = f"{suggest(text, names)}; known: {', '.join([*names, *(f'{kind}:N' for kind in SCENES)])}"
+        raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
+    try:
+        path = Path(text).expanduser()
+        there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # too long, an unknown user's home, a null character
+        found = f"no such scenario file: {shown(text)} ({getattr(error, 'strerror', None) or error})"
+        raise UnknownEnvironmentError(found) from None
+    short = shortened(str(path), 200)
+    if is_bag:
+        found = f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
+    elif path.is_dir():
+        found = f"{short}: a folder; {EXPECTED}; coopenv view opens that of a run"
+    elif not there:
+        near = suggest(path.stem, names) or ("" if path.suffix == ".toml" else f"; {EXPECTED}")
+        found = f"no such scenario file: {short}{near}"
+    elif text.endswith(".toml") or "/" in text or "\\" in text:
         return path
-    if os.path.isfile(text):  # noqa: PTH113 (never raises)
-        raise UnknownEnvironmentError(f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}")
-    known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
-    raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
+    else:
+        found = f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}"
+    raise UnknownEnvironmentError(found)
 
 
 def list_agents() -> list[str]:
@@ -137,26 +138,22 @@ def versions(*distributions: str) -> dict[str, str]:
     """Return the versions of Python and of those of the distributions that are installed."""
     found = {"python": platform.python_version()}
     for name in distributions:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Let processes that are started meanwhile see these environment variables."""
-    before = {name: os.environ.get(name) for name in variables}
+    before = {name: os.environ[name] for name in variables if name in os.environ}
     os.environ.update(variables)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in variables:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 @contextmanager
@@ -172,9 +169,11 @@ def names_of(given: object) -> list[Any]:
     """Return names, classes or functions as a list: also one alone, or a text with commas between."""
     if isinstance(given, str):
         return [word.strip() for word in given.split(",") if word.strip()]
-    if not (callable(given) or isinstance(given, Iterable)):
-        raise CoopenvError(f"expected a name, a class or a list of them, got {shown(given)}")
-    return [given] if callable(given) else list(given)
+    if callable(given) or hasattr(given, "predict"):
+        return [given]
+    if isinstance(given, Iterable):
+        return list(given)
+    raise CoopenvError(f"expected a name, a class or a list of them, got {shown(given)}")
 
 
 def is_reference(text: str) -> bool:

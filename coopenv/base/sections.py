@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import tomllib
 from contextlib import suppress
 from difflib import get_close_matches
@@ -28,11 +29,18 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: Any = None) -> None:
         """Refuse a change; overrides of `load_scenario` return a changed copy."""
         raise CoopenvError(f"{type(self).__name__}.{name}: is frozen; {CHANGE}")
 
-    __setitem__ = __setattr__
+    __setitem__ = __delitem__ = __delattr__ = __setattr__
+
+    def __contains__(self, key: str) -> bool:
+        """Return whether there is a dotted key."""
+        with suppress(AttributeError, CoopenvError):
+            self[key]
+            return True
+        return False
 
     def __getitem__(self, key: str) -> Any:
         """Return the value of a dotted key, as overrides name it; an entry of a list by index or name."""
@@ -46,7 +54,7 @@ class Section(BaseModel):
                 return super().__getattr__(name)
             except AttributeError:
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
-                known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; as data: model_dump()" if keys else ""
+                known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; {CHANGE}, model_dump() data" if keys else ""
                 raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
 
     @classmethod
@@ -75,9 +83,10 @@ class Section(BaseModel):
 
 
 def _entry(node: Any, key: str) -> Any:
-    if not isinstance(node, tuple):
+    if not isinstance(node, tuple | dict):
         return getattr(node, key)
-    named = {name: entry for i, entry in enumerate(node) for name in (str(i), getattr(entry, "name", str(i)))}
+    listing = node if isinstance(node, dict) else dict(enumerate(node))
+    named = {name: entry for i, entry in listing.items() for name in (str(i), getattr(entry, "name", str(i)))}
     check_one_of("unknown entry", key, named)
     return named[key]
 
@@ -144,17 +153,12 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     # A misspelt key often also leaves a required one missing: the misspelling is what helps.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     # Pydantic puts its own tags of unions into the location; keys of the file are identifiers or stand last.
-    last = len(first["loc"]) - 1
-    unknown = first["type"] == "extra_forbidden"
-    keys = [
-        part
-        for i, part in enumerate(first["loc"])
-        if isinstance(part, int) or part.isidentifier() or (unknown and i == last)
-    ]
+    loc, unknown = first["loc"], first["type"] == "extra_forbidden"
+    keys = [k for i, k in enumerate(loc, 1) if isinstance(k, int) or k.isidentifier() or (unknown and i == len(loc))]
     field = ".".join(shortened(str(part)) for part in keys)
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if unknown:
-        valid = _valid_keys(first["loc"][:-1], model)
+        valid = _valid_keys(loc[:-1], model)
         several = sum(detail["type"] == "extra_forbidden" for detail in details) > 2  # it is another kind of file
         hint = (not several and suggest(str(keys[-1]), valid)) or f"; allowed: {', '.join(valid)}"
         return f"{where}: {field}: unknown key{hint}{more}"
@@ -166,7 +170,7 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     if first["type"] == "missing" and isinstance(keys[-1], int):
         return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
     if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
-        joint = "." if field and _starts_with_field(message) else ": "
+        joint = "." if re.match(r"[^\W\d][\w.]*:", message) else ": "
         return f"{where}: {field}{joint if field else ''}{message}{more}"
     if first["type"] == "json_invalid":
         return f"{where}: {TOO_DEEP if 'recursion' in message else message}"
@@ -184,11 +188,6 @@ def _kind_message(detail: Any) -> str:
     kinds = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     tag = shortened(str(context.get("tag", "")))
     return f"kind: unknown kind '{tag}'{suggest(tag, kinds)}; known: {', '.join(kinds)}"
-
-
-def _starts_with_field(message: str) -> bool:
-    head, colon, _ = message.partition(":")
-    return bool(colon) and head.replace(".", "").isidentifier()
 
 
 def _valid_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:

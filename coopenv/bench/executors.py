@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from time import monotonic
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, TypeVar
 
 import psutil
 
@@ -42,19 +42,6 @@ class Limits:
     """Of processor time."""
     mebibytes: float = 8192.0
     """Of memory, besides what its process had before."""
-
-
-class Divided(Protocol):
-    """A task in parts that may fail one by one."""
-
-    def parts(self) -> Iterator[Any]:
-        """Yield None when everything is ready, then the result of each part."""
-
-    def rest(self, done: int) -> Self:
-        """Return the task without its first parts."""
-
-    def ending(self, other: Self, part: int, reason: str, everywhere: bool) -> Self:
-        """Return the task; what ended in a part of another fails unstarted, everywhere or in tasks that are alike."""
 
 
 @contextmanager

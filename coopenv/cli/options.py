@@ -93,6 +93,13 @@ def known_source(name: str) -> str | None:
     return name if name.endswith(".npz") else known_environment(name)
 
 
+def known_environments(names: list[str] | None) -> list[str] | None:
+    """Return names of which each is known, see `known_environment`."""
+    for name in names or ():
+        known_environment(name)
+    return names
+
+
 def known_policy(name: str | None) -> str | None:
     """Return the name of a policy, a folder or a place in code. Raises CoopenvError: there is no such policy."""
     if name is not None and name not in PLAIN:
@@ -102,30 +109,29 @@ def known_policy(name: str | None) -> str | None:
     return name
 
 
-def _check_agent(name: str) -> None:
-    from coopenv.policies.loader import check_agent
-
-    check_agent(name)
-
-
-def _check_observer(name: str) -> None:
-    from coopenv.observers.registry import check_known
-
-    check_known(name)
+def known_policies(names: str | None) -> str | None:
+    """Return policies with commas between. Raises CoopenvError: there is no such policy."""
+    for name in words(names):
+        known_policy(name)
+    return names
 
 
-def each(check: Callable[[str], object]) -> Callable[[Any], Any]:
-    """Return what passes on several names, a list or a text with commas between, each of which a check accepts."""
+def known_agents(names: str | None) -> str | None:
+    """Return agents with commas between. Raises CoopenvError: there is no such agent."""
+    for name in words(names):
+        from coopenv.policies.loader import check_agent
 
-    def checked(names: Any) -> Any:
-        for name in names if isinstance(names, list) else words(names):
-            check(name)
-        return names
-
-    return checked
+        check_agent(name)
+    return names
 
 
-known_environments, known_agents = each(known_environment), each(_check_agent)
+def known_observers(names: str | None) -> str | None:
+    """Return observers with commas between. Raises CoopenvError: there is no such observer."""
+    for name in names.split(",") if names is not None else ():
+        from coopenv.observers.registry import check_known
+
+        check_known(name.strip())
+    return names
 
 
 def words(text: str | None) -> list[str]:
@@ -135,10 +141,10 @@ def words(text: str | None) -> list[str]:
 
 ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
 POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
-POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": each(known_policy)}
+POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": known_policies}
 AGENT: dict[str, Any] = {"autocompletion": agents, "callback": known_agents}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
-OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": each(_check_observer)}
+OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
 """Completion and check of an argument or option."""
 
 
@@ -308,12 +314,6 @@ def print_help(context: typer.Context) -> None:
     """Print the help of a group of which no command is named."""
     if context.invoked_subcommand is None:
         print(context.get_help())
-
-
-def group(words: str) -> typer.Typer:
-    """Return a group of commands, which is described in some words."""
-    look: dict[str, Any] = {"cls": Grouped, "rich_markup_mode": None}
-    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, **look)
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:

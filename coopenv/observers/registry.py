@@ -132,6 +132,8 @@ def named(observer: str | Factory) -> str:
     If another observer has that name, the name of the file or module precedes it: `mine.Riccati`. A CoopenvError means
     that the import path has no observer, that it has no name, or that both names are taken.
     """
+    if isinstance(observer, list | tuple) or (isinstance(observer, str) and "," in observer):
+        raise CoopenvError(f"observer {shown(observer)}: one at a time; several: coopenv.compare")
     if isinstance(observer, str) and not is_reference(observer):
         return observer
     place, found = (absolute_reference(observer), _loaded(observer)) if isinstance(observer, str) else ("", observer)

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coopenv.base import installation
-from coopenv.base.errors import CoopenvError, error_text, suggest
+from coopenv.base.errors import CoopenvError, error_text, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
@@ -163,14 +163,16 @@ def _training_anew(folder: Path, training: Any) -> str:
 def find_agent(name_or_place: str | Path | Callable[..., Any]) -> Agent:
     """Return the driver behind a name of `agents/`, a folder, `file.py:Name` or `package.module:Name`, or such code.
 
-    An agent is code that runs: name only those that you trust.
+    Code may be a model with a method `predict`, as of Stable-Baselines3. It runs: name only what you trust.
 
     Raises:
         CoopenvError: there is none, or its `agent.toml` is not valid.
     """
-    if callable(name_or_place):
+    predict = None if isinstance(name_or_place, type) else getattr(name_or_place, "predict", None)
+    if callable(name_or_place) or predict is not None:
         name = getattr(name_or_place, "__name__", type(name_or_place).__name__)
-        return Agent(name=name, entry=name, code=name_or_place)
+        chosen = predict and (lambda rows: predict(rows, deterministic=True)[0])
+        return Agent(name=name, entry=name, code=chosen or name_or_place)
     name, names = str(name_or_place), list_agents()
     if name not in names and installation.is_reference(name):
         return Agent(name=name.rpartition(":")[2], entry=installation.absolute_reference(name))
@@ -204,7 +206,8 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
         raise CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
     if name.endswith(".py"):
         raise CoopenvError(f"{name}: name a class or function in it: {name}:Class")
-    raise CoopenvError(f"unknown {what} '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+    known = f"{', '.join(names)}; or a folder with agent.toml, or FILE.py:CLASS"
+    raise CoopenvError(f"unknown {what} {shown(name)}{suggest(name, names)}; known: {known}")
 
 
 def agents_for(environment: str) -> list[str]:

@@ -63,7 +63,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self.vehicle = (acting or names)[-1] if vehicle is None else vehicle
         check_one_of("unknown vehicle", self.vehicle, names)
         self._others = driver_of(others, scenario)
-        self.render_mode = self.world.render_mode
+        self.render_mode, self.scenario = self.world.render_mode, scenario
         self.metadata = dict(self.world.metadata)
         self.observation_space = self.world.observation_space(self.vehicle)
         self.action_space = self.world.action_space(self.vehicle)
@@ -76,8 +76,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None and spec.max_episode_steps is None:
-            scenario = self.world.scenario
-            spec = replace(spec, max_episode_steps=round(scenario.horizon * scenario.rates.decision))
+            spec = replace(spec, max_episode_steps=round(self.scenario.horizon * self.scenario.rates.decision))
         self._spec = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -90,7 +89,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
             observations, infos = self.world.reset()  # an episode without it
         else:
             raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
-        restart(self._others, np.ones(len(self.world.scenario.vehicles), dtype=bool))
+        restart(self._others, np.ones(len(self.scenario.vehicles), dtype=bool))
         return observations[self.vehicle], dict(infos[self.vehicle])
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -99,8 +98,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             ActionError: the action has the wrong shape or is not finite.
         """
-        observed, width = self.world.engine.view("observation")[0], self.world.scenario.action_size
-        chosen = dict(zip(self.world.scenario.vehicle_names, decide(self._others, observed, width), strict=True))
+        observed, width = self.world.engine.view("observation")[0], self.scenario.action_size
+        chosen = dict(zip(self.scenario.vehicle_names, decide(self._others, observed, width), strict=True))
         actions = {agent: chosen[agent] for agent in self.world.agents}
         if self.vehicle in actions:
             actions[self.vehicle] = action

@@ -14,11 +14,12 @@ from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
 from coopenv.base.sections import TOO_DEEP, read_toml, validated
 from coopenv.scenario.bodies import with_groups
-from coopenv.scenario.cosimulators import with_sumo
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import MOST_VEHICLES, scene_text
 from coopenv.scenario.schema import Scenario
-from coopenv.scenario.sites import STREETS_KEY, Streets, with_streets
+from coopenv.scenario.streets import KEY as STREETS_KEY
+from coopenv.scenario.streets import Streets, with_streets
+from coopenv.scenario.sumo import with_sumo
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries hold for every vehicle without its own."""
@@ -28,8 +29,7 @@ COUNT_KEY = "count"
 COUNT_OVERRIDE = re.compile(r"vehicles\.(\d+|\*)\.count")
 """Overrides of it, which number the entries of the file, other ones the vehicles that they stand for."""
 
-OVERRIDES = "overrides"
-"""Where a field stands that an override has made wrong."""
+OVERRIDES = "overrides"  # where a field stands that an override has made wrong
 
 
 ScenarioLike = str | Path | Mapping[str, Any] | Scenario
@@ -62,17 +62,15 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
     if not isinstance(name_or_path, str | Path | Mapping):
         kind = type(name_or_path).__name__
         raise ScenarioError(f"environment: expected a name, a path, a dict of its keys or a Scenario, got {kind}")
-    made = is_scene(str(name_or_path))
-    if isinstance(name_or_path, Mapping):
-        path = Path("scenario")
-    else:
-        path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
+    made, path = is_scene(str(name_or_path)), Path("scenario")
     try:
         if isinstance(name_or_path, Mapping):
             raw = located(deepcopy(dict(name_or_path)), Path.cwd())
         elif made:
+            path = Path(str(name_or_path))
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
+            path = scenario_path(name_or_path)
             raw = located(read_toml(path, ScenarioError, path.name), path.parent)
         given = overrides or {}
         counts = {key: value for key, value in given.items() if COUNT_OVERRIDE.fullmatch(str(key))}
@@ -86,12 +84,15 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
         raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
     except ScenarioError as error:
         of_file = f"{path.name}: "
-        if overrides and str(error).startswith(of_file) and _is_valid(name_or_path):
+        if overrides and str(error).startswith(of_file):
+            with warnings.catch_warnings(action="ignore"):
+                load_scenario(name_or_path)  # raises its own error if the overrides are not to blame
             raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
         raise
 
 
 Scenario.__or__ = load_scenario  # type: ignore[assignment,method-assign]
+Scenario.__replace__ = lambda self, **changes: load_scenario(self, changes)
 
 
 def scenario_name(name_or_path: ScenarioLike) -> str:
@@ -100,16 +101,6 @@ def scenario_name(name_or_path: ScenarioLike) -> str:
         return Path(name_or_path).stem
     title = name_or_path.title if isinstance(name_or_path, Scenario) else name_or_path.get("title", "scenario")
     return re.sub(r"[^A-Za-z0-9._-]+", "_", str(title)).strip("_") or "scenario"
-
-
-def _is_valid(name_or_path: ScenarioLike) -> bool:
-    """Return whether a file, a scene or a dict by itself describes a world."""
-    with warnings.catch_warnings(action="ignore"):
-        try:
-            load_scenario(name_or_path)
-        except ScenarioError:
-            return False
-    return True
 
 
 def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:

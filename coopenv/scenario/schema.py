@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from coopenv.base.columns import facts_html, one_line
-from coopenv.base.errors import ScenarioWarning, check_one_of, listed, shown, suggest
-from coopenv.base.sections import Section
+from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
+from coopenv.base.notebook import facts_html, one_line
+from coopenv.base.sections import Section, validated
 from coopenv.scenario.base import Positive, Text, Vector3, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
@@ -29,6 +29,8 @@ FAR_FROM_ORIGIN = 50.0
 
 SAME_PLACE = 1e-6  # m
 
+READ = "coopenv.load_scenario reads one by name, from a file or from a dict"
+
 
 class Map(Section):
     """The frame in which vehicles know the landmarks."""
@@ -37,7 +39,19 @@ class Map(Section):
     """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
 
 
-class Scenario(Section):
+class _Loaded(type(Section)):  # type: ignore[misc]
+    """The class of `Scenario`: its errors are one line."""
+
+    def __call__(cls, *values: Any, **entries: Any) -> Any:
+        if values:
+            raise TypeError(f"{cls.__name__} takes entries by name; {READ}")
+        return validated(cls, entries, cls.__name__, ScenarioError)
+
+    def __getattr__(cls, name: str) -> Any:
+        raise AttributeError(f"class {cls.__name__} has no attribute '{name}'; {READ}")
+
+
+class Scenario(Section, metaclass=_Loaded):
     """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
 
     title: Text

@@ -127,13 +127,18 @@ def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
     scenario = coopenv.load_scenario(ENV)
     assert scenario["noise.enabled"] is scenario.noise.enabled and scenario["horizon"] == scenario.horizon
     assert pickle.loads(pickle.dumps(scenario)) == copy.deepcopy(scenario) == scenario
+    assert "noise.enabled" in scenario and "enabledd" not in scenario.noise and "vehicles.9" not in scenario
+    assert "reward.weights.progress" in scenario and "reward.weights.nosuch" not in scenario
     for attempt in (lambda: scenario["noise.enabledd"], lambda: scenario.noise.enabledd):
         with pytest.raises(
             AttributeError, match=r"^Noise has no attribute 'enabledd' \(did you mean 'enabled'\?\); keys: "
         ):
             attempt()
-    with pytest.raises(AttributeError, match=r"no attribute 'to_toml'; .*as data: model_dump\(\)$"):
+    with pytest.raises(AttributeError, match=r"'to_toml'; .* returns a changed scenario, model_dump\(\) data$"):
         scenario.to_toml()
+    with pytest.raises(AttributeError, match=r"^class Scenario has no attribute 'load'; coopenv\.load_scenario reads"):
+        Scenario.load("facade")
+    assert Scenario(**scenario.model_dump()) == scenario
 
 
 def test_arguments_in_the_wrong_place_are_named() -> None:
@@ -156,12 +161,20 @@ def test_a_scenario_is_changed_and_read_by_dotted_keys(scenario: Scenario) -> No
         scenario["landmarks.nosuch"]
 
 
-@pytest.mark.parametrize("identity", ["coopenv/Facade-v0", "coopenv/facade", "facade", "coopenv:facade"])
+@pytest.mark.parametrize("identity", ["coopenv/Facade-v0", "coopenv/facade", "coopenv:coopenv/facade"])
 def test_an_environment_is_made_by_its_own_name(identity: str) -> None:
     with gymnasium.make(identity) as env:
         assert env.reset(seed=1)[0].shape == env.observation_space.shape
     if ":" not in identity:
         assert pettingzoo.make("parallel", identity).scenario == coopenv.load_scenario(ENV)
+
+
+def test_registries_hold_names_of_coopenv_alone_and_make_any_scenario(scenario: Scenario) -> None:
+    assert not {*coopenv.list_envs()} & {*gymnasium.registry, *pettingzoo.parallel_registry}
+    made: Any = gymnasium.make("coopenv/Scenario-v0", name_or_path=scenario).unwrapped
+    assert made.scenario == scenario
+    assert gymnasium.make_vec("coopenv/Scenario-v0", num_envs=5, name_or_path="ring:5").num_envs == 5
+    assert len(pettingzoo.make("parallel", "coopenv/Scenario-v0", name_or_path="ring:5").possible_agents) == 5
 
 
 def test_names_are_listed_alike() -> None:
@@ -183,6 +196,17 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         r"^Scenario\.horizon: is frozen; scenario \| ",
     ),
     "a folder": (lambda: coopenv.load_scenario("."), r"a folder; expected .*; coopenv view opens that of a run$"),
+    "a deleted one": (lambda: coopenv.load_scenario(ENV).__delattr__("horizon"), r"^Scenario\.horizon: is frozen; "),
+    "a deleted key": (lambda: coopenv.load_scenario(ENV).__delitem__("horizon"), r"^Scenario\.horizon: is frozen; "),
+    "a constructor": (lambda: Scenario(title="Mine"), r"^Scenario: horizon: Field required"),  # type: ignore[call-arg]
+    "a replaced entry": (lambda: coopenv.load_scenario(ENV).__replace__(horizon=-3.0), "greater than 0"),
+    "a file of another kind": (lambda: coopenv.run("x.zip"), r"^no such scenario file: x\.zip; expected a scenario "),
+    "two observers": (lambda: coopenv.run(ENV, observer="mekf,robust"), r"one at a time; several: coopenv\.compare$"),
+    "a missing model": (
+        lambda: coopenv.evaluate(ENV, "a.zip"),
+        r"^unknown agent 'a\.zip'.*; or a folder with",
+    ),
+    "an id in place of a name": (lambda: coopenv.run("coopenv/facade"), "an id, for gymnasium.make; .* is 'facade'"),
     "a nested one": (
         lambda: setattr(coopenv.load_scenario(ENV).noise, "enabled", False),
         r"^Noise\.enabled: is frozen",
@@ -237,6 +261,7 @@ def test_an_unknown_argument_is_one_line(mistake: str) -> None:
 ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
     "make": (lambda: coopenv.make, r"^module 'coopenv' has no attribute 'make' \(did you mean 'parallel_env'\?\)$"),
     "below": (lambda: coopenv.rollout, r"no attribute 'rollout' \(from coopenv\.runs import rollout\)$"),
+    "a command": (lambda: coopenv.train, r"no attribute 'train' \(in the shell: coopenv train\)$"),
     "nothing near": (lambda: coopenv.cuda, r"'cuda'; known: EVALUATION_SEEDS, .*, run$"),
     "seed": (
         lambda: coopenv.parallel_env(ENV).seed(3),
@@ -290,10 +315,16 @@ def test_classes_and_functions_are_agents() -> None:
     def still(observations: np.ndarray) -> np.ndarray:
         return np.zeros((len(observations), 2))
 
-    found = coopenv.evaluate(ENV, [Straight, still], worlds=2, overrides={"horizon": 1.0})
-    assert [*found.episodes] == ["Straight", "still"]
-    first, second = found.episodes.values()
-    np.testing.assert_array_equal(first.position, second.position)
+    class Model:  # as of Stable-Baselines3
+        def predict(self, observations: np.ndarray, deterministic: bool = False) -> tuple[np.ndarray, None]:
+            assert deterministic
+            return still(observations), None
+
+    found = coopenv.evaluate(ENV, [Straight, still, Model()], worlds=2, overrides={"horizon": 1.0})
+    assert [*found.episodes] == ["Straight", "still", "Model"]
+    first, *others = found.episodes.values()
+    for other in others:
+        np.testing.assert_array_equal(first.position, other.position)
 
 
 def test_groups_print_their_help_and_options_are_no_commands(capsys: pytest.CaptureFixture[str]) -> None:
