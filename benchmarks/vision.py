@@ -17,7 +17,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError, check_one_of
-from coopenv.cars.fake.camera import WALL, FrameRenderer, PlacedTag
+from coopenv.cars.fake.sensors import WALL, FrameRenderer, PlacedTag
 from coopenv.cars.profile import FAMILIES
 from coopenv.cars.vision import Calibration, find_tags
 from coopenv.estimation.poses import Array

@@ -21,9 +21,9 @@ from coopenv.api.terms.results import MEMORY, results_struct, results_table, ste
 from coopenv.backends.base import Backend, SensingWorld
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
+from coopenv.base.columns import facts_html, one_line, picture_html
 from coopenv.base.errors import CoopenvError, Explained, check_memory, error_text, training_seed, world_keys
 from coopenv.base.installation import load_reference
-from coopenv.base.notebook import facts_html, one_line, picture_html
 from coopenv.estimation.poses import riccati_covariance
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import ObserverError, ObserverGroup

@@ -23,7 +23,7 @@ from coopenv.base.errors import CoopenvError, ScenarioError, check_one_of, short
 from coopenv.base.installation import install_command
 from coopenv.estimation.poses import Array
 from coopenv.scenario import Scenario
-from coopenv.scenario.sumo import route_edges
+from coopenv.scenario.cosimulators import route_edges
 
 OWNED = {
     "additional-files": "sumo.additional",

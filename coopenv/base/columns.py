@@ -1,19 +1,21 @@
-"""Results as columns with units: for pandas, polars and xarray, as CSV and as Parquet."""
+"""Results as columns with units for pandas, polars, xarray, CSV and Parquet; on one line, and as HTML for notebooks."""
 
 from __future__ import annotations
 
 import csv
 import math
 from abc import ABC, abstractmethod
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from io import StringIO
+from html import escape
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, Explained
+from coopenv.base.errors import CoopenvError, Explained, shown
 from coopenv.base.files import replace_text, replacing_file
 from coopenv.base.installation import install_command, needing
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from polars import DataFrame as PolarsFrame
     from xarray import Dataset
+
 
 INSTALL = install_command("tables")
 UNITS = {
@@ -150,3 +153,39 @@ def written(text: str, path: str | Path | None) -> str:
     if path is not None:
         replace_text(path, text)
     return text
+
+
+WIDTH = 110
+"""Characters on a line of a notebook."""
+
+
+def one_line(kind: object, title: str, facts: Mapping[str, object]) -> str:
+    """Return what `repr` prints of an object: `Kind('title', fact=value, ...)`."""
+    return f"{type(kind).__name__}({', '.join([repr(title), *(f'{key}={shown(facts[key])}' for key in facts)])})"
+
+
+def facts_html(title: str, facts: Mapping[str, object]) -> str:
+    """Return a heading, and a table with a line per fact."""
+    rows = "".join(f"<tr><th>{escape(key)}</th><td>{escape(str(fact))}</td></tr>" for key, fact in facts.items())
+    return f"<b>{escape(title)}</b><table>{rows}</table>"
+
+
+def terminal_html(printable: Any) -> str:
+    """Return what rich prints of an object, its alignment kept."""
+    from coopenv.base.terminal import Terminal
+
+    console = Terminal(file=StringIO(), record=True, width=WIDTH)
+    console.print(printable)
+    return console.export_html(inline_styles=True, code_format='<pre style="line-height: 1.2">{code}</pre>')
+
+
+def picture_html(picture: Any) -> str:
+    """Return a figure of Matplotlib, or pixels (H, W, 3) uint8, as a picture in the page itself."""
+    data = BytesIO()
+    if hasattr(picture, "savefig"):
+        picture.savefig(data, format="png", dpi=100)
+    else:
+        from PIL import Image
+
+        Image.fromarray(picture).save(data, "png")
+    return f'<img style="max-width: 100%" src="data:image/png;base64,{b64encode(data.getvalue()).decode()}">'

@@ -17,12 +17,11 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.base.columns import Columns, Tabular
+from coopenv.base.columns import Columns, Tabular, one_line, terminal_html
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
-from coopenv.base.notebook import one_line, terminal_html
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES

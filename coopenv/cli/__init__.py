@@ -19,9 +19,9 @@ from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
+from coopenv.cli.bags import calibrate, identify, import_
 from coopenv.cli.bench import bench, bench_observers
-from coopenv.cli.calibrate import calibrate, identify
-from coopenv.cli.run import bundle, export, figures, import_, record, run
+from coopenv.cli.run import bundle, export, figures, record, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import dataset, evaluate, train
 from coopenv.cli.view import film, play, view, watch

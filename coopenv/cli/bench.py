@@ -13,12 +13,7 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from coopenv.bench.observers.comparison import Plan
 
-bench = typer.Typer(
-    cls=options.Grouped,
-    help="Compare observers, study seeds.",
-    invoke_without_command=True,
-    callback=options.print_help,
-)
+bench = options.group("Compare observers, study seeds.")
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
 
 

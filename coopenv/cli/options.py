@@ -93,13 +93,6 @@ def known_source(name: str) -> str | None:
     return name if name.endswith(".npz") else known_environment(name)
 
 
-def known_environments(names: list[str] | None) -> list[str] | None:
-    """Return names of which each is known, see `known_environment`."""
-    for name in names or ():
-        known_environment(name)
-    return names
-
-
 def known_policy(name: str | None) -> str | None:
     """Return the name of a policy, a folder or a place in code. Raises CoopenvError: there is no such policy."""
     if name is not None and name not in PLAIN:
@@ -109,29 +102,30 @@ def known_policy(name: str | None) -> str | None:
     return name
 
 
-def known_policies(names: str | None) -> str | None:
-    """Return policies with commas between. Raises CoopenvError: there is no such policy."""
-    for name in words(names):
-        known_policy(name)
-    return names
+def _check_agent(name: str) -> None:
+    from coopenv.policies.loader import check_agent
+
+    check_agent(name)
 
 
-def known_agents(names: str | None) -> str | None:
-    """Return agents with commas between. Raises CoopenvError: there is no such agent."""
-    for name in words(names):
-        from coopenv.policies.loader import check_agent
+def _check_observer(name: str) -> None:
+    from coopenv.observers.registry import check_known
 
-        check_agent(name)
-    return names
+    check_known(name)
 
 
-def known_observers(names: str | None) -> str | None:
-    """Return observers with commas between. Raises CoopenvError: there is no such observer."""
-    for name in names.split(",") if names is not None else ():
-        from coopenv.observers.registry import check_known
+def each(check: Callable[[str], object]) -> Callable[[Any], Any]:
+    """Return what passes on several names, a list or a text with commas between, each of which a check accepts."""
 
-        check_known(name.strip())
-    return names
+    def checked(names: Any) -> Any:
+        for name in names if isinstance(names, list) else words(names):
+            check(name)
+        return names
+
+    return checked
+
+
+known_environments, known_agents = each(known_environment), each(_check_agent)
 
 
 def words(text: str | None) -> list[str]:
@@ -141,10 +135,10 @@ def words(text: str | None) -> list[str]:
 
 ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
 POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
-POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": known_policies}
+POLICIES: dict[str, Any] = {"autocompletion": policy_lists, "callback": each(known_policy)}
 AGENT: dict[str, Any] = {"autocompletion": agents, "callback": known_agents}
 AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
-OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
+OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": each(_check_observer)}
 """Completion and check of an argument or option."""
 
 
@@ -314,6 +308,12 @@ def print_help(context: typer.Context) -> None:
     """Print the help of a group of which no command is named."""
     if context.invoked_subcommand is None:
         print(context.get_help())
+
+
+def group(words: str) -> typer.Typer:
+    """Return a group of commands, which is described in some words."""
+    look: dict[str, Any] = {"cls": Grouped, "rich_markup_mode": None}
+    return typer.Typer(help=words, invoke_without_command=True, callback=print_help, **look)
 
 
 def command(function: Callable[[Options], None]) -> Callable[..., None]:

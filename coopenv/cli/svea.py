@@ -21,13 +21,7 @@ from coopenv.cli import options
 if TYPE_CHECKING:
     from coopenv.cars.transport.base import Transport
 
-svea = typer.Typer(
-    cls=options.Grouped,
-    help="SVEA cars, real ones and fakes.",
-    invoke_without_command=True,
-    callback=options.print_help,
-    rich_markup_mode=None,
-)
+svea = options.group("SVEA cars, real ones and fakes.")
 HARMED = 1
 """Exit status of an attack that got through."""
 STOPPED = 3

@@ -36,11 +36,10 @@ from typing import Annotated, Any, NamedTuple, Self, get_type_hints
 
 import numpy as np
 
-from coopenv.base.columns import Columns, Tabular
+from coopenv.base.columns import Columns, Tabular, facts_html, one_line
 from coopenv.base.errors import DataError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.base.format import read_npz
-from coopenv.base.notebook import facts_html, one_line
 from coopenv.estimation.poses import Array, position_covariance, roll_pitch_yaw_deg, skew
 
 DEFAULT_WINDOW = 1.0

@@ -13,12 +13,11 @@ from rich.console import Console, ConsoleOptions, RenderResult
 
 from coopenv.backends.base import Repeating
 from coopenv.backends.sources import open_backend
-from coopenv.base.columns import Columns, Tabular
+from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, picture_html, terminal_html
 from coopenv.base.errors import CoopenvError, DataError, checked_seed, explained, listed
 from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
-from coopenv.base.notebook import WIDTH, one_line, picture_html, terminal_html
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from coopenv.base.columns import facts_html, one_line
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
-from coopenv.base.notebook import facts_html, one_line
 from coopenv.base.sections import Section, validated
 from coopenv.scenario.base import Positive, Text, Vector3, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle

@@ -1,12 +1,20 @@
-"""Sites of parametric scenes: vehicles with what stands around them, and the two sites with vehicles at road speed.
+"""Sites: what stands around the vehicles of parametric scenes, and the grid of streets of scenario files.
 
-On roads vehicles keep their speed and measure what is in range and not occluded: landmarks, and the vehicles before
-them. Cars and vans have bodies that occlude.
+On the roads of scenes vehicles keep their speed and measure what is in range and not occluded: landmarks, and the
+vehicles before them. Cars and vans have bodies that occlude. In a scenario file the table `streets` stands for roads,
+buildings, signs, signals and routes.
 """
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from itertools import product
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import Field
+
+from coopenv.base.errors import ScenarioError
+from coopenv.base.sections import Section, validated
+from coopenv.scenario.base import NonNegative, Positive, PositiveVector2
 
 Point = tuple[float, float, float]
 
@@ -139,3 +147,141 @@ def _turned(quarters: int, x: float, y: float) -> tuple[float, float]:
 def site_of(built: Site | Iterator[PlacedVehicle]) -> Site:
     """Return the site of a scene, by default with the three landmarks of busy_intersection."""
     return built if isinstance(built, Site) else Site(tuple(built))
+
+
+STREETS_KEY = "streets"
+"""The table of the file."""
+HEADINGS = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
+TURNS = ("straight", "right")
+CORNER_RADIUS = 6.0
+"""m, of right turns."""
+FACADE = 0.1
+"""m from a building's wall to the signs on it."""
+STARTS = 2
+"""Streets in a row, in one of which a vehicle without `routes` of its own starts."""
+
+Count = Annotated[int, Field(ge=1, le=64)]
+
+
+class Streets(Section):
+    """Blocks with a building each, between streets with one lane per direction, about the file's origin.
+
+    Right-hand traffic; vehicles go straight on or turn right at the signal of every crossing, where the streets to the
+    east and west, and those to the north and south, are green in turns. Half a block beyond the outer crossings the
+    streets end.
+    """
+
+    blocks: tuple[Count, Count]
+    """Blocks along x and y."""
+    block: Annotated[float, Field(ge=40.0, le=1000.0)] = 80.0
+    """m, from one street's axis to the next."""
+    lane: Annotated[float, Field(ge=2.5, le=5.0)] = 3.5
+    """Width of a lane, m."""
+    pavement: Annotated[float, Field(ge=0.5, le=6.0)] = 3.0
+    """From a street to the buildings, m."""
+    height: Positive = 12.0
+    """Of the buildings, m."""
+    signs: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Landmarks per block, drawn along its facades."""
+    sign_height: PositiveVector2 = (2.0, 5.0)
+    """Lowest and highest z, m."""
+    period: Positive = 28.0
+    """Of the signals, s."""
+    clearance: NonNegative = 4.0
+    """From one green time to the next, s."""
+    lateral_spread: NonNegative = 0.2
+    """Of the routes, m."""
+
+
+def with_streets(raw: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the plain data of a file with what its table `streets` stands for.
+
+    Driven vehicles and traffic without `routes` get some: those with an `entry` come into the city from its edge, the
+    others start within. Raises ScenarioError: the table, or a list that it adds to, is not as it should be.
+    """
+    filled = dict(raw)
+    if STREETS_KEY not in filled:
+        return filled
+    streets = validated(Streets, filled.pop(STREETS_KEY), f"{where}: {STREETS_KEY}", ScenarioError)
+    made = {"roads": _roads(streets), "obstacles": _buildings(streets), "landmark_groups": _signs(streets)}
+    for key, tables in {**made, "routes": _routes(streets), "vehicles": iter(())}.items():
+        if not isinstance(filled.get(key, []), list):
+            raise ScenarioError(f"{where}: {key}: must be a list of tables")
+        filled[key] = [*filled.get(key, []), *tables]
+    crossings = {f"{i + 1}_{j + 1}" for i, j in product(*map(range, [count + 1 for count in streets.blocks]))}
+    for enters in (False, True):
+        starts = [
+            name
+            for name, (dx, dy), i, j in _approaches(streets)
+            if (f"{i + 1 - dx}_{j + 1 - dy}" not in crossings) == enters
+        ]
+        chosen = [k for k, v in enumerate(filled["vehicles"]) if _has_no_route(v) and ("entry" in v) == enters]
+        for n, k in enumerate(chosen):
+            first = n * len(starts) // len(chosen)
+            own = [f"{starts[(first + m) % len(starts)]}_{turn}" for m, turn in product(range(STARTS), TURNS)]
+            filled["vehicles"][k] = {**filled["vehicles"][k], "routes": own}
+    return filled
+
+
+def _has_no_route(vehicle: Any) -> bool:
+    motion = vehicle.get("motion") if isinstance(vehicle, Mapping) else None
+    return isinstance(motion, Mapping) and motion.get("kind") in ("driven", "traffic") and "routes" not in vehicle
+
+
+def _approaches(streets: Streets) -> Iterator[tuple[str, tuple[int, int], int, int]]:
+    """Yield name, heading, column and row of every way to a crossing."""
+    columns, rows = (range(count + 1) for count in streets.blocks)
+    for i, j, (name, heading) in product(columns, rows, HEADINGS.items()):
+        yield f"{name}_{i + 1}_{j + 1}", heading, i, j
+
+
+def _axes(streets: Streets) -> tuple[list[float], list[float]]:
+    """Return x of the streets to the north and y of those to the east, m."""
+    along = [[streets.block * (k - count / 2) for k in range(count + 1)] for count in streets.blocks]
+    return along[0], along[1]
+
+
+def _roads(streets: Streets) -> Iterator[dict[str, Any]]:
+    (xs, ys), beyond, width = _axes(streets), streets.block / 2, 2 * streets.lane
+    for x in xs:
+        yield {"start": [x, ys[0] - beyond], "end": [x, ys[-1] + beyond], "width": width}
+    for y in ys:
+        yield {"start": [xs[0] - beyond, y], "end": [xs[-1] + beyond, y], "width": width}
+
+
+def _buildings(streets: Streets) -> Iterator[dict[str, Any]]:
+    (xs, ys), half = _axes(streets), streets.block / 2
+    size = streets.block - 2 * (streets.lane + streets.pavement)
+    for (i, x), (j, y) in product(enumerate(xs[:-1]), enumerate(ys[:-1])):
+        center = [x + half, y + half, streets.height / 2]
+        yield {"name": f"block_{i + 1}_{j + 1}", "center": center, "size": [size, size, streets.height]}
+
+
+def _signs(streets: Streets) -> Iterator[dict[str, Any]]:
+    """Yield a group of landmarks on the four facades of every building."""
+    for house in _buildings(streets):
+        (x, y, _), r = house["center"], house["size"][0] / 2 + FACADE
+        corners = [[x - r, y - r], [x + r, y - r], [x + r, y + r], [x - r, y + r]]
+        lines = [{"start": corners[k - 1], "end": corners[k]} for k in range(4)]
+        yield {"name": house["name"], "count": streets.signs, "lines": lines, "height": list(streets.sign_height)}
+
+
+def _routes(streets: Streets) -> Iterator[dict[str, Any]]:
+    """Yield the routes across every crossing, half a block long on both sides."""
+    (xs, ys), half, aside = _axes(streets), streets.block / 2, streets.lane / 2
+    stop, cycle = half - streets.lane - streets.pavement, streets.period / 2
+    for name, (dx, dy), i, j in _approaches(streets):
+        phase = cycle * ((i + j + (dx == 0)) % 2)
+        signal = {"at": stop, "period": streets.period, "start": phase, "green": cycle - streets.clearance}
+        for turn, (ex, ey) in zip(TURNS, ((dx, dy), (dy, -dx)), strict=True):  # headings behind the crossing
+            begin = [xs[i] - half * dx + aside * dy, ys[j] - half * dy - aside * dx]
+            corner = [xs[i] + aside * (dy + ey), ys[j] - aside * (dx + ex)]
+            end = [xs[i] + half * ex + aside * ey, ys[j] + half * ey - aside * ex]
+            yield {
+                "name": f"{name}_{turn}",
+                "waypoints": [begin, end] if turn == "straight" else [begin, corner, end],
+                "corner_radius": CORNER_RADIUS,
+                "lateral_spread": streets.lateral_spread,
+                "start_spread": stop / 2,
+                "signal": signal,
+            }

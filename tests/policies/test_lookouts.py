@@ -10,9 +10,16 @@ import pytest
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
-from coopenv.policies.giving_way import discs_along, nearest
 from coopenv.policies.look_ahead import LookAhead, Peek
-from coopenv.policies.prediction import FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
+from coopenv.policies.prediction import (
+    FieldOfView,
+    Occluder,
+    Occluders,
+    PlanarCovariance,
+    discs_along,
+    nearest,
+    unhidden,
+)
 from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.oracles.geometry import is_occluded

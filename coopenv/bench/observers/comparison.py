@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
-from coopenv.base.columns import Columns, Tabular, written
+from coopenv.base.columns import Columns, Tabular, one_line, picture_html, terminal_html, written
 from coopenv.base.errors import CoopenvError, check_one_of, checked_seed, explained
 from coopenv.base.installation import names_of
-from coopenv.base.notebook import one_line, picture_html, terminal_html
 from coopenv.base.terminal import Terminal, text_of
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables

@@ -1,16 +1,27 @@
-"""Sensors of fake cars: the truth with the scenario's noise and lasting errors, as messages of real cars."""
+"""Sensors of fake cars: the truth with the scenario's noise and lasting errors, as messages of real cars.
+
+Cameras cast rays: blocks of a Pixy and the authors' bearings, or frames with tags.
+"""
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import encode, header, make, ros2
-from coopenv.cars.fake.faults import FakeSettings
-from coopenv.cars.fake.world import CarWorld
-from coopenv.cars.profile import CarProfile, Role
+from coopenv.cars.fake.faults import AHEAD, CarFaults, FakeSettings
+from coopenv.cars.fake.world import CarWorld, Neighbours
+from coopenv.cars.profile import IMAGES, CarProfile, Role
+from coopenv.cars.see import object_bearings
 from coopenv.cars.transport.base import Transport
+from coopenv.cars.vision import Calibration, dictionary_of, opencv, rays
+from coopenv.estimation.poses import Array
 from coopenv.scenario.sensing import Noise
 from coopenv.world.random import ODOMETRY_NOISE
 
@@ -140,3 +151,262 @@ def deviation(stated: float, noise: Noise, rate: float) -> float:
     if not noise.enabled:
         return 0.0
     return stated if isinstance(noise.odometry_rate, str) else stated * math.sqrt(rate / noise.odometry_rate)
+
+
+CAMERA_INFO_RATE = 1.0  # Hz
+OLDEST = 255  # frames that the camera counts
+BLUR, NOISE = 0.5, 2.0
+"""Of frames, standard deviations: pixels and shades."""
+
+
+class Spot(NamedTuple):
+    """A marker in a frame."""
+
+    number: int
+    pixel: Array  # (2,) of its centre
+    size: float  # side over distance
+    age: int = 1  # frames in a row
+
+
+class FakeCamera:
+    """The camera of one car."""
+
+    def __init__(
+        self,
+        world: CarWorld,
+        binding: Binding,
+        others: Neighbours,
+        faults: CarFaults,
+        publisher: SensorPublisher,
+        settings: FakeSettings,
+    ) -> None:
+        """Put it on the car.
+
+        Args:
+            world: what it looks at.
+            binding: markers of the cars and of landmarks, and the make, which states what it publishes.
+            others: the other cars, which are placed for each frame.
+            faults: that it may have.
+            publisher: of its messages.
+            settings: size of the markers.
+
+        Raises:
+            CoopenvError: it publishes frames, and the extra is not installed, or the family has no such markers.
+        """
+        self._world, self._others, self._faults, self._publisher = world, others, faults, publisher
+        self._markers, self._side = {target: marker for marker, target in binding.targets.items()}, settings.marker
+        smallest, largest = binding.profile.markers
+        self._numbers = range(smallest, largest + 1)
+        self._calibration = Calibration.of(world.scenario.cameras[world.vehicle])
+        self._vision, self._renderer, self._false_width = binding.profile.vision, None, 2.0
+        if binding.profile.sees_frames:
+            if self._vision.colours:
+                raise CoopenvError("vision.colours: frames of fakes have tags, no colours")
+            self._false_width = 40.0  # pixels, so that a tag can be read
+            self._renderer = FrameRenderer(self._calibration, self._vision.family)
+            self._compressed = binding.profile.topics[Role.DETECTIONS].type != IMAGES[0]
+            for number in self._numbers:
+                pattern(self._vision.family, number)
+        self.acts: list[tuple[float, Act]] = [
+            (world.scenario.rates.camera, self._camera),
+            (CAMERA_INFO_RATE, self._camera_info),
+        ]
+        """Rates in Hz, and what is published."""
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """Begin an episode: frames count from here, faults draw from `rng`."""
+        self._ages: dict[int, int] = {}
+        self._frames, self._rng = 0, rng
+
+    def _camera(self, due: int, stamp: int) -> None:
+        spots = self._spots(due)
+        share = self._faults.value("wrong_stamps", due)
+        if share and self._rng.random() < share:
+            stamp += round(AHEAD * 1e9)
+        begin = stamp - self._vision.late((), self._calibration.image_size[1])
+        if self._renderer is None:
+            blocks = [self._block(spot) for spot in spots]
+            self._publisher.send(Role.DETECTIONS, begin, "camera", objects=blocks)
+            self._publisher.send(Role.BEARINGS, stamp, "camera", bearing=self._bearings(blocks))
+            return
+        frame = self._renderer.render(self._tags(spots), BLUR, NOISE, self._rng)
+        self._publisher.send(Role.DETECTIONS, begin, "camera", **self._fields(frame))
+
+    def _camera_info(self, _due: int, stamp: int) -> None:
+        c = self._calibration
+        (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
+        matrices = {"d": c.distortion, "k": (fx, 0, cx, 0, fy, cy, 0, 0, 1), "r": np.eye(3)}
+        fields = {"width": width, "height": height, "distortion_model": "plumb_bob", **matrices}
+        fields["p"] = (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)
+        self._publisher.send(Role.CAMERA_INFO, stamp, "camera", **fields)
+
+    def _spots(self, now: int) -> list[Spot]:
+        """Take a frame at a time in ns; return its markers, the nearest first, with faults."""
+        self._others.place()
+        self._frames += 1
+        seen = {agent: ray for agent, ray in self._world.look(self._frames).items() if agent in self._markers}
+        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
+        far = np.array([max(self._world.distance(agent), self._side) for agent in seen])
+        pixels, sizes = self._rolled(np.array([*seen.values()]).reshape(-1, 3), far), self._side / far
+        rows = zip(seen, pixels, sizes, strict=True)
+        spots = [Spot(self._markers[agent], pixel, size, self._ages[agent]) for agent, pixel, size in rows]
+        return self._with_faults(sorted(spots, key=lambda spot: -spot.size), now)
+
+    def _rolled(self, units: Array, far: Array) -> Array:
+        """Return the pixels (m, 2) of rays (m, 3) to markers at distances (m,), each at the time of its row.
+
+        Rays are those of the middle row. Only the own motion counts.
+        """
+        pixels = self._calibration.pixels(units)
+        late = self._vision.row_time * (pixels[:, 1:] - 0.5 * self._calibration.image_size[1])
+        (velocity, turn), camera = self._world.twist, self._world.scenario.cameras[self._world.vehicle]
+        w, v = turn @ camera.to_body(), (velocity + np.cross(turn, camera.position)) @ camera.to_body()
+        return self._calibration.pixels(units - late * (np.cross(w, units) + v / far[:, None]))
+
+    def _with_faults(self, spots: list[Spot], now: int) -> list[Spot]:
+        faults, rng, size = self._faults, self._rng, self._calibration.image_size
+        if faults.value("swapped_signatures", now):
+            numbers = [spot.number for spot in spots]
+            spots = [s._replace(number=n) for s, n in zip(spots, reversed(numbers), strict=True)]
+        if share := faults.value("duplicate_blocks", now):
+            doubled = [spot for spot in spots if rng.random() < share]
+            spots = [*spots, *(Spot(s.number, s.pixel + np.array([3.0, 0.0]), 0.5 * s.size) for s in doubled)]
+        if rate := faults.value("false_blocks", now):
+            for _ in range(rng.poisson(rate / self._world.scenario.rates.camera)):
+                number, pixel = int(rng.choice(self._numbers)), rng.integers(size).astype(np.float64)
+                spots = [*spots, Spot(number, pixel, self._false_width / self._calibration.focal_length[0])]
+        return spots
+
+    def _block(self, spot: Spot) -> Any:
+        """Return the ObjectInfo of a Pixy."""
+        c = self._calibration
+        x, y = np.rint(spot.pixel).clip(0, np.array(c.image_size) - 1).astype(int).tolist()
+        width, height = (max(1, round(f * spot.size)) for f in c.focal_length)
+        fields = {"center_x": x, "center_y": y, "width": width, "height": height, "age": spot.age}
+        return make("pixy_camera/msg/ObjectInfo", signature=spot.number, index=spot.number - 1, **fields)
+
+    def _bearings(self, blocks: list[Any]) -> list[Any]:
+        """Return the ObjectBearings of blocks as the authors compute them: distortion is not removed."""
+        c, pixels = self._calibration, np.array([(b.center_x, b.center_y) for b in blocks], dtype=np.float64)
+        flat = (pixels.reshape(-1, 2) - c.principal_point) / c.focal_length
+        units = np.concatenate([flat, np.ones((len(blocks), 1))], axis=-1)
+        units /= np.linalg.norm(units, axis=-1, keepdims=True)
+        return object_bearings([block.signature for block in blocks], units.tolist())
+
+    def _tags(self, spots: list[Spot]) -> list["PlacedTag"]:
+        """Return upright tags that face the camera."""
+        units, there = rays(np.array([spot.pixel for spot in spots]).reshape(-1, 2), self._calibration)
+        tags = []
+        for spot, ray in zip((s for s, ok in zip(spots, there, strict=True) if ok), units[there], strict=True):
+            across = np.array([ray[2], 0.0, -ray[0]]) / np.hypot(ray[0], ray[2])
+            axes = np.stack([across, [0.0, 1.0, 0.0], np.cross(across, [0.0, 1.0, 0.0])], axis=-1)
+            tags.append(PlacedTag(spot.number, axes, ray * self._side / spot.size, self._side))
+        return tags
+
+    def _fields(self, frame: NDArray[np.uint8]) -> dict[str, Any]:
+        """Return the fields of the message of a frame."""
+        if self._compressed:
+            return {"format": "jpeg", "data": opencv().imencode(".jpg", frame)[1]}
+        height, width = frame.shape
+        return {"height": height, "width": width, "step": width, "encoding": "mono8", "data": frame}
+
+
+INSIDE = (np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) - 1.5) / 4.0
+"""Rays through a pixel, from its middle: downwards and to the right, in pixels."""
+
+WHITE, BLACK, WALL, OUTSIDE = 220.0, 30.0, 120.0, -1.0
+"""Shades of tags, and of what is behind them; what is not on a tag."""
+
+
+class PlacedTag(NamedTuple):
+    """A tag in front of a camera."""
+
+    number: int
+    axes: Array  # (3, 3) columns: to its right, downwards and behind it, as its reader sees it; optical frame
+    place: Array  # (3,) of its centre, optical frame, m
+    side: float  # of its black square, m; a white border of one cell is around it
+
+
+@cache
+def pattern(family: str, number: int) -> Array:
+    """Return the shades of the cells of a tag, border included. Raises CoopenvError: the family has no such number."""
+    dictionary = dictionary_of(family)
+    if not 0 <= number < (count := len(dictionary.bytesList)):
+        raise CoopenvError(f"marker {number}: {family} has 0 to {count - 1}")
+    cells = opencv().aruco.generateImageMarker(dictionary, number, dictionary.markerSize + 2)
+    return np.where(np.pad(cells, 1, constant_values=255) > 127, WHITE, BLACK)
+
+
+@cache
+def pixel_rays(calibration: Calibration) -> tuple[Array, Array, Array]:
+    """Return the rays (height, width, 3) of all pixels, at depth 1, and their changes downwards and to the right."""
+    width, height = calibration.image_size
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    units, there = rays(pixels.astype(np.float64), calibration)
+    units[~there] = np.nan  # meets no tag
+    found = (units / units[:, 2:]).reshape(height, width, 3)
+    return found, *np.gradient(found)[:2]  # per pixel: nearly the same all over it
+
+
+class FrameRenderer:
+    """Renders frames of one camera; pixels have whole numbers in their middle, as in OpenCV."""
+
+    def __init__(self, calibration: Calibration, family: str) -> None:
+        """Find the rays of all pixels."""
+        self.calibration, self.family = calibration, family
+        self._rays, self._down, self._right = pixel_rays(calibration)
+
+    def render(
+        self, tags: Sequence[PlacedTag], blur: float, noise: float, rng: np.random.Generator, behind: Any = WALL
+    ) -> NDArray[np.uint8]:
+        """Return a frame (height, width) of tags before shades of that size, or one shade.
+
+        Blur is in pixels, noise in shades, standard deviations both.
+        """
+        frame = np.empty(self._rays.shape[:2], np.float32)
+        frame[:] = behind
+        for tag in sorted(tags, key=lambda tag: -float(np.linalg.norm(tag.place))):
+            self._paint(frame, tag)
+        if blur:
+            frame = opencv().GaussianBlur(frame, (0, 0), blur)
+        frame += np.float32(noise) * rng.standard_normal(frame.shape, np.float32)
+        return np.asarray(np.rint(frame).clip(0, 255), dtype=np.uint8)
+
+    def _paint(self, frame: NDArray[Any], tag: PlacedTag) -> None:
+        shades = np.pad(pattern(self.family, tag.number), 1, constant_values=OUTSIDE)
+        cells, cell = len(shades) - 2, tag.side / (len(shades) - 4)
+        box = self._box(tag, 0.5 * cells * cell)
+        if box is None:
+            return
+        n, p = tag.axes[:, 2], tag.place
+        rows = [((n @ p) * a - (a @ p) * n) / cell + 0.5 * cells * n for a in tag.axes[:, :2].T]
+        H = np.array([*rows, n])  # from rays to the cells, homogeneous
+        middle, down, right = (part[box] @ H.T for part in (self._rays, self._down, self._right))
+        behind, found = frame[box], shades[_cells(middle, cells)]
+        mixed = maximum_filter(found, 3) != minimum_filter(found, 3)  # most pixels of a near tag have one shade
+        through = middle[mixed, None] + INSIDE[:, :1] * down[mixed, None] + INSIDE[:, 1:] * right[mixed, None]
+        fine = shades[_cells(through, cells)]
+        found = np.where(found == OUTSIDE, behind, found)
+        found[mixed] = np.where(fine == OUTSIDE, behind[mixed, None], fine).mean(axis=-1)
+        frame[box] = found
+
+    def _box(self, tag: PlacedTag, half: float) -> tuple[slice, slice] | None:
+        """Return rows and columns of the pixels that a tag may cover; None: none."""
+        along = np.linspace(-half, half, 9)
+        rim = np.array([(u, v) for w in (-half, half) for a in along for u, v in ((a, w), (w, a))])
+        points = tag.place + rim @ tag.axes[:, :2].T
+        if (points[:, 2] <= 1e-3).any() or tag.axes[:, 2] @ tag.place <= 0.0:  # behind the camera, or its back
+            return None
+        pixels = self.calibration.pixels(points)
+        low = np.floor(pixels.min(axis=0)).astype(int) - 1
+        high = np.ceil(pixels.max(axis=0)).astype(int) + 2
+        (left, top), (right, bottom) = low.clip(0), np.minimum(high, self.calibration.image_size)
+        return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
+
+
+def _cells(at: Array, cells: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns, from 1 on, of places (..., 3) on a tag, homogeneous in cells; 0 or beyond: outside."""
+    with np.errstate(all="ignore"):
+        on = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], -1.0)
+    column, row = np.moveaxis(np.floor(on).clip(-1, cells).astype(np.intp) + 1, -1, 0)
+    return row, column

@@ -13,7 +13,7 @@ from coopenv.cars.bags import Bag
 from coopenv.cars.bags.doctor import examined, proposed
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.codec import make
-from coopenv.cars.fake.camera import FrameRenderer, PlacedTag
+from coopenv.cars.fake.sensors import FrameRenderer, PlacedTag
 from coopenv.cars.profile import Role, VisionSettings
 from coopenv.cars.readings import Detections, read
 from coopenv.cars.vision import Calibration, find_tags, frame_of

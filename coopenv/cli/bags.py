@@ -1,7 +1,8 @@
-"""`coopenv calibrate` and `coopenv identify`."""
+"""`coopenv import`, `coopenv calibrate` and `coopenv identify`: bags of cars."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,11 +10,110 @@ import typer
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
+from coopenv.cli.run import check_log
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from coopenv.cars.bags.log import TopicRow
     from coopenv.cars.calibration.findings import Row
+
+
+def import_(
+    bags: Annotated[list[Path], options.bags(help="Bags of one drive, such as one per car.")],
+    topics: options.TopicMap = None,
+    out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
+    seed: options.Seed = 0,
+    overrides: options.Overrides = None,
+    observer: options.LogObserver = None,
+    scene: options.LogScene = True,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    propose: Annotated[
+        Path | None, typer.Option(help="TOML file to write: a map of the topics, by their types and names.")
+    ] = None,
+    as_json: options.AsJson = False,
+) -> None:
+    """List what ROS bags hold, and make a recording of them.
+
+    Files and folders of ROS 1 and ROS 2. Without --map: rates, gaps and stamps of their topics; --propose writes a map.
+    """
+    if topics is not None and propose is not None:
+        raise CoopenvError("--propose: writes a map, --map names one; give one of them")
+    if topics is None:
+        if out is not None or overrides:
+            raise CoopenvError(
+                f"{'--out' if out else '--override'}: needs the map of the bags' topics, --map topics.toml"
+            )
+        from coopenv.base.files import check_new, replace_text
+        from coopenv.cars.bags.doctor import examined, proposed
+        from coopenv.cars.bags.files import BagFile
+
+        if propose is not None:
+            check_new(propose, force)
+        with ExitStack() as stack:
+            files = [stack.enter_context(BagFile(path)) for path in bags]
+            rows, notes = examined(files)
+            text = "" if propose is None else proposed(files, rows)
+        _print_topics(rows, as_json)
+        console = options.console(stderr=as_json)
+        for note in notes:
+            console.print(note, soft_wrap=True)
+        if propose is not None:
+            replace_text(propose, text)
+            console.print(f"{propose}: set its environment and markers", soft_wrap=True)
+        return
+    from coopenv.backends.sources import open_bags
+    from coopenv.base.files import check_new
+
+    if out is not None:
+        check_log(out, observer, scene)
+        check_new(out, force)
+    bag = open_bags(bags, topics, options.parse_overrides(overrides))
+    _print_topics(bag.log.rows, as_json)
+    ticks = bag.capabilities.ticks or 0
+    seconds = (ticks - 1) / bag.scenario.rates.camera
+    vehicles = len(bag.binding.cars)
+    facts = f"{vehicles} vehicle{'s' * (vehicles > 1)}, {ticks} ticks, {seconds:.4g} s"
+    if out is not None:
+        from coopenv.runs.console import Progress
+        from coopenv.runs.recorder import record as recorded
+        from coopenv.runs.scenes import write_log
+
+        log = options.console(stderr=True)
+        with Progress(log, "recording", total=1.0) as progress:
+            recording = recorded(bag, seed, on_progress=progress.update)
+        write_log(recording, out, log, observer, scene)
+    if not as_json:
+        options.console().print(f"{out or bag.where}: {facts}", soft_wrap=True)
+
+
+def _print_topics(rows: Sequence[TopicRow], as_json: bool) -> None:
+    """Print what bags hold; where it is known, also as what it is read."""
+    if as_json:
+        options.print_json([*rows])
+        return
+    from coopenv.cars.bags.clocks import written
+    from coopenv.runs.console import number_table
+
+    read = any(row.role for row in rows)
+    names = ["topic", "read as" if read else "type"]
+    numbers = [
+        "messages",
+        "rate\n[Hz]",
+        *(["used"] if read else []),
+        *("bad\nstamps", "longest\ngap [s]", "gaps", "clock\n[ms]"),
+        *(["leads\n[ms]"] if read else []),
+    ]
+    table = number_table(names, numbers)
+    for row in rows:
+        about = (f"{row.car} {row.role}" if row.role else "") if read else row.type
+        offset = None if row.offset is None else 1e3 * row.offset
+        used = [(row.used, 0)] if read else []
+        figures = [(row.rate, 1), *used, (row.outlying, 0), (row.gap, 3), (row.gaps, 0), (offset, 1)]
+        shown = ("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
+        lead = "-" if row.lead is None or row.lead_error is None else written(row.lead, row.lead_error)
+        table.add_row(row.topic, about, str(row.messages), *shown, *([lead] if read else []))
+    options.console().print(table)
 
 
 def calibrate(
