@@ -98,7 +98,7 @@ LINES_AND_FILES = {
     "policies": (1870, 9),
     "runs": (3365, 13),
     "scenario": (3755, 13),
-    "training": (1720, 7),
+    "training": (1715, 7),
     "viz": (4810, 19),
     "world": (5475, 20),
 }

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from stable_baselines3.common.logger import configure
@@ -197,7 +197,8 @@ def _judge(trainer: Trainer | SetTrainer, threads: int | None, report: Reports, 
 class Checkpoint(BaseModel):
     """What a file holds."""
 
-    path: Path
+    model_config = ConfigDict(ser_json_inf_nan="constants")
+    format: int = FORMAT
     plan: TrainingPlan
     scenario: str
     """JSON of the scenario, to find out whether it is still the same."""
@@ -208,7 +209,8 @@ class Checkpoint(BaseModel):
     """Whether an ONNX model is to be written, too, as the command line said."""
     logs: Path | None = None
     """Its folder for TensorBoard; None: in the agent's folder."""
-    arrays: dict[str, dict[str, Any]] = Field(repr=False)
+    path: Path = Field(default=Path(), exclude=True)
+    arrays: dict[str, dict[str, Any]] = Field(default={}, exclude=True, repr=False)
     """By what they restore, and by name."""
 
 
@@ -220,22 +222,18 @@ def save(
     Raises:
         OutputError: it cannot be written; the one before is whole.
     """
-    header = {
-        "format": FORMAT,
-        "plan": TypeAdapter(TrainingPlan).dump_python(trainer.plan, mode="json"),
-        "scenario": trainer.scenario.model_dump_json(),
-        "progress": {
-            "steps": trainer.model.num_timesteps,
-            "seconds": trainer.seconds,
-            "cpu_seconds": trainer.cpu_seconds,
-        },
-        "curve": curve,
-        "onnx": onnx,
-        "logs": None if logs is None else str(logs.absolute()),
-    }
+    spent = {"seconds": trainer.seconds, "cpu_seconds": trainer.cpu_seconds}
+    header = Checkpoint(
+        plan=trainer.plan,
+        scenario=trainer.scenario.model_dump_json(),
+        progress={"steps": trainer.model.num_timesteps, **spent},
+        curve=curve,
+        onnx=onnx,
+        logs=logs and logs.absolute(),
+    )
     with replacing_file(path) as new, writing(path):
         try:
-            save_file(_arrays(trainer), new, metadata={HEADER: json.dumps(header)})
+            save_file(_arrays(trainer), new, metadata={HEADER: header.model_dump_json()})
         except SafetensorError as error:  # what the system says of a full disk comes as one of these
             raise OSError(str(error)) from None
     interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
