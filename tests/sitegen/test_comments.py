@@ -12,24 +12,6 @@ from tests.helpers.sessions import ROOT
 
 griffe = pytest.importorskip("griffe", reason="needs the extra 'docs'")
 
-SOURCE = '''
-LIMIT = 3  # most of them
-
-class Part:
-    size: int  # (N,) m, map
-    kind: str = field(
-        default="a",
-    )  # what it is
-    told: int  # not this
-    """But this."""
-    bare: float
-    ignored = 1  # noqa: E501
-    typed = []  # type: ignore[var-annotated]
-
-    def __init__(self):
-        self.inner = 0  # for whoever reads the code
-'''
-
 
 def loaded(folder: Path, package: str) -> Any:
     extensions = griffe.load_extensions(str(ROOT / "sitegen" / "comments.py"))
@@ -38,21 +20,6 @@ def loaded(folder: Path, package: str) -> Any:
 
 def docstrings(parent: Any) -> dict[str, str | None]:
     return {name: part.docstring and part.docstring.value for name, part in parent.attributes.items()}
-
-
-def test_comments_become_docstrings(tmp_path: Path) -> None:
-    (tmp_path / "parts.py").write_text(SOURCE, encoding="utf-8")
-    parts = loaded(tmp_path, "parts")
-    assert docstrings(parts) == {"LIMIT": "most of them"}
-    assert docstrings(parts["Part"]) == {
-        "size": "(N,) m, map",
-        "kind": "what it is",
-        "told": "But this.",
-        "bare": None,
-        "ignored": None,
-        "typed": None,
-        "inner": None,
-    }
 
 
 def test_every_field_of_what_the_api_shows_is_described() -> None:

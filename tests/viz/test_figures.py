@@ -18,7 +18,6 @@ from mpl_toolkits.mplot3d import proj3d
 from scipy.stats import chi2
 
 import coopenv
-from coopenv.base.errors import OutputError
 from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
@@ -70,12 +69,6 @@ def test_lost_observers_are_drawn(tmp_path: Path) -> None:
     run = dataclasses.replace(run, **arrays)
     assert len(save_figures(run, tmp_path, ends=[0.0, 0.5, np.nan, 1.0, 1.5])) == len(NAMES)
     assert all("no rate to fit" in row["rate_remark"] for row in summarise(run, 0.5))
-
-
-def test_a_place_that_cannot_be_written_is_one_clear_error(run: Trajectory, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write to"):
-        save_figures(run, tmp_path / "file" / "folder")
 
 
 def test_global_state_of_matplotlib_is_left_alone() -> None:
@@ -235,15 +228,6 @@ def test_axes_show_two_decades_and_no_labels_between(values: tuple[float, float]
     assert sum(low <= 10.0**k <= high for k in range(-5, 7)) >= 2
     assert low <= values[0] and values[1] <= high
     assert all(not text.get_text() for text in ax.get_yticklabels(minor=True))
-
-
-def test_lines_are_thinned_and_without_what_an_axis_cannot_show() -> None:
-    values = np.array([1.0, -1.0, 0.0, np.nan, np.inf, 1e200])
-    np.testing.assert_array_equal(style.drawable(values), [1, -1, 0, np.nan, np.nan, np.nan])
-    np.testing.assert_array_equal(style.drawable(values, positive=True), [1] + [np.nan] * 5)
-    assert style.thinned(10).tolist() == list(range(10))
-    long = style.thinned(100_000)
-    assert len(long) <= style.MAX_POINTS and long[0] == 0 and long[-1] == 99_999
 
 
 def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> None:
@@ -412,19 +396,6 @@ def test_lines_are_cut_at_the_sides_of_a_box() -> None:
     np.testing.assert_allclose(through[:, 0], [0, 1], atol=1e-9)
     assert len(clipped(np.array([(5.0, 5.0), (6.0, 6.0)]), np.zeros(2), np.ones(2))) == 0
     assert len(clipped(np.array([(0.5, 0.5)]), np.zeros(2), np.ones(2))) == 1
-
-
-def test_names_keep_off_marks_and_each_other() -> None:
-    point = style.DPI / 72.0
-    anchors = np.array([(100.0, 100.0), (104.0, 100.0)])
-    marks = np.vstack([anchors, [(115.0, 110.0)]])
-    offsets = style.place_names(["SL1", "$f_{2}$"], anchors, marks, np.empty((0, 2)), 10.0)
-    low = anchors / point + offsets
-    extent = np.array([(0.62 * 3, 0.95), (0.62 * 2, 0.95)]) * 10.0
-    for corner, size in zip(low, extent, strict=True):
-        assert not np.any(np.all((marks / point > corner) & (marks / point < corner + size), axis=-1))
-    assert np.any((low[0] >= low[1] + extent[1]) | (low[1] >= low[0] + extent[0]))
-    assert style.place_names(["A"], anchors[:1], anchors[:1], np.empty((0, 2)), 10.0).tolist() == [[5.0, 5.0]]
 
 
 @pytest.mark.parametrize("draw", [trajectory_figure_2d, trajectory_figure_3d])

@@ -32,7 +32,6 @@ from coopenv.viz.stage import (
     ellipses,
     free_lengths,
     limits,
-    pointers,
 )
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView
@@ -221,15 +220,6 @@ def test_estimates_outside_change_no_limits_and_are_pointed_at(start: Any) -> No
         blue = np.all(np.abs(edge - 255 * np.array(to_rgb(vehicle_colour(0)))) < 8, axis=-1).sum()
         assert (blue > 15) == (far > 0), far
     assert np.any(inside != picture)
-
-
-def test_pointer_sits_at_the_border_and_points_outwards() -> None:
-    low, high = np.zeros(2), np.array([10.0, 10.0])
-    origin = np.array([[5.0, 5.0], [5.0, 5.0], [20.0, 5.0]])
-    point = np.array([[5.0, 50.0], [6.0, 6.0], [-20.0, 5.0]])
-    triangles = pointers(origin, point, low, high, size=1.0)
-    np.testing.assert_allclose(triangles[:, 0], [[5.0, 9.85], [np.nan, np.nan], [0.15, 5.0]])
-    assert np.all((triangles[[0, 2]] >= low) & (triangles[[0, 2]] <= high))
 
 
 @pytest.mark.parametrize("name", coopenv.list_envs())

@@ -269,26 +269,6 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
         assert_allclose(ray[1] / ray[2], (block["center_y"] - 100.0) / 410.0)
 
 
-def test_the_authors_bearings_stand_in_for_pixels(tmp_path: Path) -> None:
-    """Their node's vectors, of pixels whose distortion it leaves, give what the pixels give."""
-    drive = []
-    for m in short():
-        if "objectsInfo" not in m.topic:
-            drive.append(m)
-            continue
-        bearing = []
-        for b in m.fields["objects"]:
-            ray = np.array([(b["center_x"] - 154.841998) / 213.161906, (b["center_y"] - 114.98398) / 213.521038, 1.0])
-            x, y, z = (-ray / np.linalg.norm(ray)).tolist()
-            bearing.append({"id": b["signature"], "bearing_x": x, "bearing_y": y, "bearing_z": z})
-        name, kind = "/agent8/pixy_landmark_detection/objectsBearing", "pixy_camera/msg/ObjectBearingArrayStamped"
-        drive.append(replace(m, topic=name, kind=kind, fields={"bearing": bearing}))
-    (tmp_path / "vectors").mkdir()
-    vectors, pixels = opened(tmp_path / "vectors", MAP, drive), opened(tmp_path, MAP)
-    for a, b in zip(vectors.episode(None, {}), pixels.episode(None, {}), strict=True):
-        assert_allclose(a.bearings, b.bearings, atol=1e-5)
-
-
 def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     turning = {"angular_velocity": (0.0, 0.0, 0.7), "linear_acceleration": (0.0, 0.0, 9.8)}
     wheels = [m for m in short() if "twist" in m.topic]
