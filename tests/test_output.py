@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-import coopenv
 from coopenv.cli import main
-from coopenv.runs.rollouts import rollout
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start
 
 AGENTS = """
@@ -156,20 +154,6 @@ def test_a_bag_that_does_not_exist_is_told_so(command: str, name: str, capsys: p
     assert main(command.format(name).split()) == 2
     told = capsys.readouterr().err
     assert f"no such bag: {name}" in told and "map" not in told and told.count("\n") == 1
-
-
-def test_a_scenario_goes_where_a_name_goes() -> None:
-    scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
-    env = coopenv.parallel_env(scenario, overrides={"noise.enabled": False}, observer="robust")
-    made = env.engine.backend.scenario
-    assert made.observer.name == "robust" and not made.noise.enabled
-    assert env.metadata["name"] == f"{scenario.title}_v0"
-    assert len(rollout(scenario, steps=2).t) == len(rollout("overtaking", steps=2).t)
-    batch = coopenv.make_vec(scenario, num_worlds=2, overrides={"horizon": 0.5})
-    assert batch.num_envs == 2 * len(scenario.vehicles)
-    assert coopenv.load_scenario(scenario) is scenario
-    with pytest.raises(coopenv.CoopenvError, match=r"^overrides: noise\.enabeld: unknown key .*did you mean"):
-        coopenv.parallel_env(scenario, overrides={"noise.enabeld": False})
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["schema"], ["--help"]])

@@ -13,7 +13,6 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from pettingzoo.utils import BaseParallelWrapper, aec_to_parallel, parallel_to_aec
 
 import coopenv
 from coopenv.api.arguments import Info
@@ -83,21 +82,6 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
     env.close()
     env.close()
     env.reset(seed=3)
-
-
-def test_wrappers_and_registries() -> None:
-    turned = aec_to_parallel(parallel_to_aec(BaseParallelWrapper(coopenv.parallel_env(ENV))))
-    assert turned.reset(seed=1)[0].keys() == {"vehicle_1"}
-    assert (
-        pettingzoo.make("parallel", "coopenv/Facade-v0", overrides={"horizon": 1.0}).unwrapped.scenario.horizon == 1.0
-    )
-    view: Any = gymnasium.make("coopenv/Facade-v0", max_episode_steps=2, render_mode="rgb_array")
-    for wrapper in (gymnasium.wrappers.NormalizeObservation, gymnasium.wrappers.RecordEpisodeStatistics):
-        view = wrapper(view)
-    view.reset(seed=2)
-    assert view.render().shape[-1] == 3
-    assert [view.step(view.action_space.sample())[3] for _ in range(2)] == [False, True]
-    assert len(view.return_queue) == 1
 
 
 def test_infos_have_the_entries_that_their_type_names() -> None:
@@ -175,10 +159,6 @@ def test_registries_hold_names_of_coopenv_alone_and_make_any_scenario(scenario: 
     assert made.scenario == scenario
     assert gymnasium.make_vec("coopenv/Scenario-v0", num_envs=5, name_or_path="ring:5").num_envs == 5
     assert len(pettingzoo.make("parallel", "coopenv/Scenario-v0", name_or_path="ring:5").possible_agents) == 5
-
-
-def test_names_are_listed_alike() -> None:
-    assert "robust" in coopenv.list_observers() and "peek" in coopenv.list_agents() and ENV in coopenv.list_envs()
 
 
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {

@@ -123,16 +123,6 @@ def test_the_next_episode_is_another_one_and_a_mask_leaves_the_others() -> None:
     assert not np.array_equal(engine.view("position")[1], first[1])
 
 
-def test_batches_train_like_any_other() -> None:
-    envs = coopenv.make_vec(CROSSING, num_worlds=2, overrides={"horizon": 2.0})
-    envs.reset(seed=0)
-    ended = 0
-    for _ in range(25):
-        _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
-        ended += int((terminated | truncated).sum())
-    assert ended >= 2 * 8
-
-
 def put_a_car(engine: Engine, x: float, y: float) -> None:
     """Put a car of highway-env's that stands across the road; x and y as on our map."""
     from highway_env.vehicle.kinematics import Vehicle
@@ -189,15 +179,6 @@ def test_who_leaves_the_road_has_arrived() -> None:
         *_, infos = env.step({agent: np.array([-1.0, 0.0]) for agent in env.agents})
         arrived = [agent for agent, info in infos.items() if info["outcome"] == "arrived"]
     assert arrived and "vehicle_1" not in arrived
-
-
-@pytest.mark.parametrize("observer", ["riccati", "mekf"])
-def test_any_observer_runs_on_it(observer: str) -> None:
-    env = coopenv.parallel_env(CROSSING, observer=observer, dtype="float64")
-    env.reset(seed=2)
-    for _ in range(15):
-        *_, infos = env.step({agent: np.array([-0.5, 0.0]) for agent in env.agents})
-    assert all(info["position_error"] < 0.6 for info in infos.values())
 
 
 def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,23 +116,6 @@ def test_observers_in_the_replay_do_as_in_the_runner(observer: str) -> None:
             assert_allclose(estimate["rotation"], result.rotation[step * k, i], atol=1e-9)
 
 
-@pytest.mark.parametrize("variant", ["landmarks", "landmarks+robots", "blind"])
-def test_robots_embedded_and_in_numpy_agree(data: Path, variant: str) -> None:
-    result = run("riccati", robots(data, variant))
-    assert not result.failure
-    env = coopenv.parallel_env("mrclam_6", data=data, variant=variant, dtype="float64")
-    assert env.possible_agents == [f"vehicle_{i}" for i in range(1, 6)]
-    step = env.scenario.ticks_per_decision
-    record = play(env)
-    for k, (*_, infos) in enumerate(record[1:], start=1):
-        tick = min(step * k, result.t.size - 1)
-        for i, agent in enumerate(infos):
-            assert_allclose(infos[agent]["estimate"]["position"], result.position[tick, i], atol=1e-9)
-            assert infos[agent]["time"] == pytest.approx(result.t[tick])
-    assert len(record) - 1 == -(-(result.t.size - 1) // step)
-    assert all(record[-1][3].values()) and not any(record[-1][2].values())
-
-
 def test_actions_and_seeds_change_nothing(data: Path) -> None:
     env = replayed(robots(data))
     for first, second in zip(play(env, 1), play(env, 2), strict=True):

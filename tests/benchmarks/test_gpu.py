@@ -14,7 +14,7 @@ import pytest
 from benchmarks import view
 from benchmarks.gpu import work
 from benchmarks.gpu.__main__ import PAGE, main
-from benchmarks.gpu.plan import ENVIRONMENT, LEARNING, OBSERVERS, SIZES, Stage, plan
+from benchmarks.gpu.plan import Stage, plan
 from benchmarks.gpu.prepare import requirements
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import BEGIN, END, put, section
@@ -25,17 +25,6 @@ from benchmarks.stages.rounds import alternate
 from coopenv.base.errors import CoopenvError
 
 HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
-
-
-def test_every_stage_has_work_and_a_limit() -> None:
-    stages = plan("cuda:0")
-    assert all(stage.work in work.WORK and 0.0 < stage.limit <= 900.0 for stage in stages)
-    assert len({stage.name for stage in stages}) == len(stages)
-    batches = [stage.arguments for stage in stages if stage.work == "throughput"]
-    measured = {(b["environment"], b["overrides"]["observer.name"], b["worlds"]) for b in batches}
-    sizes = {(ENVIRONMENT, observer, size) for observer in OBSERVERS for size in SIZES}
-    assert measured == sizes | {(LEARNING, observer, SIZES[0]) for observer in OBSERVERS}
-    assert max(SIZES) == 262_144 and min(SIZES) == 4_096
 
 
 def test_what_is_there_is_kept_when_a_stage_fails_or_takes_too_long(tmp_path: Path) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import tomllib
-import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from coopenv.base.errors import ScenarioError, ScenarioWarning, UnknownEnvironmentError
-from coopenv.base.installation import list_envs
-from coopenv.scenario import load_scenario, scenario_name, scenario_path
+from coopenv.base.errors import ScenarioError, UnknownEnvironmentError
+from coopenv.scenario import load_scenario, scenario_name
 
 MINIMAL = """
 title = "t"
@@ -41,16 +39,6 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "mine.toml"
     path.write_text(MINIMAL)
     return path
-
-
-def test_shipped_environments_load_under_their_names() -> None:
-    names = list_envs()
-    assert {"busy_intersection", "busy_intersection_mirror", "crossing_path", "overtaking"} <= set(names)
-    for name in names:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ScenarioWarning)
-            assert load_scenario(name).title
-        assert scenario_path(name).stem == name
 
 
 def test_unknown_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,13 +247,3 @@ def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:
 def test_wrong_overrides(file: Path, key: str, words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
         load_scenario(file, {key: 1.0})
-
-
-def test_override_values_are_checked(file: Path) -> None:
-    with pytest.raises(
-        ScenarioError,
-        match=r"overrides: rates.camera: Input should be greater than or equal to 0.001, got -5",
-    ):
-        load_scenario(file, {"rates.camera": -5})
-    with pytest.raises(ScenarioError, match="whole multiple of the decision rate"):
-        load_scenario(file, {"rates.camera": 61})

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import ScenarioError
 from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
-from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.routes import (
     BLOCK,
     MOST_POINTS,
@@ -34,7 +33,7 @@ from coopenv.scenario.routes import (
     route_length,
     route_points,
 )
-from tests.helpers.builders import raw, scenario, vehicle
+from tests.helpers.builders import scenario, vehicle
 from tests.oracles import continuous
 
 LEFT_TURN = {"name": "left", "waypoints": [[-6.0, -0.5], [0.5, -0.5], [0.5, 7.0]], "corner_radius": 2.0}
@@ -171,15 +170,6 @@ def test_the_boxes_of_a_start_are_at_every_corner_of_its_spread() -> None:
     distance = np.abs(found[:, None] - np.array(expected)).max(axis=-1)
     assert distance.min(axis=0).max() < 1e-12
     assert distance.min(axis=1).max() < 1e-12
-
-
-def test_defaults_may_give_the_spreads() -> None:
-    plain = raw([{"routes": ["left"]}], routes=[LEFT_TURN])
-    plain["vehicle_defaults"] = {"motion": DRIVEN, "initial_pose": {"yaw_spread": 0.1}, "goal": {"radius": 0.7}}
-    made = parse_scenario(apply_vehicle_defaults(plain), "test").vehicles[0]
-    assert made.initial_pose is not None
-    assert (made.initial_pose.yaw_spread, made.goal_radius) == (0.1, 0.7)
-    assert scenario([{"routes": ["left"], "motion": DRIVEN}], routes=[LEFT_TURN]).vehicles[0].goal_radius == 0.5
 
 
 # Boxes overlap where a linear programme finds a point in both

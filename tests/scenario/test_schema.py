@@ -151,12 +151,6 @@ def test_several_mistakes_are_counted() -> None:
     assert complaint(data).endswith("(and 2 more)")
 
 
-def test_a_scenario_is_frozen() -> None:
-    made = parse_scenario(complete(), "here")
-    with pytest.raises(ValueError, match="frozen"):
-        made.horizon = 3.0  # type: ignore[misc]
-
-
 def test_quaternions_are_normalised() -> None:
     data = changed("vehicles.0.initial_estimate.orientation_offset_wxyz", [0.7071, 0, 0, 0.7071])
     q = parse_scenario(data, "here").vehicles[0].initial_estimate.orientation_offset_wxyz

@@ -13,10 +13,9 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
-from torch import nn
 
 import coopenv
-from coopenv.training.ppo import TanhPolicy, differentiate, outputs, product
+from coopenv.training.ppo import product
 from coopenv.training.settings import Ppo, Settings, TrainingPlan
 from coopenv.training.trainer import Trainer
 from tests.helpers.four_way import FOUR_WAY
@@ -86,22 +85,6 @@ def test_an_update_is_that_of_sb3(ppo: dict[str, Any]) -> None:
         assert found[name] == pytest.approx(expected[name], rel=5e-3, abs=1e-4), name
 
 
-def test_gradients_of_a_network_are_those_of_autograd() -> None:
-    generator = torch.Generator().manual_seed(0)
-    layers = [nn.Linear(7, 5), nn.Linear(5, 6), nn.Linear(6, 2)]
-    rows = torch.randn(11, 7, generator=generator)
-    plain = nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
-    (plain(rows) ** 3).sum().backward()
-    expected = [each.grad for layer in layers for each in (layer.weight, layer.bias)]
-    with torch.no_grad():
-        found = outputs(layers, rows)
-        differentiate(layers, found, 3.0 * found[-1] ** 2)
-    assert found[-1].numpy() == pytest.approx(plain(rows).detach().numpy(), abs=1e-6)
-    for layer, (weight, bias) in zip(layers, zip(expected[::2], expected[1::2], strict=True), strict=True):
-        assert layer.weight.grad.numpy() == pytest.approx(weight.numpy(), rel=1e-4, abs=1e-5)
-        assert layer.bias.grad.numpy() == pytest.approx(bias.numpy(), rel=1e-4, abs=1e-5)
-
-
 @pytest.mark.parametrize("available", [True, False])
 def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of transposed views as well, with oneDNN and without."""
@@ -114,15 +97,3 @@ def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.Monk
     assert product(rows, weight, bias).numpy() == pytest.approx((exact + bias).numpy(), abs=1e-4)
     turned = weight.t().contiguous().t(), rows.t().contiguous().t()
     assert product(turned[1], turned[0]).numpy() == pytest.approx(exact.numpy(), abs=1e-4)
-
-
-def test_values_and_mean_actions_are_those_of_sb3() -> None:
-    trainer, _ = trained(Trainer, 1)
-    policy = trainer.model.policy
-    assert isinstance(policy, TanhPolicy)
-    rows = torch.from_numpy(np.random.default_rng(2).normal(size=(50, 132)).astype(np.float32))
-    with torch.no_grad():
-        actions, values, densities = policy(rows, deterministic=True)
-        expected, expected_values, expected_densities = ActorCriticPolicy.forward(policy, rows, deterministic=True)
-    for ours, theirs in ((actions, expected), (values, expected_values), (densities, expected_densities)):
-        assert ours.numpy() == pytest.approx(theirs.numpy(), abs=1e-5)

@@ -171,19 +171,6 @@ def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path, re
     assert offsets["/agent7/riccatiPoint"] == pytest.approx(-0.5) and offsets["/qualisys/svea3/pose"] == 0.0
 
 
-def test_a_cars_clock_that_is_behind_is_moved(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
-    drive = bags.later(bags.messages(bags.drive()), received=0.004)
-    path = bags.write(tmp_path / "behind", bags.later(drive, stamps=-3.0, topics="/agent8"), "mcap")
-    with pytest.warns(DataWarning, match=r"clock of svea3: stamps are \+3\.004 s behind"):
-        moved = ticks_of(Bag([path], folder / "topics.toml"))
-    believed = ticks_of(open_bag(path, tmp_path, bags.MAP + '[clocks]\nmode = "auto"\noffsets = { svea3 = 3.0 }\n'))
-    assert_same(believed, reference, atol=1e-12)
-    same = ("visible", "bearings", "rotation")
-    assert all(
-        np.allclose(getattr(moved[k], n), getattr(believed[k], n), equal_nan=True) for k in (5, 90) for n in same
-    )
-
-
 def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Path, reference: list[Sensed]) -> None:
     unstamped = [replace(m, stamp=-bags.BEGIN) if "twist" in m.topic else m for m in bags.messages(bags.drive())]
     path = bags.write(tmp_path / "unstamped", unstamped, "ros1")

@@ -14,8 +14,6 @@ from coopenv.backends.simulated import Simulated
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
-from coopenv.cars.readings import Detections, read
-from coopenv.cars.vision import Calibration
 from coopenv.scenario import load_scenario
 from tests.helpers.fakes import CROSSING, EXACT, MARKERS, OVERTAKING, Stage
 
@@ -159,7 +157,6 @@ def test_a_moving_landmark_drives_its_motion_and_says_where_it_is() -> None:
 
 FOCAL, CENTRE, SIZE = (213.161906, 213.521038), (154.841998, 114.98398), (316, 208)
 DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
-CALIBRATION = Calibration(SIZE, FOCAL, CENTRE, DISTORTION)
 CAMERA, MARKER = np.array([0.3218, 0.0, 0.2233]), np.array([0.16, 0.0, 0.25])
 BOX, BOX_CENTRE = np.array([0.586, 0.25, 0.25]), np.array([0.16, 0.0, 0.125])
 
@@ -288,24 +285,6 @@ def test_an_empty_frame_is_a_frame() -> None:
     stage.run(1.0)
     frames = stage.arrivals("svea7", Role.DETECTIONS)
     assert len(frames) == pytest.approx(60, abs=2) and not any(m.objects for m in frames)
-
-
-def test_both_topics_are_read_as_the_same_rays() -> None:
-    stage = Stage("svea_overtaking", OVERTAKING)
-    put(stage, "svea7", 0.0, -1.0, np.pi / 2)
-    blocks, unit = frame(stage, "svea7")
-    a, b = read(Role.DETECTIONS, blocks, CALIBRATION), read(Role.BEARINGS, unit, CALIBRATION)
-    assert isinstance(a, Detections) and isinstance(b, Detections)
-    assert a.markers == b.markers and len(a.markers) >= 4
-    assert_allclose(a.bearings, b.bearings, atol=1e-5)
-    for number, ray in zip(a.markers, a.bearings, strict=True):
-        if number in places(stage):
-            forward, left, up = turned(np.pi / 2).T @ (places(stage)[number] - [0.0, -1.0, 0.0]) - CAMERA
-            true = np.array([-left, -up, forward]) / np.linalg.norm([forward, left, up])
-            assert np.arccos(min(ray @ true, 1.0)) < 0.015  # half a pixel and the noise
-    stage.run(1.1)
-    told = read(Role.CAMERA_INFO, stage.arrivals("svea7", Role.CAMERA_INFO)[-1])
-    assert told == CALIBRATION
 
 
 def test_the_moving_landmark_is_seen_once_its_car_is_there() -> None:
