@@ -119,7 +119,6 @@ UNEXPLAINED = 0.3  # largest share of the variance at a wrong offset that may re
 CUT = 3.0  # times the 90 % quantile of residuals; larger ones are outliers
 FEWEST, MOST = 50, 20_000  # elements compared
 ABSURD = 0.1  # rad between bearings and poses, with which no camera or map is right
-LASTING = 0.1  # share of the residuals of bearings that wrong lenses and mountings may make look like an offset
 
 
 @dataclass(frozen=True)
@@ -195,13 +194,10 @@ def fit(e: Array, N: Array, w: Array | None = None, *, scaled: bool = False) -> 
     return rest, weights
 
 
-def lead_by(
-    residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False, lasting: float = 0.0
-) -> Lead | None:
+def lead_by(residual: Residual, times: Array, most: float, least: float, *, scaled: bool = False) -> Lead | None:
     """Return the offset at which a residual, of elements at times (n,), is smallest; None: no clear minimum.
 
-    There is none either if its root mean square is above `most`. `least` is added to the error, as is what a share
-    `lasting` of the residual would give if it were a constant's; `scaled` as in `fit`.
+    There is none either if its root mean square is above `most`. `least` is added to the error; `scaled` as in `fit`.
     """
     if len(times) < FEWEST:
         return None
@@ -226,8 +222,7 @@ def lead_by(
             return None
         offset -= float(np.clip((w * slope * rest).sum() / information, -STEP, STEP))
     blocks = np.bincount(((times - times.min()) / BLOCK).astype(int), w * slope * rest)
-    wrong = lasting * np.sqrt((w * rest**2).sum() / information)
-    return Lead(offset, float(np.linalg.norm([np.sqrt((blocks**2).sum()) / information, least, wrong])))
+    return Lead(offset, float(np.hypot(np.sqrt((blocks**2).sum()) / information, least)))
 
 
 def lead_of_motion(signal: Signal, reference: Signal, least: float = FLOOR) -> Lead | None:
@@ -247,15 +242,20 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
     """Return by how much the stamps of bearings are early, by the known path (x, y, heading) of the car.
 
     They are (n,) times, s, azimuths in the body frame and (n, 2) targets in the map; the camera is at (2,) in the body.
+    Wrong mountings and lenses look like an offset while the car turns, so their first-order effects are fitted with it:
+    a shift of the camera, and a polynomial of the azimuth about its mean for orientation, focal length and distortion.
     """
+    unit = np.exp(1j * azimuths)
+    powers = np.vander(np.angle(unit * np.conj(unit.sum())), 4)
 
     def residual(offset: float) -> tuple[Array, Array]:
         x, y, heading = path.over(times + offset, times + offset, level=True).T
         away = targets - np.column_stack([x, y])
         ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
-        return np.angle(ahead * np.exp(-1j * azimuths)), np.ones((len(times), 1))
+        shift = unit / np.abs(ahead)
+        return np.angle(ahead * np.conj(unit)), np.column_stack([powers, shift.real, shift.imag])
 
-    return lead_by(residual, times, ABSURD, FLOOR, lasting=LASTING)
+    return lead_by(residual, times, ABSURD, FLOOR)
 
 
 def turn_of(times: Array, azimuths: Array, places: Array) -> Signal | None:

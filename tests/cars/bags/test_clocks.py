@@ -192,6 +192,21 @@ def test_a_topic_with_another_clock_and_wrong_stamps_cost_nothing(
     assert ("stamps were moved" in notes) == bool(topic) and ('{ "truth" = -0.1' in notes) == (topic == TRUTH)
 
 
+@pytest.mark.parametrize("offset", [0.0, -0.13])
+@pytest.mark.parametrize(
+    ("key", "wrong"), [("distortion", [0.0] * 5), ("position", [0.39, 0.03, 0.2233]), ("focal_length", [220.0, 220.0])]
+)
+def test_a_wrong_camera_is_no_offset(
+    key: str, wrong: list[float], offset: float, clean: list[bags.Message], tmp_path: Path
+) -> None:
+    (tmp_path / "topics.toml").write_text(bags.MAP, encoding="utf-8")
+    path = bags.write(tmp_path / "bag", bags.later(clean, stamps=offset, topics=BLOCKS), "mcap")
+    with warnings.catch_warnings(action="ignore"):
+        bag = Bag([path], tmp_path / "topics.toml", {f"camera.{key}": wrong})
+    assert {row.topic: row.lead for row in bag.log.rows}[BLOCKS] == pytest.approx(-offset, abs=0.003)
+    assert ("moved" in "".join(bag.log.notes)) == bool(offset)
+
+
 @pytest.mark.parametrize("jump", [0.4, -2.5])
 def test_a_clock_that_jumps_costs_nothing(
     jump: float, clean: list[bags.Message], reference: float, tmp_path: Path
