@@ -3,6 +3,7 @@
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -19,6 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
 
+from coopenv.base.columns import picture_html
 from coopenv.base.errors import CoopenvError, check_one_of
 from coopenv.base.files import replacing_file
 from coopenv.estimation.observability import Trajectory
@@ -34,8 +36,7 @@ AXES_COLOURS = (VERMILION, GREEN, BLUE)  # x, y, z and roll, pitch, yaw
 VEHICLE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK, GREY)
 
 DPI = 130
-LINE = 1.2  # pt
-SMALL, NORMAL = 7.5, 9.0  # pt
+LINE, SMALL, NORMAL = 1.2, 7.5, 9.0  # pt
 HALO = (withStroke(linewidth=2.0, foreground="white"),)  # of words that stand on lines
 MAX_POINTS = 1500  # of a line: more than the pixels it crosses
 MERGED_GAP = 0.2  # s, longest gap in a shade that is not drawn: a frame or two without a detection
@@ -49,16 +50,15 @@ LETTER = 0.062  # inches, a letter of small print
 LINE_HEIGHT = 0.17  # inches, of a legend or a note
 NARROW = 5.0  # inches: narrower figures are for one column of a journal
 _LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
-_LEAST_DECADES = 1.05  # on a logarithmic axis
-_LEAST_LABELS = 2  # decades that have one there
+_LEAST_DECADES, _LEAST_LABELS = 1.05, 2  # on a logarithmic axis
 _LARGEST = 1e100  # of a value that is drawn
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure (inches) with its own Agg canvas, unknown to pyplot."""
-    figure = Figure(figsize=(width, height), dpi=DPI)
-    FigureCanvasAgg(figure)
-    return figure
+    """Return an empty figure (inches) with its own Agg canvas, unknown to pyplot; notebooks show it all the same."""
+    figure: Any = FigureCanvasAgg(Figure(figsize=(width, height), dpi=DPI)).figure
+    figure._repr_html_ = partial(picture_html, figure)
+    return figure  # type: ignore[no-any-return]
 
 
 def save(figure: Figure, path: Path, file_format: str = "", about: Mapping[str, object] | None = None) -> Path:

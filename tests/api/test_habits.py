@@ -94,6 +94,11 @@ def test_infos_have_the_entries_that_their_type_names() -> None:
         assert info["estimate"].keys() == get_type_hints(hints["estimate"]).keys()
 
 
+def test_figures_show_in_notebooks_that_have_not_loaded_pyplot(scenario: Scenario) -> None:
+    figure: Any = coopenv.run(scenario, seed=4).figure()
+    assert "data:image/png;base64," in figure._repr_html_()
+
+
 def test_types_of_numpy_are_precisions() -> None:
     assert coopenv.parallel_env(ENV, dtype=np.float64).engine.world.precision.name == "float64"  # type: ignore[arg-type]
     with pytest.raises(coopenv.DeviceError, match=r"^unknown dtype 'float16' \(did you mean 'float\d\d'\?\)"):
