@@ -47,6 +47,7 @@ class Section(BaseModel):
         return reduce(_entry, str(key).split("."), self)
 
     if not TYPE_CHECKING:  # which knows the attributes
+        __or__ = __ror__ = __setattr__
 
         def __getattr__(self, name: str) -> Any:
             """Raise an error that lists the keys."""

@@ -183,6 +183,14 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a folder": (lambda: coopenv.load_scenario("."), r"a folder; expected .*; coopenv view opens that of a run$"),
     "a deleted one": (lambda: coopenv.load_scenario(ENV).__delattr__("horizon"), r"^Scenario\.horizon: is frozen; "),
     "a deleted key": (lambda: coopenv.load_scenario(ENV).__delitem__("horizon"), r"^Scenario\.horizon: is frozen; "),
+    "a changed section": (
+        lambda: coopenv.load_scenario(ENV).noise | {"enabled": False},  # type: ignore[operator]
+        r"^Noise\..* is frozen; scenario \| ",
+    ),
+    "the wrong way round": (
+        lambda: {"horizon": 3.0} | coopenv.load_scenario(ENV),  # type: ignore[operator]
+        r"^Scenario\..* is frozen; scenario \| ",
+    ),
     "a constructor": (lambda: Scenario(title="Mine"), r"^Scenario: horizon: Field required"),  # type: ignore[call-arg]
     "a replaced entry": (lambda: coopenv.load_scenario(ENV).__replace__(horizon=-3.0), "greater than 0"),
     "a file of another kind": (lambda: coopenv.run("x.zip"), r"^no such scenario file: x\.zip; expected a scenario "),
