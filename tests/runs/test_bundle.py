@@ -137,7 +137,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
 
     (folder / "cut.zip").write_bytes(whole.read_bytes()[:2000])
     assert "cut.zip: not a readable run" in refused("run", "cut.zip")
-    assert "unknown environment 'none.zip'" in refused("run", "none.zip")
+    assert "no such scenario file: none.zip; expected a scenario" in refused("run", "none.zip")
     assert "record.zip: not a readable run" in refused("bundle", ".")
     cases: list[tuple[Callable[[dict[str, bytes]], None], bool, str]] = [
         (lambda parts: arrays(parts, actions=np.zeros((4, 1, 2))), False, "arrays.npz: not the part that was written"),
