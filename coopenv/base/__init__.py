@@ -1,10 +1,10 @@
 """Errors, files, numbers and seeds that all other packages use, and names that are loaded at their first use."""
 
 import ast
-import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +24,23 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
     def get(name: str) -> Any:
         if name not in module_of:
-            near = suggest(name, module.__all__) or f"; known: {listed(module.__all__, 40)}"
-            there = "" if name.startswith("_") else below(name) or near
-            raise AttributeError(f"module '{package}' has no attribute '{name}'{there}")
+            raise AttributeError(f"module '{package}' has no attribute '{name}'{hint(name)}")
         value = getattr(import_module(str(module_of[name])), name)
         setattr(module, name, value)
         return value
 
-    def below(name: str) -> str:
-        """Return in which package below this one a public name is, or that it is a command."""
+    def hint(name: str) -> str:
+        """Return where an unknown public name is: in a package below this one, in the shell, or one that is near."""
+        if name.startswith("_"):
+            return ""
         for file in Path(str(module.__file__)).parent.glob("*/__init__.py"):
-            text = file.read_text(encoding="utf-8")
-            if re.search(rf'^__all__ = \[[^\]]*"{name}"', text, re.MULTILINE):
+            lists = [n for n in ast.parse(file.read_text(encoding="utf-8")).body if isinstance(n, ast.Assign)]
+            if any(ast.unparse(n.targets[0]) == "__all__" and name in ast.literal_eval(n.value) for n in lists):
                 return f" (from {package}.{file.parent.name} import {name})"
-            if re.search(rf"^(from {package}\.cli\.\w+ import .*\b|def ){name}\b", text, re.MULTILINE):
-                return f" (in the shell: {package} {name})"
-        return ""
+        commands = import_module(cli).app if find_spec(cli := f"{package}.cli") else None
+        if commands and name in import_module("typer.main").get_group(commands).commands:
+            return f" (in the shell: {package} {name})"
+        return suggest(name, module.__all__) or f"; known: {listed(module.__all__, 40)}"
 
     def public_names() -> list[str]:
         return sorted(module.__all__)

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from polars import DataFrame as PolarsFrame
     from xarray import Dataset
 
-
 INSTALL = install_command("tables")
 UNITS = {
     "gramian_min_eigenvalue": "mixed",

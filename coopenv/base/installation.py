@@ -24,7 +24,7 @@ from coopenv.base.errors import CoopenvError, UnknownEnvironmentError, error_tex
 SCENES = ("lane", "roots", "tree", "random", "ring", "road", "crossroad")
 """Kinds of parametric scenes, `lane:20`; see `coopenv.scenario.scenes`."""
 
-EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"
+EXPECTED = "expected a scenario (.toml), run (.zip), log (.mcap) or ROS bag (.bag, .db3, a folder with metadata.yaml)"
 BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
 
 

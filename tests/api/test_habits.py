@@ -255,6 +255,7 @@ ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
     "make": (lambda: coopenv.make, r"^module 'coopenv' has no attribute 'make' \(did you mean 'parallel_env'\?\)$"),
     "below": (lambda: coopenv.rollout, r"no attribute 'rollout' \(from coopenv\.runs import rollout\)$"),
     "a command": (lambda: coopenv.train, r"no attribute 'train' \(in the shell: coopenv train\)$"),
+    "no command": (lambda: coopenv.main, r"no attribute 'main'; known: EVALUATION_SEEDS, "),
     "nothing near": (lambda: coopenv.cuda, r"'cuda'; known: EVALUATION_SEEDS, .*, run$"),
     "seed": (
         lambda: coopenv.parallel_env(ENV).seed(3),

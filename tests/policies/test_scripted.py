@@ -53,7 +53,7 @@ def test_only_the_others_are_agents_and_a_state_holds_the_drivers() -> None:
 
 
 def test_rows_with_a_driver_are_not_learned_from() -> None:
-    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
     from coopenv.api.trainers.sb3 import make_sb3_vec_env
 
     env = make_sb3_vec_env("scout_platoon", num_worlds=2, overrides={**FOLLOWERS, **SHORT}, seed=0)

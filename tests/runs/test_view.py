@@ -215,7 +215,7 @@ def test_addresses_and_localhost_are_served_behind_any_port(hosts: list[str], st
 
 
 def test_what_viser_starts_unguarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    viser = pytest.importorskip("viser")
+    viser = pytest.importorskip("viser", reason="needs the extra 'view'")
 
     monkeypatch.setattr(viser, "ViserServer", lambda **unused: SimpleNamespace(stop=lambda: None))
     with pytest.raises(CoopenvError, match="would serve without checks"), guarded_server("127.0.0.1"):
