@@ -48,7 +48,7 @@ def plan(device: str, sizes: tuple[int, ...] = SIZES, quick: bool = False) -> li
         stages.append(
             Stage(f"compile, {observer}, float64", "compile_kernels", compiling, {**world, "dtype": "float64"})
         )
-        stages.append(Stage(f"agreement, {observer}", "agreement", 60.0, {**world, **alike}))
+        stages.append(Stage(f"agreement, {observer}", "agreement", 120.0, {**world, **alike}))
     return [*stages, Stage("training", "training", 90.0, _training(device, quick)), _tests(device, quick)]
 
 

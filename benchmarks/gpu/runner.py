@@ -19,6 +19,8 @@ from coopenv.base.format import json_text
 
 LEAST = 5.0
 """s that have to be left for a stage to begin."""
+LOG_LINES = 60
+"""The last lines of a stage that failed which are kept: a second try on a rented machine is dear."""
 
 
 def run(
@@ -76,7 +78,8 @@ def run_stage(stage: Stage, limit: float) -> dict[str, Any]:
     results = [line.removeprefix(MARK) for line in said.splitlines() if line.startswith(MARK)]
     if process.returncode != 0 or not results:
         lines = (complained.strip() or said.strip() or "no output").splitlines()
-        return {"problem": f"{lines[-1][:300]} (exit status {process.returncode})"}
+        log = "\n".join(f"{said}\n{complained}".splitlines()[-LOG_LINES:])
+        return {"problem": f"{lines[-1][:300]} (exit status {process.returncode})", "log": log}
     result = json.loads(results[-1], parse_constant=lambda word: None)
     return result if "skipped" in result else {"result": result}
 
