@@ -18,12 +18,12 @@ def section(document: dict[str, Any]) -> str:
     rows = document["stages"]
     results = {row["name"]: row["result"] for row in rows if "result" in row}
     parts = [_machine(document, results.get("machine")), _throughput(results)]
-    parts += [_agreement(name, result) for name, result in results.items() if name.startswith("agreement")]
-    if "training" in results:
-        parts.append(_training(results["training"]))
+    lines = [_agreement(name, result) for name, result in results.items() if name.startswith("agreement")]
     if "tests" in results:
-        tests = results["tests"]
-        parts.append(f"CUDA tests: {tests['passed']} passed, {tests['failed']} failed.")
+        lines.append("CUDA tests: {passed} passed, {failed} failed.".format(**results["tests"]))
+    if "training" in results:
+        lines.append(_training(results["training"]))
+    parts.append(" ".join(lines))
     left = [f"{row['name']} ({row.get('problem') or row['skipped']})" for row in rows if "result" not in row]
     parts += [f"Left out: {'; '.join(left)}."] if left else []
     return "\n\n".join(part for part in parts if part)
@@ -37,7 +37,7 @@ def _machine(document: dict[str, Any], found: dict[str, Any] | None) -> str:
     return (
         f"`{document['command']}` on one {device['name']} ({device['memory_bytes'] / 2**30:.0f} GiB), "
         f"{place['cores_available']} cores of {place['processor']}; coopenv {document['coopenv']}, {versions}. Rates "
-        "are medians over rounds of a second; in brackets the slowest and the fastest round."
+        "are medians; *rounds*: the slowest and the fastest round over it."
     )
 
 
@@ -46,15 +46,11 @@ def _throughput(results: dict[str, dict[str, Any]]) -> str:
     for name, found in results.items():
         if not name.startswith("throughput"):
             continue
-        low, high = (found["env_steps_per_s"] * found[key] for key in ("slowest_round", "fastest_round"))
-        rates = (_rate(found["env_steps_per_s"]), f"[{_rate(low)}, {_rate(high)}]")
-        ticks = _rate(found["vehicle_ticks_per_s"])
+        rates = [_rate(found[key]) for key in ("env_steps_per_s", "agent_steps_per_s", "vehicle_ticks_per_s")]
+        rounds = "{slowest_round:.2f}-{fastest_round:.2f}".format(**found)
         memory = f"{found['bytes_per_world'] / 1024:.1f}"
-        observer = name.split(", ")[1]
-        rows.append(
-            (observer, f"{found['worlds']:,}", " ".join(rates), _rate(found["agent_steps_per_s"]), ticks, memory)
-        )
-    columns = ("observer", "worlds", "env steps/s", "agent steps/s", "vehicle ticks/s", "arrays, KiB/world")
+        rows.append((name.split(", ")[1], f"{found['worlds']:,}", *rates, rounds, memory))
+    columns = ("observer", "worlds", "steps/s", "agent steps/s", "vehicle ticks/s", "rounds", "KiB/world")
     return table(columns, rows) if rows else ""
 
 

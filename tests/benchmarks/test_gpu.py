@@ -102,7 +102,7 @@ def test_the_table_stands_between_the_marks(tmp_path: Path) -> None:
     put(document, page)
     text = page.read_text()
     assert text.startswith(f"before\n{BEGIN}\n") and text.endswith(f"{END}\nafter\n") and "old" not in text
-    assert "| riccati | 4,096 | 2 M [1 M, 3 M] | 10 M | 60 M | 2.0 |" in text
+    assert "| riccati | 4,096 | 2 M | 10 M | 60 M | 0.50-1.50 | 2.0 |" in text
     assert "64 of 64 worlds alike" in text and "4 passed, 0 failed" in text and "99.0 GiB" in text
     put(document, page)
     assert page.read_text() == text
