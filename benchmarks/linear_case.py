@@ -1,8 +1,8 @@
 """`python -m benchmarks.linear_case`: exact error covariances of the observer `robust` in linear scalar examples.
 
 Every error is a vector of coefficients over independent sources of variance 1, so that true covariances are exact.
-The receiver states its covariance by the observer's rules: considered senders, regression, increments. The tuned
-inflations are left out. The second table has the mean of the monitors' statistic without a fault.
+The receiver states its covariance by the observer's rules: considered senders, regression, increments. Tuned
+shares are left out. The second table has the mean of the monitors' statistic without a fault.
 """
 
 import argparse

@@ -93,7 +93,6 @@ def parts() -> dict[str, list[tuple[Any, str, Any]]]:
             (constants, "LINEARISATION_TIME", 0.0),
             (constants, "CONSIDERED_LINEARISATION_TIME", 0.0),
         ],
-        "inflation of senders": [(constants, "LEAST_SHARE", 0.0)],
     }
 
 

@@ -74,9 +74,6 @@ RESET_GROWTH = 0.5  # growth of a sender's variance, as a share of it, that coun
 LEAST_NEWS = 0.1
 """Share of a sender's variance that counts as noise of its increment: linearisation errors of small corrections add up.
 Tuned."""
-LEAST_SHARE = 0.003
-"""Share of a sender's variance: least one that known correlations leave, inflation of a sender that depends on others,
-because messages hold only some of the correlations, and what a monitor adds to an increment. Tuned."""
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
 
 # Search

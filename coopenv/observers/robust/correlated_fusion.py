@@ -150,7 +150,6 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.scratch[world, i, n].column = after - memory.scratch[world, i, n].row
     before = mat66d(memory.P[world, i, n, n])
     N = before - after - memory.scratch[world, i, n].column
-    unknown = unknown + wp.float64(constants.LEAST_SHARE) * block3(before, 3, 3)
     monitor_increment(memory, world, i, n, d, block3(N, 3, 3), unknown)
     N = N + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
     memory.known[world, i, 0].covariance = N

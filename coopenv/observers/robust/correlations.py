@@ -293,27 +293,19 @@ def stated_covariance(model: Any, memory: Any, world: int, i: int, n: int):
     return mat66d(memory.member[world, i, n].report.P) + by_clocks(model, memory, world, i, n)
 
 
-@subroutine
-def leaves_enough(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether the residual in `scratch.column` of n is above a share of the stated covariance."""
-    share = wp.float64(constants.LEAST_SHARE)
-    return is_positive(memory.scratch[world, i, n].column - share * stated_covariance(model, memory, world, i, n))
-
-
 @wp.func
 def excess(left: Any, after: Any):
-    """Return the least inflation of a covariance `after` that keeps the residual `left` above a share of it.
+    """Return the least inflation of a covariance `after` that makes the residual `left` positive semidefinite.
 
-    All are 6x6, of left errors, rad and m. Only the directions that violate the bound are inflated.
+    All are 6x6, of left errors, rad and m. Only the directions in which it is negative are inflated.
     """
     more = mat66d()
-    share = wp.float64(constants.LEAST_SHARE)
-    if not is_positive(left - share * after):
+    if not is_positive(left):
         X = algebra.inverse_factor(after)
         values, axes = eigen_symmetric6(symmetric_part(X * left * wp.transpose(X)))
         B = factor(after) * axes
         for k in range(6):
-            values[k, k] = wp.max(share - values[k, k], wp.float64(0.0))
+            values[k, k] = wp.max(-values[k, k], wp.float64(0.0))
         more = B * wp.diag(wp.get_diag(values)) * wp.transpose(B)
     return more
 
@@ -327,15 +319,12 @@ def set_own_row(model: Any, memory: Any, world: int, i: int, n: int, larger: Any
 
 @device_function
 def dependence_inflation(memory: Any, world: int, i: int, n: int):
-    """Return the share by which member n's covariance is inflated for its dependence on other vehicles.
+    """Return the share by which member n's covariance is inflated for its dependence on this vehicle.
 
     Senders that depend on this vehicle may return its own information; together they count as one.
     """
-    depends_on = memory.member[world, i, n].report.depends_on
-    if depends_on == wp.uint64(0):
-        return wp.float64(0.0)
     if not depends_on_own(memory, world, i, n):
-        return wp.float64(constants.LEAST_SHARE)
+        return wp.float64(0.0)
     return wp.float64(dependents(memory, world, i))
 
 
@@ -401,7 +390,7 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool)
     sure = note_correlations(model, memory, world, i, n, received, first, True)
     count = note_correlations(model, memory, world, i, n, received, sure, False)
     solve_for(model, memory, world, i, n, count)
-    if sure > 0 and sure < count and not leaves_enough(model, memory, world, i, n):
+    if sure > 0 and sure < count and not is_positive(memory.scratch[world, i, n].column):
         count = sure
         solve_for(model, memory, world, i, n, count)
     if count > first:

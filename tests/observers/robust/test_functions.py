@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.robust.algebra import forward, inverse6, is_regular, left_error, log_so3
-from coopenv.observers.robust.constants import LEAST_SHARE
 from coopenv.observers.robust.correlations import excess
 from coopenv.observers.robust.memory import Pose as PoseRecord
 from tests.helpers.robust_ticks import (
@@ -120,14 +119,14 @@ def test_regularity_is_that_of_the_spectrum() -> None:
     assert 0 < regular.sum() < 200 and clear.sum() > 190
 
 
-def test_a_sender_is_vaguer_where_what_is_told_of_it_contradicts_what_is_believed() -> None:
-    """A share is left over in all directions in which both are diagonal, and no more is added."""
+def test_a_sender_is_inflated_where_correlations_contradict_its_covariance() -> None:
+    """The residual becomes semidefinite, and no more is added."""
     rng = np.random.default_rng(0)
     A = rng.normal(size=(100, 6, 6)) * np.repeat([0.01, 0.3], 3)[:, None]  # of poses: rad and m
     after = A @ np.swapaxes(A, 1, 2) + 1e-8 * np.eye(6)
     values = rng.uniform(-1.0, 1.0, (100, 6))
     values[20:, 0] = -np.abs(values[20:, 0])
-    values[:20] = rng.uniform(2.0 * LEAST_SHARE, 1.0, (20, 6))  # nothing contradicts
+    values[:20] = rng.uniform(0.01, 1.0, (20, 6))  # nothing contradicts
     B = np.linalg.cholesky(after) @ np.linalg.qr(rng.normal(size=(100, 6, 6)))[0]
     left = (B * values[:, None]) @ np.swapaxes(B, 1, 2)
     added = call(excess, left, after)
@@ -136,7 +135,7 @@ def test_a_sender_is_vaguer_where_what_is_told_of_it_contradicts_what_is_believe
     for one, reported, more in zip(left, after, added, strict=True):
         before, axes = eigh(one, reported)
         now = axes.T @ (one + more) @ axes
-        assert_allclose(now, np.diag(np.maximum(before, LEAST_SHARE)), atol=1e-9)
+        assert_allclose(now, np.diag(np.maximum(before, 0.0)), atol=1e-9)
 
 
 AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
