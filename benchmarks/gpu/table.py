@@ -24,8 +24,8 @@ def section(document: dict[str, Any]) -> str:
     if "training" in results:
         lines.append(_training(results["training"]))
     parts.append(" ".join(lines))
-    left = [f"{row['name']} ({row.get('problem') or row['skipped']})" for row in rows if "result" not in row]
-    parts += [f"Left out: {'; '.join(left)}."] if left else []
+    left = [f"{row['name']}: {row.get('problem') or row['skipped']}" for row in rows if "result" not in row]
+    parts += [f"{'; '.join(left)}."] if left else []
     return "\n\n".join(part for part in parts if part)
 
 
@@ -36,22 +36,22 @@ def _machine(document: dict[str, Any], found: dict[str, Any] | None) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
     return (
         f"`{document['command']}` on one {device['name']} ({device['memory_bytes'] / 2**30:.0f} GiB), "
-        f"{place['cores_available']} cores of {place['processor']}; coopenv {document['coopenv']}, {versions}. Rates "
-        "are medians; *rounds*: the slowest and the fastest round over it."
+        f"{place['cores_available']} cores of {place['processor']}; coopenv {document['coopenv']}, {versions}. Medians "
+        "over rounds of a second."
     )
 
 
 def _throughput(results: dict[str, dict[str, Any]]) -> str:
-    rows = []
-    for name, found in results.items():
-        if not name.startswith("throughput"):
-            continue
-        rates = [_rate(found[key]) for key in ("env_steps_per_s", "agent_steps_per_s", "vehicle_ticks_per_s")]
-        rounds = "{slowest_round:.2f}-{fastest_round:.2f}".format(**found)
-        memory = f"{found['bytes_per_world'] / 1024:.1f}"
-        rows.append((name.split(", ")[1], f"{found['worlds']:,}", *rates, rounds, memory))
-    columns = ("observer", "worlds", "steps/s", "agent steps/s", "vehicle ticks/s", "rounds", "KiB/world")
-    return table(columns, rows) if rows else ""
+    """Return vehicle ticks/s: a row per observer and environment, a column per number of worlds."""
+    found = {name: result for name, result in results.items() if name.startswith("throughput")}
+    sizes = sorted({result["worlds"] for result in found.values()})
+    rows: dict[str, list[str]] = {}
+    for name, result in found.items():
+        case, memory = name.split(", ")[1], f"{result['bytes_per_world'] / 1024:.0f}"
+        row = rows.setdefault(case, [case, memory, *[""] * len(sizes)])
+        row[2 + sizes.index(result["worlds"])] = _rate(result["vehicle_ticks_per_s"])
+    columns = ("vehicle ticks/s", "KiB/world", *(f"{size:,} worlds" for size in sizes))
+    return table(columns, list(rows.values())) if rows else ""
 
 
 def _rate(value: float) -> str:
@@ -63,10 +63,11 @@ def _rate(value: float) -> str:
 
 def _agreement(name: str, found: dict[str, Any]) -> str:
     observer, largest = name.split(", ")[1], found["largest_difference"]
-    difference = "none that is finite" if largest is None else f"{largest:.1e}"  # JSON has no infinity
+    difference = "not finite" if largest is None else f"{largest:.1e}"  # JSON has no infinity
+    where = f" ({found['in']})" if found["worlds_alike"] < found["worlds"] else ""
     return (
-        f"CPU and device, float64, `{observer}`: {found['worlds_alike']} of {found['worlds']} worlds alike; largest "
-        f"difference {difference} ({found['in'] or 'nowhere'})."
+        f"`{observer}` on CPU and device, float64: {found['worlds_alike']} of {found['worlds']} worlds alike, "
+        f"difference at most {difference}{where}."
     )
 
 
@@ -75,8 +76,7 @@ def _training(found: dict[str, Any]) -> str:
     return (
         f"Training (`examples/train_ppo.py`, {found['env']}, {found['num_worlds']:,} worlds, one seed): "
         f"{found['vehicle_steps'] / 1e6:.1f} M vehicle steps at {_rate(found['steps_per_s'])} a second; return "
-        f"{first['return']:.1f} at the first report, {last['return']:.1f} at the last, where "
-        f"{100 * last['arrived']:.0f} % arrive."
+        f"{first['return']:.1f} to {last['return']:.1f}, {100 * last['arrived']:.0f} % arrive."
     )
 
 

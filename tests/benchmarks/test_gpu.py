@@ -102,7 +102,7 @@ def test_the_table_stands_between_the_marks(tmp_path: Path) -> None:
     put(document, page)
     text = page.read_text()
     assert text.startswith(f"before\n{BEGIN}\n") and text.endswith(f"{END}\nafter\n") and "old" not in text
-    assert "| riccati | 4,096 | 2 M | 10 M | 60 M | 0.50-1.50 | 2.0 |" in text
+    assert "| riccati | 2 | 60 M |" in text
     assert "64 of 64 worlds alike" in text and "4 passed, 0 failed" in text and "99.0 GiB" in text
     put(document, page)
     assert page.read_text() == text
@@ -120,7 +120,7 @@ def test_bad_worlds_and_failed_tests_are_failures() -> None:
     document = document_of_a_gpu()
     assert not failures(document)
     document["stages"][2]["result"] |= {"worlds_alike": 63, "largest_difference": None}
-    assert "63 of 64 worlds alike; largest difference none that is finite" in section(document)
+    assert "63 of 64 worlds alike, difference at most not finite" in section(document)
     document["stages"][3]["result"]["passed"] = 0
     assert failures(document) == ["agreement, riccati", "tests"]
 
@@ -153,7 +153,7 @@ def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert results["agreement, robust"]["worlds_alike"] == results["agreement, robust"]["worlds"]
     assert results["throughput, riccati, 64"]["env_steps_per_s"] > 0.0
     assert results["tests"]["failed"] == 0 < results["tests"]["passed"]
-    assert "| riccati | 64 |" in capsys.readouterr().out
+    assert "| vehicle ticks/s | KiB/world | 64 worlds |" in capsys.readouterr().out
 
 
 def test_rounds_alternate() -> None:
