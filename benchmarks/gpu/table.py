@@ -84,8 +84,10 @@ def put(document: dict[str, Any], page: Path) -> None:
     """Put the section of a run into a page.
 
     Raises:
-        CoopenvError: the page has no place for it, or the run was on a CPU.
+        CoopenvError: the document is none of `make gpu`, the page has no place for it, or the run was on a CPU.
     """
+    if not isinstance(document, dict) or not {"command", "coopenv", "device", "stages"} <= document.keys():
+        raise CoopenvError("--table: takes a JSON file that make gpu has written")
     if document["device"] == "cpu":
         raise CoopenvError("these figures are of a CPU; the page has room for those of a GPU")
     text = page.read_text(encoding="utf-8")

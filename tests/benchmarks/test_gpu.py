@@ -106,6 +106,8 @@ def test_the_table_stands_between_the_marks(tmp_path: Path) -> None:
     assert "64 of 64 worlds alike" in text and "4 passed, 0 failed" in text and "99.0 GiB" in text
     put(document, page)
     assert page.read_text() == text
+    with pytest.raises(CoopenvError, match="make gpu has written"):
+        put({"stages": 1}, page)
     with pytest.raises(CoopenvError, match="of a CPU"):
         put({**document, "device": "cpu"}, page)
     page.write_text(PAGE.read_text(encoding="utf-8"))  # has a place for it
