@@ -53,6 +53,8 @@ NEEDS = ("ptx_bytes", "registers", "stack", "spills")
 """What has limits. Seconds have none, as they depend on the machine; the size of the PTX stands for them."""
 ROOM, REGISTERS = 1.25, 16
 """What limits leave beside what `--accept` measures: a factor, and registers; architectures differ by as much."""
+STACK = 2048
+"""B of stack per thread; a limit reaches it only where the need does."""
 BEGIN, END = "<!-- make cuda-check: begin -->", "<!-- make cuda-check: end -->"
 ENTRY = re.compile(r"Compiling entry function '(\w+)'.*?(?=Compiling entry function|\Z)", re.DOTALL)
 Rows = list[dict[str, Any]]
@@ -192,6 +194,8 @@ def accept(rows: Rows) -> None:
         most = {need: max(row[need] for row in rows if row["module"] == name) for need in NEEDS}
         room = {need: round(ROOM * most[need]) for need in NEEDS}
         room["registers"] = min(255, most["registers"] + REGISTERS)
+        if most["stack"] < STACK:
+            room["stack"] = min(room["stack"], STACK - 1)
         lines.append(",".join((name, *(str(room[need]) for need in NEEDS))))
     replace_text(LIMITS, "\n".join(lines) + "\n")
 

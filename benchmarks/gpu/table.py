@@ -67,7 +67,7 @@ def _agreement(name: str, found: dict[str, Any]) -> str:
     where = f" ({found['in']})" if found["worlds_alike"] < found["worlds"] else ""
     return (
         f"`{observer}` on CPU and device, float64: {found['worlds_alike']} of {found['worlds']} worlds alike, "
-        f"difference at most {difference}{where}."
+        f"largest difference {difference}{where}."
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 
-from benchmarks.cuda_check import PRECISIONS, ROOM, assembler, beyond, catalogue, check_module, limits, main, parsed
+from benchmarks.cuda_check import PRECISIONS, STACK, assembler, beyond, catalogue, check_module, limits, main, parsed
 from coopenv.base.errors import CoopenvError
 from coopenv.observers.registry import ZOO
 
@@ -42,7 +42,7 @@ def test_parts_of_robust_stay_small() -> None:
     """Bytes of PTX stand for the time to compile: 1.2 MB take 20 s."""
     parts = [needs for name, needs in limits().items() if name.startswith("robust")]
     assert len(parts) == 6 * len(PRECISIONS)
-    assert max(needs["stack"] for needs in parts) < ROOM * 2048  # B that a thread needs
+    assert max(needs["stack"] for needs in parts) < STACK
     assert max(needs["ptx_bytes"] for needs in parts) < 2_000_000
 
 
