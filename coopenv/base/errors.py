@@ -157,6 +157,7 @@ def check_one_of(what: str, name: object, valid: Iterable[object], error: type[V
 
 
 ELSEWHERE = {
+    "asdict": "model_dump",
     "config": "overrides",
     "env": "parallel_env",
     "make": "parallel_env",
@@ -165,6 +166,8 @@ ELSEWHERE = {
     "save": "to_csv",
     "seed": "reset",
     "set": "overrides",
+    "to_dict": "model_dump",
+    "to_json": "model_dump_json",
     "n_envs": "num_worlds",
 }
 """Words of other libraries and of the shell, and those for the same here."""

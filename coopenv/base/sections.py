@@ -55,7 +55,8 @@ class Section(BaseModel):
                 return super().__getattr__(name)
             except AttributeError:
                 keys = [] if name.startswith("_") else [*type(self).model_fields]
-                known = f"{suggest(name, keys)}; keys: {listed(keys, 40)}; {CHANGE}, model_dump() data" if keys else ""
+                near = suggest(name, [*keys, "model_dump", "model_dump_json"])
+                known = f"{near}; keys: {listed(keys, 40)}; {CHANGE}, model_dump() data" if keys else ""
                 raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}") from None
 
     @classmethod

@@ -12,7 +12,7 @@ from typing import Any
 from coopenv.base.errors import ScenarioError, explained, shown
 from coopenv.base.format import plain
 from coopenv.base.installation import is_scene, scenario_path
-from coopenv.base.sections import TOO_DEEP, read_toml, validated
+from coopenv.base.sections import TOO_DEEP, Section, read_toml, validated
 from coopenv.scenario.bodies import with_groups
 from coopenv.scenario.cosimulators import with_sumo
 from coopenv.scenario.own_terms import located
@@ -60,11 +60,11 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
     if not isinstance(name_or_path, str | Path | Mapping):
         kind = type(name_or_path).__name__
         raise ScenarioError(f"environment: expected a name, a path, a dict of its keys or a Scenario, got {kind}")
-    made, path = is_scene(str(name_or_path)), Path("scenario")
+    path = Path("scenario")
     try:
         if isinstance(name_or_path, Mapping):
-            raw = located(deepcopy(dict(name_or_path)), Path.cwd())
-        elif made:
+            raw = located({key: _data(value) for key, value in name_or_path.items()}, Path.cwd())
+        elif is_scene(str(name_or_path)):
             path = Path(str(name_or_path))
             raw = tomllib.loads(scene_text(str(name_or_path)))
         else:
@@ -91,6 +91,13 @@ def load_scenario(name_or_path: ScenarioLike, overrides: Mapping[str, Any] | Non
 
 Scenario.__or__ = load_scenario  # type: ignore[assignment,method-assign]
 Scenario.__replace__ = lambda self, **changes: load_scenario(self, changes)
+
+
+def _data(value: Any) -> Any:
+    """Return a copy of an entry, sections and their lists as plain data."""
+    if isinstance(value, tuple):
+        return [_data(entry) for entry in value]
+    return value.model_dump(mode="json", exclude_unset=True) if isinstance(value, Section) else deepcopy(value)
 
 
 def scenario_name(name_or_path: ScenarioLike) -> str:

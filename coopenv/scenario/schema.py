@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, KeysView, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -90,6 +90,10 @@ class Scenario(Section, metaclass=_Loaded):
     action: Action = Action()
     reward: Reward = Reward()
     termination: Termination = Termination()
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the sections and values, for `dict(scenario)` and `{**scenario}`."""
+        return type(self).model_fields.keys()
 
     @property
     def facts(self) -> dict[str, object]:

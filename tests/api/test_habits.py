@@ -127,7 +127,10 @@ def test_a_scenario_is_read_by_dotted_keys_and_lists_them() -> None:
         scenario.to_toml()
     with pytest.raises(AttributeError, match=r"^class Scenario has no attribute 'load'; coopenv\.load_scenario reads"):
         Scenario.load("facade")
-    assert Scenario(**scenario.model_dump()) == scenario
+    with pytest.raises(AttributeError, match=r"'to_dict' \(did you mean 'model_dump'\?\); keys: "):
+        scenario.to_dict()
+    assert Scenario(**scenario.model_dump()) == Scenario(**scenario) == scenario
+    assert coopenv.load_scenario({**scenario, "horizon": 0.5}) == scenario | {"horizon": 0.5}
 
 
 def test_arguments_in_the_wrong_place_are_named() -> None:
@@ -190,6 +193,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "the wrong way round": (
         lambda: {"horizon": 3.0} | coopenv.load_scenario(ENV),  # type: ignore[operator]
         r"^Scenario\..* is frozen; scenario \| ",
+    ),
+    "a number of thousands of digits": (
+        lambda: coopenv.load_scenario({"title": 10**5000}),
+        "^scenario: Exceeds the limit",
     ),
     "a constructor": (lambda: Scenario(title="Mine"), r"^Scenario: horizon: Field required"),  # type: ignore[call-arg]
     "a replaced entry": (lambda: coopenv.load_scenario(ENV).__replace__(horizon=-3.0), "greater than 0"),
