@@ -18,11 +18,11 @@ from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 from coopenv.scenario.learning import Difficulty
-from tests.helpers.env_suite import largest_slow
+from tests.helpers.env_suite import LARGEST, largest_slow
 
 pytestmark = pytest.mark.headroom
 
-WORLDS = {"open_square": 32, "facade": 32, "behind_truck": 32, "urban_crossing": 48, "large_crossing": 6}
+WORLDS = {"open_square": 16, "facade": 16, "behind_truck": 16, "urban_crossing": 48, "large_crossing": 6}
 """How many suffice for intervals that tell the drivers apart."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""
@@ -124,7 +124,7 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
 @pytest.mark.slow
 def test_one_driver_drives_where_it_never_learnt() -> None:
     """The agent learnt in eight environments without this one."""
-    driver, lookout = (figures("open_square", agent, times=4) for agent in ("open_square_general", "peek"))
+    driver, lookout = (figures("open_square", agent, times=8) for agent in ("open_square_general", "peek"))
     assert driver["arrival_rate"][0] >= 0.95 and driver["collision_rate"][0] <= 0.03
     assert driver["e95_m"][0] <= lookout["e95_m"][0]
 
@@ -144,7 +144,7 @@ def test_learned_agents_arrive_whatever_they_sense(environment: str) -> None:
 
 @pytest.mark.slow
 def test_a_planner_knows_better_where_it_is_and_loses_little_time() -> None:
-    straight, planner = figures("open_square", "route_follower"), figures("open_square", "look_ahead")
+    straight, planner = (figures("open_square", agent, times=4) for agent in ("route_follower", "look_ahead"))
     assert planner["e95_m"][0] < 0.6 * straight["e95_m"][0] and planner["e50_m"][0] < 0.7 * straight["e50_m"][0]
     assert planner["few_targets_share"][0] < straight["few_targets_share"][0]
     assert planner["travel_time_s"][0] < 1.15 * straight["travel_time_s"][0]
@@ -153,7 +153,7 @@ def test_a_planner_knows_better_where_it_is_and_loses_little_time() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", WORLDS)
 def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
-    assert change_of_time(environment, 15).relative <= MOST_TIME
+    assert change_of_time(environment, 15 if environment in LARGEST else 30).relative <= MOST_TIME
 
 
 @pytest.mark.parametrize("environment", largest_slow(WORLDS))

@@ -214,9 +214,8 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 @cache
 def run(name: str, driver: str, times: int = 1) -> Run:
-    """Drive all vehicles in 16 worlds or `times` as many."""
-    vehicles = len(SHIPPED[name].vehicles)
-    worlds = times * (16 if vehicles <= 4 else 32 // vehicles)
+    """Drive 32 vehicles, in 16 worlds at most, or `times` as many."""
+    worlds = times * min(16, 32 // len(SHIPPED[name].vehicles))
     envs = coopenv.make_vec(name, num_worlds=worlds, autoreset="disabled")
     engine, policy = envs.engine, drivers(envs.scenario)[driver]
     term = engine.reward_terms.index("position_uncertainty")

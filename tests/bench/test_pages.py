@@ -134,7 +134,7 @@ def test_what_moves_has_a_film(tmp_path: Path) -> None:
 
 
 def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:
-    assert main(["page", "facade", "--measure", "--worlds", "2", "--out", str(tmp_path)]) == 0
+    assert main(["page", "facade", "--measure", "--worlds", "2", "--no-film", "--out", str(tmp_path)]) == 0
     value = json.loads((tmp_path / "facade.json").read_text())
     assert {(row["sensing"], row["agent"]) for row in value["rows"]} == {
         (how, who) for how in SETTINGS for who in DRIVERS

@@ -67,12 +67,16 @@ def reset(world: World, seeds: Sequence[int] | None = None, mask: np.ndarray | N
     world.mask.zero_()
 
 
-def run(world: World, ticks: int) -> list[dict[str, np.ndarray]]:
-    """Return the state at the start and after each of `ticks` ticks."""
-    states = [world.get_state()]
+def run(world: World, ticks: int, *names: str) -> list[dict[str, np.ndarray]]:
+    """Return the state at the start and after each of `ticks` ticks: the fields of some names, else everything."""
+
+    def state() -> dict[str, np.ndarray]:
+        return {name: world.view(name).copy() for name in names} if names else world.get_state()
+
+    states = [state()]
     for _ in range(ticks):
         world.advance(1)
-        states.append(world.get_state())
+        states.append(state())
     return states
 
 

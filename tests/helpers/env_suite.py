@@ -23,7 +23,7 @@ Make = Callable[..., Env]
 SHIPPED = {name: coopenv.load_scenario(name) for name in coopenv.list_envs()}
 """All environments: loaded once, however many files have a test of each."""
 
-STEPS = 25
+STEPS = 15
 CHECKS: list[Callable[[Make], None]] = []
 """All checks that hold for environments of any backend."""
 
@@ -65,19 +65,19 @@ def official_tests(make: Make) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         if any(vehicle.presence < 1.0 for vehicle in make().scenario.vehicles):
-            parallel_api_test(make(overrides={"vehicles.*.presence": 1.0}), num_cycles=20)
+            parallel_api_test(make(overrides={"vehicles.*.presence": 1.0}), num_cycles=10)
             # Who is not there does not end either.
             warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
-        parallel_api_test(make(), num_cycles=20)
-        api_test(parallel_to_aec(make()), num_cycles=40)
+        parallel_api_test(make(), num_cycles=10)
+        api_test(parallel_to_aec(make()), num_cycles=10)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # PettingZoo advises against Dict observations
-        api_test(parallel_to_aec(make(observation="dict")), num_cycles=20)
+        api_test(parallel_to_aec(make(observation="dict")), num_cycles=10)
 
 
 @check
 def seeds(make: Make) -> None:
-    seed_test(lambda: parallel_to_aec(make()), num_cycles=20)
+    seed_test(lambda: parallel_to_aec(make()), num_cycles=10)
 
 
 @check

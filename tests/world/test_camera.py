@@ -227,7 +227,7 @@ def test_noise_at_the_edge_of_the_lens_stays_at_the_edge() -> None:
 def bearings(noise: dict[str, Any], worlds: int = 200, ticks: int = 50, dtype: str = "float64", **more: Any) -> Any:
     """Return measured bearings (worlds * ticks, targets, 3) and the true ones (targets, 3)."""
     made = scenario([vehicle((0, 0, 0))], noise={"bearing": noise}, **more)
-    states = run(start(made, range(worlds), dtype), ticks - 1)
+    states = run(start(made, range(worlds), dtype), ticks - 1, "bearing")
     b = np.concatenate([s["bearing"][:, 0, :-1] for s in states]).astype(float)
     place = np.array([p.position for p in made.landmarks])
     return b, place / np.linalg.norm(place, axis=1, keepdims=True)
@@ -291,7 +291,7 @@ def test_paper_noise_in_the_plane_of_the_axis_is_finite() -> None:
 
 def test_misses_and_their_frequency() -> None:
     made = scenario([vehicle((0, 0, 0))], camera={"miss_probability": 0.3})
-    states = run(start(made, range(100)), 99)
+    states = run(start(made, range(100)), 99, "sight")
     missed = np.array([s["sight"][:, 0, :4] for s in states]) == Sight.MISSED
     assert abs(missed.mean() - 0.3) < 4 * np.sqrt(0.21 / missed.size)
     assert np.abs(missed.mean(axis=(0, 1)) - 0.3).max() < 4 * np.sqrt(0.21 / 10000)

@@ -194,7 +194,7 @@ def test_a_replay_is_an_older_message_as_if_new(delay: int, period: int) -> None
 
 def test_ages_are_wrong_by_the_difference_of_two_clocks() -> None:
     made = fleet({}, faults={"clock_offset": 0.1}, v2x={"delay": 2})
-    states = run(start(made, range(200)), 40)
+    states = run(start(made, range(200)), 40, "clock", "inbox_stamp")
     clock = states[0]["clock"]
     assert_array_equal(states[-1]["clock"], clock)
     assert np.std(clock / 60) == pytest.approx(0.1, rel=4 / np.sqrt(2 * clock.size))

@@ -47,14 +47,15 @@ def test_sample_counts_and_increments(rate: float) -> None:
     """The noise is read off the held samples of a world of the same seed whose camera is as fast as its odometry."""
     made = scenario([vehicle(motion=SEGMENTS)], rates={"odometry": rate}, noise=NOISE)
     ticks = 150
-    states = run(start(made, 5), ticks)
+    read = ("odometry_samples", "odometry_velocity", "odometry_angular_velocity")
+    states = run(start(made, 5), ticks, *read, "increment_rotation", "increment_translation")
     count = int(np.floor(ticks / 60 * rate + 1e-9)) + 1
     samples = [int(s["odometry_samples"][0, 0]) for s in states]
     assert samples == [0] + [int(np.floor(k / 60 * rate + 1e-9)) + 1 for k in range(1, ticks + 1)]
     paired = scenario(
         [vehicle(motion=SEGMENTS)], rates={"odometry": rate, "camera": rate, "decision": rate}, noise=NOISE
     )
-    fast = run(start(paired, 5), count)
+    fast = run(start(paired, 5), count, *read)
     times = np.arange(count) / rate
     # at tick m of the fast camera the last sample is sample m; sample 0 is heard before tick 1 only
     v = np.array([s["odometry_velocity"][0, 0] for s in fast])[:count]
@@ -94,7 +95,7 @@ def test_noise_free_odometry_integrates_to_the_truth() -> None:
         made = scenario(
             [vehicle((1, 2, 3), 0.4, motion=constant([0.5, 0.1, 0], [0.1, 0, 0.6]))], rates={"odometry": rate}
         )
-        states = run(start(made), 240)
+        states = run(start(made), 240, "rotation", "position", "increment_rotation", "increment_translation")
         R, p = states[0]["rotation"][0, -1], states[0]["position"][0, -1]
         for s in states[1:]:
             p = p + R @ s["increment_translation"][0, 0]
@@ -119,7 +120,7 @@ def test_driven_vehicles_are_sampled_on_the_way() -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_noise_is_gaussian_white_and_of_the_stated_size(dtype: str) -> None:
     made = scenario([vehicle(motion=constant([0.5, 0, 0]))], rates={"odometry": 60.0}, noise=NOISE)
-    states = run(start(made, range(200), dtype), 100)[1:]
+    states = run(start(made, range(200), dtype), 100, "odometry_velocity", "odometry_angular_velocity")[1:]
     for name, sigma, mean in (("odometry_velocity", 0.3, [0.5, 0, 0]), ("odometry_angular_velocity", 0.2, [0, 0, 0])):
         x = np.array([s[name][:, 0] for s in states]).astype(float) - mean
         assert_allclose(x.std(axis=(0, 1)), sigma, rtol=4 / np.sqrt(2 * 20000))
@@ -145,7 +146,8 @@ def test_density_is_kept_when_the_rate_changes(stated: float | str) -> None:
             rates={"odometry": rate},
             noise={"velocity": 0.1, "angular_velocity": 0.05, "odometry_rate": stated},
         )
-        states = run(start(made, range(600)), 121)[2:]  # two seconds, without the first sample's partial hold
+        states = run(start(made, range(600)), 121, "increment_rotation", "odometry_velocity")
+        states = states[2:]  # two seconds, without the first sample's partial hold
         drift = sum(s["increment_rotation"][:, 0, 1, 0] for s in states)
         held = rate if isinstance(stated, str) else stated
         assert_allclose(drift.std(), 0.05 * np.sqrt(2.0 / held), rtol=0.1)
@@ -216,7 +218,7 @@ def test_slips_come_and_go() -> None:
     """Per frame a slip begins with 1 - exp(-rate dt) where there is none, and ends with 1 - exp(-dt / duration)."""
     slip = {"rate": 1.0, "duration": 0.25, "size": 0.4, "angle": 0.2}
     made = scenario([vehicle(motion=TURNING)], noise={"slip": slip})
-    states = run(start(made, range(400)), 600)
+    states = run(start(made, range(400)), 600, "slip")
     slips = np.array([state["slip"][:, 0] for state in states])
     there = (slips != 0.0).any(axis=-1)
     assert not there[0].any()

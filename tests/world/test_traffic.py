@@ -81,7 +81,7 @@ def test_cars_appear_in_their_time_where_there_is_room_and_leave_where_no_route_
     made = streets(
         cars, first, second, termination={"after_arrival": "transit"}, topology={"mode": "sensed", "acyclic": False}
     )
-    states = run(start(made, range(50)), 400)
+    states = run(start(made, range(50)), 400, "present", "ended", "route_drawn", "position", "sight")
     present = np.array([state["present"][:, -2:] for state in states])
     ended, drawn = (np.array([state[name][:, 1:] for state in states]) for name in ("ended", "route_drawn"))
     position = np.array([state["position"][:, -2:] for state in states])
