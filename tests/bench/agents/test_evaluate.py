@@ -64,7 +64,7 @@ def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
 
 
 def test_a_table_of_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", *SHORT, "--agents", "own.py:still", "--stress"]) == 0
+    assert main(["evaluate", *SHORT, "--worlds", "2", "--agents", "own.py:still", "--stress"]) == 0
     out = capsys.readouterr().out
     assert "still, a third of the landmarks" in out and "still, vehicle_1 lies" in out and "…" not in out
 
