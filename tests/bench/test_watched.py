@@ -119,16 +119,15 @@ def test_what_misbehaves_is_ended_with_one_line(tmp_path: Path, monkeypatch: pyt
 def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that raises is tried in all of them."""
+    """One that raises is tried in all of them. That the rows of others stay is tested above."""
     counted = "class My{0}({0}):\n    def reset(self, *start):\n        print('{0}', file=open('log', 'a'))\n"
     counted += "        super().reset(*start)\n"
     (tmp_path / "own.py").write_text(PLUGINS + counted.format("Loops") + counted.format("Raises"))
     monkeypatch.chdir(tmp_path)
-    benchmark, names = Frozen("v1"), ["lane", "roots"]
-    observers = ["own.py:MyLoops", "own.py:MyRaises", "dead_reckoning"]
+    benchmark, names = Frozen("v1"), ["lane", "ring"]
+    observers = ["own.py:MyLoops", "own.py:MyRaises"]
     result = benchmark.run(observers, names, 1, Limits(seconds=2.0), lambda share: None)
     rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
-    assert all(rows["dead_reckoning", scene]["rmse_m"] for scene in names)
     log = (tmp_path / "log").read_text().split()
     for name, started, seeds in (("Loops", ["lane"], 1), ("Raises", names, 4)):
         assert all(rows[f"My{name}", scene]["failure"] for scene in names)
