@@ -278,6 +278,11 @@ def _detector(family: str) -> tuple[Any, int]:
     return aruco.ArucoDetector(dictionary, chosen), int(dictionary.markerSize) + 2
 
 
+CONTRAST = 0.3
+"""Threshold of edges, share of the standard deviation of a frame's shades: finds tags in dark frames, and makes fewer
+contours of the texture of bright ones."""
+
+
 def find_tags(gray: NDArray[np.uint8], family: str, camera: Calibration) -> list[Tag]:
     """Return the tags of a family in a frame.
 
@@ -286,6 +291,9 @@ def find_tags(gray: NDArray[np.uint8], family: str, camera: Calibration) -> list
     diagonals intersect: the mean of the corners is none for a tag that is seen obliquely.
     """
     detector, cells = _detector(family)
+    chosen, spread = detector.getDetectorParameters(), float(opencv().meanStdDev(gray)[1][0, 0])
+    chosen.adaptiveThreshConstant = float(np.clip(CONTRAST * spread, 2.0, 12.0))
+    detector.setDetectorParameters(chosen)
     quads, numbers, _ = detector.detectMarkers(gray)
     if numbers is None or not len(numbers):
         return []

@@ -64,6 +64,15 @@ def test_bearings_of_oblique_tags(name: str, family: str) -> None:
     assert np.degrees(max(errors)) < 0.1
 
 
+def test_tags_are_found_in_dark_frames() -> None:
+    calibration = Calibration((640, 480), (450.0, 455.0), (322.3, 236.1), LENSES["plumb_bob"])
+    renderer, rng = FrameRenderer(calibration, "tag36h11"), np.random.default_rng(2)
+    tags = [PlacedTag(n, np.eye(3), 2.0 * np.array([x, y, 1.0]), 0.16) for n, (x, y) in enumerate(PLACES)]
+    frame = renderer.render(tags, 0.5, 0.0, rng)
+    dark = np.rint(10.0 + 0.07 * frame + rng.normal(size=frame.shape)).astype(np.uint8)  # 19 shades from black to white
+    assert {tag.number for tag in find_tags(dark, "tag36h11", calibration)} == set(range(len(PLACES)))
+
+
 PLACES = ((-0.42, -0.28), (0.42, -0.28), (-0.42, 0.28), (0.42, 0.28))
 
 
