@@ -15,7 +15,7 @@ import coopenv
 from coopenv.backends.mcap import write_recording
 from coopenv.base.installation import environment_id, list_agents
 from coopenv.bench.observers.faults import FAULTS, VARIANTS
-from coopenv.cli import main
+from coopenv.cli import failure_status, main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.observability import Trajectory
 from coopenv.observers.recording import Truth
@@ -279,3 +279,10 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 )
 def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
     assert parse_value(text) == value
+
+
+def test_a_module_that_is_not_installed_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert failure_status(ModuleNotFoundError("No module named 'scipy'", name="scipy")) == 2
+    assert re.fullmatch(r"error: needs the module scipy, .*: pip install .*\n", capsys.readouterr().err)
+    with pytest.raises(ModuleNotFoundError):
+        failure_status(ModuleNotFoundError(name="coopenv.nowhere"))

@@ -231,9 +231,12 @@ class Safety(Section):
     stand inside the geofence, apart."""
     judge: Literal["truth", "estimate"] = "truth"
     """Source of the positions for geofence and separation."""
-    max_error: Positive | None = 1.0
-    """Largest distance between a car's estimated position and that of motion capture, while this is known, m. This and
-    the next two stop all cars when they have been exceeded for 0.2 s."""
+    max_error: Positive | None = 0.15
+    """Largest distance between a car's estimated position and that of motion capture, while this is known, m. A car
+    stands until its estimate has been within this and the next three limits for 0.2 s, 2 s at most. All cars are
+    stopped when one of them has then been exceeded for 0.2 s."""
+    max_turn_error: Positive | None = 0.15
+    """Largest angle between a car's estimated orientation and that of motion capture, rad."""
     max_std: Positive | None = None
     """Largest standard deviation of the estimated position, m."""
     max_nis: Positive | None = 10.0

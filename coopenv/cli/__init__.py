@@ -17,6 +17,7 @@ import typer
 
 from coopenv.base import interrupts
 from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import install_command
 from coopenv.base.installation import version as installed_version
 from coopenv.cli import options
 from coopenv.cli.bags import calibrate, identify, import_
@@ -237,6 +238,8 @@ def failure_status(error: BaseException) -> int:
     elif isinstance(error, OSError):
         message = f"{error.filename or 'standard output'}: {error.strerror or error}"
         drop_output()
+    elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("coopenv"):
+        message = f"needs the module {error.name}, as in the whole of coopenv: {install_command('svea')}"
     else:
         raise error
     if sys.stderr is not None:

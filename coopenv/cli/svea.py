@@ -436,6 +436,8 @@ def run(given: SveaRunOptions) -> None:
         try:
             result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched)
         except NoTruthError:
+            if not given.as_json:
+                links_report(backend, options.console())  # with the reason of a stop
             raise CoopenvError(truth_report(backend)) from None
     if given.as_json:
         options.print_json({**result.metrics, "files": result.files})

@@ -78,16 +78,18 @@ def links_report(backend: Svea, out: Console) -> None:
 
 def truth_report(backend: Svea) -> str:
     """Return why no tick has true poses: no car sends, or by topic of motion capture what came."""
-    names = list(backend.binding.cars)
+    names, lead = list(backend.binding.cars), "no true poses are known, so there are no errors to show: "
     if not backend.health.received:
         where = ", ".join(backend.deployment.network.connect)
         return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
+    if not backend.capabilities.truth:
+        return f"{lead}sensors.truth = false"
     topics = [backend.binding.profile.topic_of(name, Role.TRUTH) for name in names]
     came = [topic for topic in topics if isfinite(backend.station.silence(topic))]
     silent = [topic for topic in topics if topic not in came]
     parts = [f"nothing came on {listed(silent)}"] if silent else []
     parts += [f"messages on {listed(came)} came too late for the ticks"] if came else []
-    return "no true poses are known, so there are no errors to show: " + "; ".join(parts)
+    return lead + "; ".join(parts)
 
 
 Rows = list[dict[str, Any]]

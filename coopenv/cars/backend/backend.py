@@ -197,8 +197,8 @@ class Svea:
         if self._armed:
             self.gates.next()
             for name, i in self._local.items():
-                speed, steering, acceleration = command.speed[i], command.steering[i], command.acceleration[i]
-                self.gates.command(name, float(speed), float(steering), float(acceleration))
+                speed = float(command.speed[i]) if self.monitor.settled(name) else 0.0
+                self.gates.command(name, speed, float(command.steering[i]), float(command.acceleration[i]))
         for _ in range(self.scenario.ticks_per_decision):
             if self._armed and self.watchdog.trip is not None:
                 self._armed = False
@@ -236,7 +236,7 @@ class Svea:
             if not all(np.isfinite(part).all() for part in (each.rotation, each.position, each.covariance)):
                 continue
             self._judge(name, each)
-            if self.deployment.safety.judge == "estimate":
+            if self.deployment.safety.judge == "estimate" and self.monitor.settled(name):  # it jumps before
                 self.monitor.place(name, each.position + self._origin, moment)
             self.gates.send(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
             if (report := report_message(each, moment, self._origin)) is not None:
@@ -250,8 +250,11 @@ class Svea:
         stated, lever = bool(P.any()), np.array(self.scenario.cameras[i].position)
         nis = bearing_nis(sent, self._landmarks[seen], lever, tick.bearings[i][seen]) if stated else np.zeros(0)
         std = float(np.sqrt(max(np.linalg.eigvalsh(left_covariance(R.T @ p, P)[3:, 3:])[-1], 0.0)))
-        error = float("nan") if tick.truth is None else float(np.linalg.norm(p - tick.truth.position[i]))
-        self.monitor.judge(name, self.deployment.safety, error, std, nis)
+        error = turn = float("nan")
+        if tick.truth is not None:
+            error = float(np.linalg.norm(p - tick.truth.position[i]))
+            turn = float(np.arccos(np.clip(0.5 * (np.vdot(R, tick.truth.rotation[i]) - 1.0), -1.0, 1.0)))
+        self.monitor.judge(name, self.deployment.safety, error, turn, std, nis)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""

@@ -57,6 +57,7 @@ BEARING_STD = 0.01  # rad, with calibration
 NIS_TIME = 1_000_000_000  # ns over which the median is taken
 FEWEST = 8  # bearings of which it is taken
 LASTING = 0.2  # s
+UNSETTLED = 2.0  # s that an estimate has at first, while the car stands
 VELOCITY_TIME = 200_000_000  # ns
 
 
@@ -81,6 +82,8 @@ class LinkMonitor:
         self._nis: dict[str, deque[tuple[int, float]]] = {}
         self._recent: dict[str, deque[Place]] = {}
         self._doubts: dict[str, tuple[str, int]] = {}  # why an estimate is wrong, and since when, ns
+        self._well: dict[str, int] = {}  # since when an estimate has been within all limits, ns
+        self._settled: set[str] = set()
 
     def put(self, sample: Sample) -> None:
         """Take a sample that is newer than all before of its car and role."""
@@ -103,13 +106,14 @@ class LinkMonitor:
             recent.append(Place(position, time, velocity))
             self.places = {**self.places, car: recent[-1]}
 
-    def judge(self, car: str, safety: Safety, error: float, std: float, nis: Array) -> None:
+    def judge(self, car: str, safety: Safety, error: float, turn: float, std: float, nis: Array) -> None:
         """Compare an estimate with the limits.
 
         Args:
             car: its name.
             safety: limits.
             error: distance to the true position, m; NaN: not known.
+            turn: angle to the true orientation, rad; NaN: not known.
             std: of its position, m.
             nis: per degree of freedom, of the bearings of its tick.
         """
@@ -118,21 +122,33 @@ class LinkMonitor:
         while recent and recent[0][0] < now - NIS_TIME:
             recent.popleft()
         median = float(np.median([value for _, value in recent])) if len(recent) >= FEWEST else 0.0
-        found = ((error, "max_error", " m from motion capture"), (std, "max_std", " m uncertain"))
-        measured = (*found, (median, "max_nis", " squared standard deviations from its bearings"))
+        measured = (
+            (error, "max_error", " m from motion capture"),
+            (turn, "max_turn_error", " rad from motion capture"),
+            (std, "max_std", " m uncertain"),
+            (median, "max_nis", " squared standard deviations from its bearings"),
+        )
         for value, name, what in measured:
             most = getattr(safety, name)
             if most is not None and value > most:
                 why = f"its estimate is {value:.3g}{what}, safety.{name} = {most:g}"
                 since_when = self._doubts[car][1] if car in self._doubts else now
                 self._doubts[car] = why, since_when
+                self._well.pop(car, None)
                 return
-        self._doubts.pop(car, None)
+        if (now - self._well.setdefault(car, now)) * 1e-9 > LASTING:
+            self._settled.add(car)
+        if self.settled(car):
+            self._doubts.pop(car, None)
+
+    def settled(self, car: str) -> bool:
+        """Return whether the estimate of a car has once been within all limits for long enough to drive by it."""
+        return car in self._settled
 
     def doubt(self, car: str) -> str:
         """Return why the estimate of a car has been wrong for too long; empty: it has not."""
         why, since_when = self._doubts.get(car, ("", self.looked))
-        return why if (self.looked - since_when) * 1e-9 > LASTING else ""
+        return why if (self.looked - since_when) * 1e-9 > (LASTING if self.settled(car) else UNSETTLED) else ""
 
     def age(self, car: str, role: Role) -> float:
         """Return the age of a sensor's last message when messages were looked at last, s; inf: none was received."""

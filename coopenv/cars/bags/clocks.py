@@ -252,7 +252,7 @@ def lead_of_bearings(times: Array, azimuths: Array, targets: Array, camera: Arra
         x, y, heading = path.over(times + offset, times + offset, level=True).T
         away = targets - np.column_stack([x, y])
         ahead = (away[:, 0] + 1j * away[:, 1]) * np.exp(-1j * heading) - complex(*camera)
-        shift = unit / np.abs(ahead)
+        shift = unit * (1.0 / np.abs(ahead))  # NaN beyond the path, without a warning
         return np.angle(ahead * np.conj(unit)), np.column_stack([powers, shift.real, shift.imag])
 
     return lead_by(residual, times, ABSURD, FLOOR)

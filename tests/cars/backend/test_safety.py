@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -74,23 +75,31 @@ def test_places_come_from_what_judges() -> None:
 
 
 def test_an_estimate_that_is_wrong_for_long_is_doubted() -> None:
-    monitor, none = LinkMonitor("truth"), np.zeros(0)
+    monitor, none, unknown = LinkMonitor("truth"), np.zeros(0), (float("nan"), float("nan"))
     safety = Safety(max_std=0.5)
     cases = {
-        "1.2 m from motion capture, safety.max_error = 1": (1.2, 0.1, none),
-        "0.6 m uncertain, safety.max_std = 0.5": (float("nan"), 0.6, none),
-        "20 squared standard deviations from its bearings": (float("nan"), 0.1, np.full(8, 20.0)),
-        "": (0.9, 0.4, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
+        "0.2 m from motion capture, safety.max_error = 0.15": (0.2, 0.0, 0.1, none),
+        "0.3 rad from motion capture, safety.max_turn_error = 0.15": (0.0, 0.3, 0.1, none),
+        "0.6 m uncertain, safety.max_std = 0.5": (*unknown, 0.6, none),
+        "20 squared standard deviations from its bearings": (*unknown, 0.1, np.full(8, 20.0)),
+        "": (0.1, 0.1, 0.4, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
     }
-    for said, given in cases.items():
+    for (said, given), settled in itertools.product(cases.items(), (False, True)):
         monitor.begin(BEGIN)
-        for ms in (0, 100, 190, 210):
+        for ms in (0, 100, 190, 210) if settled else ():
+            assert not monitor.settled("a")
             monitor.looked = BEGIN + ms * MS
+            monitor.judge("a", safety, 0.0, 0.0, 0.0, none)
+        assert monitor.settled("a") == settled
+        begin, patience = monitor.looked, 200 if settled else 2000
+        for ms in (0, patience // 2, patience - 10, patience + 10):
+            monitor.looked = begin + ms * MS
             monitor.judge("a", safety, *given)
-            assert bool(monitor.doubt("a")) == (bool(said) and ms > 200)
+            assert bool(monitor.doubt("a")) == (bool(said) and ms > patience)
+            assert monitor.settled("a") == (settled or (not said and ms > 200))
         assert said in monitor.doubt("a") and not monitor.doubt("b")
-        monitor.judge("a", Safety(max_error=None, max_nis=None), *given)
-        assert not monitor.doubt("a")
+        monitor.judge("a", Safety(max_error=None, max_turn_error=None, max_nis=None), *given)
+        assert bool(monitor.doubt("a")) == (bool(said) and not settled)  # one good tick does not settle it
 
 
 def test_the_innovation_of_bearings_counts_in_standard_deviations() -> None:
