@@ -92,14 +92,14 @@ LINES_AND_FILES = {
     "bench": (5325, 19),
     "cars": (10645, 47),
     "cli": (2607, 8),
-    "estimation": (1810, 8),
+    "estimation": (1840, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
     "policies": (1870, 9),
-    "runs": (3366, 13),
+    "runs": (3370, 13),
     "scenario": (3770, 13),
     "training": (1715, 7),
-    "viz": (4810, 19),
+    "viz": (4820, 19),
     "world": (5475, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""

@@ -12,7 +12,6 @@ Source: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evalu
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from coopenv.estimation.observability import Observability, Trajectory, slowest_
 from coopenv.estimation.poses import Array, Coordinates, covariance_in_map, orientation_error_deg
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
+MOST_SHOWN = 12  # vehicles that figures and printed tables show; of a larger fleet, those of the largest errors
 MIRROR_ANGLE_DEG = 150.0  # an orientation error above it at the end of a run is the mirrored solution, not a slow one
 
 
@@ -189,13 +189,29 @@ def _no_rate(reason: str, samples: int = 0) -> RateFit:
 def observability_of(observability: Observability, vehicle: int, end: float = math.inf) -> Observability:
     """Return the figures of one vehicle alone, without the windows that reach beyond its end (s; NaN: none)."""
     late = observability.t + observability.window > end + 1e-6
-    columns = ("min_eigenvalue", "condition_number", "local_eigenvalue")
-    return replace(
-        observability,
-        t=observability.t[~late],
-        vehicles=observability.vehicles[[vehicle]],
-        **{name: getattr(observability, name)[~late][:, [vehicle]] for name in columns},
-    )
+    return observability.selected([vehicle], ~late)
+
+
+def shown_vehicles(trajectory: Trajectory, steady_from: float, ends: Sequence[float] | None = None) -> list[int]:
+    """Return the vehicles that figures and tables show: all, or the `MOST_SHOWN` of the largest steady position RMSE.
+
+    The largest comes first; an estimate without a finite error counts as the largest. Vehicles that end before the
+    steady state follow, by their last error. `steady_from` and `ends` as of `summarise`.
+    """
+    count, t = len(trajectory.vehicles), trajectory.t
+    if count <= MOST_SHOWN:
+        return [*range(count)]
+    live = live_ticks(t, count, ends)
+    rmse = [steady_rmse(t[:n], trajectory.position_error[:n, i], steady_from) for i, n in enumerate(live)]
+    last = trajectory.position_error[live - 1, np.arange(count)]
+    steady = t[live - 1] > steady_from
+    order = np.lexsort([-np.nan_to_num(error, nan=np.inf) for error in (last, rmse)] + [~steady])
+    return [int(i) for i in order[:MOST_SHOWN]]
+
+
+def shown_note(count: int) -> str:
+    """Return which vehicles of a fleet `shown_vehicles` chooses, in words; nothing where these are all."""
+    return f"{MOST_SHOWN} worst of {count} vehicles, by RMSE of the position" if count > MOST_SHOWN else ""
 
 
 def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] | None = None) -> list[dict[str, Any]]:

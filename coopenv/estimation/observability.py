@@ -29,7 +29,7 @@ Everything is taken along the truth. In map axes A vanishes, and the prediction 
 isotropic. As in the theorem, neighbours count as known, and lambda and p are about the map's origin.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, get_type_hints
@@ -141,6 +141,10 @@ class Trajectory(RecordedGeometry, Tabular):
         """Return the record of some vehicles alone; the others stay among the targets."""
         return self if [*indices] == [*range(len(self.vehicles))] else self._along("N", [*indices])
 
+    def without_targets(self, names: Collection[str]) -> Self:
+        """Return the record without some of its targets."""
+        return self._along("T", [name not in names for name in self.targets.tolist()]) if names else self
+
     def _along(self, axis: str, chosen: Any) -> Self:
         """Return the record with the chosen entries of an axis, in every array that has it."""
         places = {name: kinds.split()[1:] for name, kinds in self.kinds().items()}
@@ -199,6 +203,12 @@ class Observability:
     def observable(self) -> np.ndarray:
         """(M, N) bool: the verdict of each window."""
         return self.local_eigenvalue >= self.threshold
+
+    def selected(self, vehicles: Sequence[int], windows: Any = slice(None)) -> Self:
+        """Return the figures of some vehicles, and of some windows, alone."""
+        columns = ("min_eigenvalue", "condition_number", "local_eigenvalue")
+        cut = {name: getattr(self, name)[windows][:, [*vehicles]] for name in columns}
+        return replace(self, t=self.t[windows], vehicles=self.vehicles[[*vehicles]], **cut)
 
     def intervals(self, vehicle: int) -> list[ObservabilityInterval]:
         """Return one vehicle's stretches of equal verdict in order; the last ends with its last window."""
@@ -259,14 +269,17 @@ def _windows_about_anchor(scene: RecordedGeometry, window: float) -> tuple[np.nd
 
 def _information_of(scene: RecordedGeometry, i: int, anchor: np.ndarray, q: Array | float = 1.0) -> np.ndarray:
     """Return C*^T Q C* (K, 6, 6) of one vehicle in map axes, about a point (3,); q (T,) are weights of targets."""
-    known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
-    place = np.where(known[..., None], scene.target_position, 0.0)
-    offset = place - scene.position[:, i, None]  # (K, T, 3)
+    ever = scene.visible[:, i].any(axis=0)  # a target that is never seen adds nothing
+    known = np.isfinite(scene.target_position[:, ever]).all(axis=-1)  # (K, S) for the S others
+    place = np.where(known[..., None], scene.target_position[:, ever], 0.0)
+    offset = place - scene.position[:, i, None]  # (K, S, 3)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     bearing = offset / np.where(distance > 0, distance, 1.0)
-    seen = scene.visible[:, i] & known & (distance[..., 0] > 0)
-    projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * np.where(seen, q, 0.0)[..., None, None]
-    lever = skew(place - anchor)  # (K, T, 3, 3)
+    seen = scene.visible[:, i, ever] & known & (distance[..., 0] > 0)
+    projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * np.where(
+        seen, np.broadcast_to(q, ever.shape)[ever], 0.0
+    )[..., None, None]
+    lever = skew(place - anchor)  # (K, S, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
     rate = np.empty((len(scene.position), 6, 6))
     rate[:, :3, :3] = -(cross @ lever).sum(axis=1)

@@ -19,7 +19,7 @@ from coopenv.base.files import new_folder, replace_text, replacing_folder
 from coopenv.base.format import json_text
 from coopenv.base.installation import install_command
 from coopenv.base.terminal import Terminal, text_of
-from coopenv.estimation.metrics import steady_start
+from coopenv.estimation.metrics import shown_note, shown_vehicles, steady_start
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
@@ -284,8 +284,11 @@ class Results(Tabular):
         return text_of(self, WIDTH)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        vehicles, end = self.metrics["vehicles"], float(self.trajectory.t[-1])
+        shown, end = shown_vehicles(self.trajectory, self.steady_from, self.ends), float(self.trajectory.t[-1])
+        vehicles = [self.metrics["vehicles"][i] for i in shown]
         yield metrics_table(vehicles)
+        if note := shown_note(len(self.trajectory.vehicles)):
+            yield f"{note}; all of them: {METRICS_FILE}"
         yield ""
         yield from rates(vehicles)
         yield from legend(self.steady_from, end)

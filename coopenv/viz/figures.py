@@ -23,7 +23,7 @@ from matplotlib.text import Text
 
 from coopenv.base.errors import check_one_of
 from coopenv.base.files import writing
-from coopenv.estimation.metrics import live_ticks, mean_targets_in_view
+from coopenv.estimation.metrics import STEADY_SHARE, live_ticks, mean_targets_in_view, shown_note, shown_vehicles
 from coopenv.estimation.observability import Observability, Trajectory, analyse_observability
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
@@ -308,7 +308,7 @@ def draw_figure(
     gain: bool = False,
     note: str = "",
 ) -> Figure:
-    """Return one figure of a run.
+    """Return one figure of a run: of a large fleet, of `shown_vehicles` alone, which it then says.
 
     Args:
         name: one of `FIGURE_NAMES`.
@@ -324,16 +324,21 @@ def draw_figure(
     Raises:
         CoopenvError: no figure or column of that name.
     """
-    inches = inches_of(width)
+    inches, fleet = inches_of(width), trajectory.vehicles.tolist()
+    steady_from = STEADY_SHARE * float(trajectory.t[-1]) if steady_from is None else steady_from
+    shown = shown_vehicles(trajectory, steady_from, ends)
+    trajectory, ends = trajectory.of_vehicles(shown), None if ends is None else [ends[i] for i in shown]
+    paths = trajectory.without_targets({*fleet} - {*trajectory.vehicles.tolist()})  # its vehicles are no landmarks
+    observability = observability and observability.selected(shown)
     drawings: dict[str, Callable[[], Figure]] = {
         "errors": lambda: error_figure(trajectory, ends, inches),
-        "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario, inches),
-        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends, scenario, inches),
+        "trajectories_2d": lambda: trajectory_figure_2d(paths, ends, scenario, inches),
+        "trajectories_3d": lambda: trajectory_figure_3d(paths, ends, scenario, inches),
         "topology": lambda: topology_figure(trajectory, ends, inches),
         "consistency": lambda: consistency_figure(trajectory, ends, steady_from, inches, gain=gain),
         "observability": lambda: observability_figure(observability or analyse_observability(trajectory), ends, inches),
     }
     check_one_of("unknown figure", name, drawings)
     figure = drawings[name]()
-    sign(figure, note)
+    sign(figure, "\n".join(filter(None, (shown_note(len(fleet)), note))))
     return restyle(figure, width) if isinstance(width, str) else figure

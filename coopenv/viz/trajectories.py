@@ -233,7 +233,8 @@ def _draw_paths(
 
     A scenario's vehicles that the record is not about are estimated elsewhere.
     """
-    elsewhere = [] if scenario is None else [n for n in scenario.vehicle_names if n not in trajectory.vehicles]
+    others = {*trajectory.targets.tolist()} - {*trajectory.vehicles.tolist()}
+    elsewhere = [] if scenario is None else [name for name in scenario.vehicle_names if name in others]
     _draw_landmarks(drawing, trajectory, elsewhere)
     live = live_ticks(trajectory.t, len(trajectory.vehicles), ends)
     settled = np.nan_to_num(settling_times(trajectory, ends, SETTLED), nan=np.inf)
