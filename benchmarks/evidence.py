@@ -176,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"error: {asked.page}: expected the marks {begin} and {end}", file=sys.stderr)
             return 2
         head, rest = page.split(begin, 1)
-        replace_text(asked.page, f"{head}{begin}\n\n{text}\n{end}{rest.split(end, 1)[1]}")
+        replace_text(asked.page, f"{head}{begin}\n\n{text.rstrip()}\n\n{end}{rest.split(end, 1)[1]}")
     return 0
 
 

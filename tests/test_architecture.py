@@ -95,10 +95,10 @@ LINES_AND_FILES = {
     "estimation": (1840, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
-    "policies": (1870, 9),
+    "policies": (1965, 9),
     "runs": (3370, 13),
     "scenario": (3770, 13),
-    "training": (1715, 7),
+    "training": (1720, 7),
     "viz": (4820, 19),
     "world": (5475, 20),
 }

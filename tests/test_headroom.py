@@ -121,25 +121,30 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
     assert unseen[2] > 0.8 * unseen[0]
 
 
-@pytest.mark.slow
-def test_one_driver_drives_where_it_never_learnt() -> None:
-    """The agent learnt in eight environments without this one."""
-    driver, lookout = (figures("open_square", agent, times=8) for agent in ("open_square_general", "peek"))
-    assert driver["arrival_rate"][0] >= 0.95 and driver["collision_rate"][0] <= 0.03
-    assert driver["e95_m"][0] <= lookout["e95_m"][0]
-
-
-LEAST = {"facade": 0.95, "behind_truck": 0.95, "open_square": 0.75}
-"""Share of arrivals in each kind of worlds; a vehicle that lies is not among them."""
+GENERAL = ("open_square", "facade", "behind_truck", "urban_crossing")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("environment", LEAST)
-def test_learned_agents_arrive_whatever_they_sense(environment: str) -> None:
-    contest = Contest.of(environment, {}, [f"{environment}_quality"], 32, 9, stressed=True)
+@pytest.mark.parametrize("environment", GENERAL)
+def test_one_driver_drives_everywhere_like_its_planner(environment: str) -> None:
+    driver, planner = (figures(environment, agent, times=8) for agent in ("general", "look_ahead"))
+    assert driver["arrival_rate"][0] >= 0.97 and driver["collision_rate"][0] <= 0.01
+    assert driver["e95_m"][0] <= 1.15 * planner["e95_m"][0]
+    assert driver["travel_time_s"][0] <= 1.03 * planner["travel_time_s"][0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", GENERAL)
+def test_it_arrives_whatever_it_senses(environment: str) -> None:
+    """A vehicle that lies is not among the cases: whoever gives way by its messages cannot know where it is."""
+    contest = Contest.of(environment, {}, ["general"], 32, 9, stressed=True)
     found = {name: {r.metric: r.mean for r in results} for name, results in contest.drive().results.items()}
     arrived = {name: rates["arrival_rate"] for name, rates in found.items() if not name.endswith(" lies")}
     assert len(arrived) > 8 and min(arrived.values()) >= LEAST[environment], arrived
+
+
+LEAST = dict.fromkeys(GENERAL, 0.95) | {"open_square": 0.9}
+"""Share of arrivals in each kind of worlds."""
 
 
 @pytest.mark.slow

@@ -206,7 +206,8 @@ class Evaluation(Contest, Tabular):
             yield _differences_table(self)
         yield ""
         yield "\n".join(f"{words}: {meaning}." for words, meaning in EXPLANATIONS.items())
-        for name, e in self.episodes.items():
+        for name in [each.name for each in self.entrants if each.scenario is self.entrants[0].scenario]:
+            e = self.episodes[name]
             pairs = [(e.vehicles[i], e.vehicles[j], e.seen_share[i, j]) for i, j in np.argwhere(e.seen_share >= 0.01)]
             if pairs:
                 words = ", ".join(f"{own} measures {other} {share:.0%}" for own, other, share in pairs)

@@ -123,17 +123,35 @@ class LookAhead(RouteFollower):
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
         left, plan = self.memory(observations)
-        due = np.flatnonzero(left == 0)
+        blocked = self.blocked(observations)
+        due = np.flatnonzero((left == 0) | blocked)
+        plan[due] = self.planned(observations, due)
+        left[due] = HOLD
+        left -= 1
+        steering, points = self.way(observations, plan, blocked)
+        return np.minimum(self.speed(observations, points), self._pace[plan] * self.cruise), steering
+
+    def blocked(self, observations: np.ndarray) -> np.ndarray:
+        """Return whether something stands in the way of the rows: (rows,)."""
+        return np.asarray(~self.clear(observations, self.route_points(observations)[0]))
+
+    def planned(self, observations: np.ndarray, due: np.ndarray) -> np.ndarray:
+        """Return the numbers of the best plans of the rows `due`."""
+        plan = np.zeros(len(observations), dtype=int)
         due = due[np.argsort(self._sees_landmarks[due % len(self._top)], kind="stable")]
         for rows in np.split(due, range(CACHED, len(due), CACHED)):
             vehicle = rows % len(self._top)
             plan[rows] = np.argmin(self.costs(observations[rows], vehicle, self.followers(observations, rows)), axis=1)
-        left[due] = HOLD
-        left -= 1
-        heading = self.read(observations, "route_heading")[:, 0]
+        return np.asarray(plan[np.sort(due)])
+
+    def way(self, observations: np.ndarray, plan: np.ndarray, blocked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the steering, (rows,) in rad, and the way, (rows, P, 2) in m: a first leg of the plan if blocked."""
+        points, distance = self.route_points(observations)
         offset, along = self._first[plan], self.pursue(self.direction(observations))
-        steering = np.where(offset == 0.0, along, self.pursue(offset - heading))
-        return np.minimum(self.speed(observations), self._pace[plan] * self.cruise), steering
+        aside = offset - self.read(observations, "route_heading")[:, 0]
+        leg = distance[:, None] * np.stack([np.cos(aside), np.sin(aside)], axis=1)[:, None]
+        turns = offset != 0.0
+        return np.where(turns, self.pursue(aside), along), np.where((blocked & turns)[:, None, None], leg, points)
 
     def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
         """Return the vehicles whose losses count for the rows `due` of the observations; here none."""
@@ -155,7 +173,10 @@ class LookAhead(RouteFollower):
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
         theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
-        mask = self.avoided(mask, vehicle)
+        avoided, others = self.avoided(mask, vehicle), others + self.middle * forward
+        # Whoever gives way is expected to stand, and is passed as closely as can be.
+        theirs = np.where(avoided[..., None], theirs, 0.0)
+        keep = np.where(avoided, keep, self.blocking)[:, None]
         cost, missing = np.zeros_like(now.x), zero
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -181,9 +202,10 @@ class LookAhead(RouteFollower):
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
             # Vehicles to give way to are expected to drive straight on at top speed.
             driven = theirs * (STEP * (step + 1)) * forward
-            apart = (others + driven)[:, None] - place[:, :, None]
-            distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
-            cost = cost + STEP * CLOSE * np.maximum(keep - distance, 0.0)
+            middle = place + self.middle * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
+            apart = (others + driven)[:, None] - middle[:, :, None]
+            lacking = keep - np.linalg.norm(apart, axis=-1)
+            cost = cost + STEP * CLOSE * np.max(lacking, axis=2, where=mask[:, None], initial=0.0)
         rest = FAR + missing
         later = covariance.driven(rest * np.cos(now.heading), rest * np.sin(now.heading), 0.0, 0.0)
         cost = cost + self.price * rest / top * np.maximum(later.std - self.tolerated, 0.0)

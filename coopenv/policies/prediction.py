@@ -309,8 +309,21 @@ def right_of_way(scenario: Scenario) -> np.ndarray:
     return np.asarray(first[~np.eye(len(driven), dtype=bool)].reshape(len(driven), -1))
 
 
+def on_circle(velocity: np.ndarray, curvature: np.ndarray, time: float) -> np.ndarray:
+    """Return how far, (rows, M, 2) in m, vehicles get in a time, s, with velocities, m/s, and curvatures, 1/m."""
+    half = curvature * np.linalg.norm(velocity, axis=-1) * (time / 2.0)  # rad, between the velocity and the chord
+    x, y, c, s = velocity[..., 0], velocity[..., 1], np.cos(half), np.sin(half)
+    return np.asarray((time * np.sinc(half / np.pi))[..., None] * np.stack([c * x - s * y, s * x + c * y], axis=-1))
+
+
 def nearest(
-    path: np.ndarray, times: np.ndarray, place: np.ndarray, velocity: np.ndarray, mask: np.ndarray, until: float
+    path: np.ndarray,
+    times: np.ndarray,
+    place: np.ndarray,
+    velocity: np.ndarray,
+    mask: np.ndarray,
+    until: float,
+    curvature: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the closest approach of other vehicles, (rows,) in m; infinite without any.
 
@@ -321,13 +334,18 @@ def nearest(
         velocity: (rows, M, 2), m/s, of others.
         mask: (rows, M), which vehicles count.
         until: s.
+        curvature: (rows, M), 1/m, of the circles that others drive along, of which chords are taken; None: straight on.
     """
     found = np.full(len(path), np.inf)
     for k in range(len(times) - 1):
         begin, end = times[k], times[k + 1] if k < len(times) - 2 else max(until, times[k + 1])
         own = (path[:, k + 1] - path[:, k]) / (times[k + 1] - times[k])
-        apart = place + velocity * begin - path[:, k][:, None]
-        away = velocity - own[:, None]
+        driven, speed = velocity * begin, velocity
+        if curvature is not None:
+            driven, later = (on_circle(velocity, curvature, time) for time in (begin, end))
+            speed = (later - driven) / (end - begin)
+        apart = place + driven - path[:, k][:, None]
+        away = speed - own[:, None]
         square = np.maximum((away**2).sum(axis=-1), 1e-9)
         time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, min(end, until) - begin)
         distance = np.linalg.norm(apart + time[..., None] * away, axis=-1)

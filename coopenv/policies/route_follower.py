@@ -50,7 +50,9 @@ class Driver(ABC):
         self.look_ahead = max(1.0, PURSUED * self.cruise / scenario.rates.decision)
         """Distance of the pursued point of the route, m."""
         driven = [vehicle.body for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
-        self.length, self.width, _ = max((body.size for body in driven), default=(*SMALL, 0.0))
+        (self.length, self.width, _), (self.middle, *_) = max(
+            ((body.size, body.center) for body in driven), default=((*SMALL, 0.0), (0.0,))
+        )
         self.scale = max(1.0, self.length / SMALL[0])
         self.midway = scenario.cosimulator is not None and scenario.cosimulator.reference_midway
         self.wheelbase = self.length if self.midway else scenario.dynamics.wheelbase
@@ -148,6 +150,9 @@ PATIENCE, STANDING = 3.0, 0.5
 """s for which a car waits that is slower than this, m/s, before it takes others to go on as they do now, until it
 drives at half of its top speed."""
 
+LEAST_MOVED = 0.2
+"""m, that a car has driven at least before the curvature of its way is measured in full."""
+
 PREDICTED = 11
 """Points in time of a predicted motion of a car that stops slowly."""
 
@@ -179,7 +184,7 @@ class RouteFollower(Driver):
         if scenario.topology.most_nearby is not None:
             self.traffic = np.zeros_like(self.goes_first)  # as the senders are not known
         """(N, N - 1), which senders are cars of a backend's traffic."""
-        self.discs = np.zeros(1) if nimble else discs_along(self.length, self.width)
+        self.discs = self.middle + (np.zeros(1) if nimble else discs_along(self.length, self.width))
         """Centres of the discs that cover a car, m ahead of its reference point; a nimble car is one disc."""
         reach = (self.length + self.width) / 2.0 if nimble else np.hypot(self.length / len(self.discs), self.width)
         more = (self.clearance - self.closest) * self.scale
@@ -190,8 +195,8 @@ class RouteFollower(Driver):
         self.foresight = 6.0 if nimble else stopping + REACTION
         """How far ahead to look for others, s."""
         self.period = 1.0 / scenario.rates.decision
-        self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(3)), np.zeros(0))
-        """Of the last decision: which messages there were, their places, ages and velocities, and s of standing."""
+        self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(4)), np.zeros(0))
+        """Of the last decision: messages, places, directions, ages and motions of their senders, and s of standing."""
         self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -214,70 +219,108 @@ class RouteFollower(Driver):
         """Return those of the senders, (rows, M), over which the rows' vehicles, (rows,), have no right of way."""
         return np.asarray(senders & ~self.goes_first[vehicle]) if self.goes_first.any() else senders
 
-    def speed(self, observations: np.ndarray) -> np.ndarray:
+    def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
         """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
 
-        Others are expected to go straight on at one of `velocities`.
+        Others are expected to go on at one of the velocities of `motions`.
+
+        Args:
+            observations: (rows, D).
+            points: the way ahead in place of that of `route_points`.
         """
         mask, place, forward = self.received(observations)
-        points, distance = self.route_points(observations)
+        route, distance = self.route_points(observations)
+        points = route if points is None else points
+        clear = self.clear(observations, points)
         if not self.nimble:
             mask = mask & ((place[..., 0] > 0.0) | (forward[..., 0] < SAME_WAY))
-        keep, times, count = self.distance_to_keep(observations), distance / self.cruise, len(self.discs)
-        velocities = [np.repeat(v, count, axis=1) for v in self.velocities(observations, mask, place, forward)]
-        place = (place[:, :, None] + self.discs[:, None] * forward[:, :, None]).reshape(len(place), -1, 2)
-        mask, forward = (np.repeat(values, count, axis=1) for values in (mask, forward))
-        near = np.min(np.linalg.norm(place, axis=-1), axis=1, where=mask, initial=np.inf)
-        soon = SOON if self.nimble else self.foresight
-        clear = nearest(points, times, place, 0.0 * forward, mask, soon) >= np.minimum(self.blocking, near)
-        clear |= not self.goes_first.any()  # those who never have the right of way keep the larger distance below
+        keep, count = self.distance_to_keep(observations), len(self.discs)
+        *velocities, curvature = self.motions(observations, mask, place, forward)
+        velocities = [np.repeat(v, count, axis=1) for v in velocities]
+        bends = None if self.nimble else np.repeat(curvature, count, axis=1)
+        place = self._covered(place, forward)
         vehicles = len(self.goes_first)
         if len(mask) % vehicles == 0:  # else the rows are of unknown vehicles, which give way to all
-            senders = self.before(mask[:, ::count], np.arange(len(mask)) % vehicles)
-            mask = np.repeat(senders, count, axis=1)
+            mask = self.before(mask, np.arange(len(mask)) % vehicles)
+        mask = np.repeat(mask, count, axis=1)
 
         def least(paths: Sequence[np.ndarray], times: np.ndarray) -> np.ndarray:
-            found = [nearest(p, times, place, v, mask, self.foresight) for p, v in product(paths, velocities)]
+            every = product(paths, velocities)
+            found = [nearest(p, times, place, v, mask, self.foresight, bends) for p, v in every]
             return np.asarray(np.min(found, axis=0))
 
         if self.nimble:
-            going = least([points], times)
-            waiting = least([np.zeros((len(observations), 2, 2))], np.array([0.0, 1.0]))
+            middles = self.middles(points)
+            going = least([middles], distance / self.cruise)
+            waiting = least([np.repeat(middles[:, :1], 2, axis=1)], np.array([0.0, 1.0]))
         else:
             times = np.linspace(0.0, self.foresight, PREDICTED)
             s = self.going(observations, times)
             going, waiting = (least(self.swept(points, distance, arcs), times) for arcs in (s, 0.0 * s))
-        return np.where(clear & ((going >= keep) | (going > waiting)), self.cruise, 0.0)
+        return np.where(clear & ((going >= keep) | (going > np.maximum(waiting, self.blocking))), self.cruise, 0.0)
 
-    def velocities(
+    def clear(self, observations: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return whether no sender that stands where it is would block a way by the points, (rows, P, 2) in m.
+
+        Those who never have the right of way keep a larger distance to others than one that blocks.
+        """
+        if not self.goes_first.any():
+            return np.ones(len(points), dtype=bool)
+        mask, place, forward = self.received(observations)
+        if not self.nimble:
+            mask = mask & ((place[..., 0] > 0.0) | (forward[..., 0] < SAME_WAY))
+        place, mask = self._covered(place, forward), np.repeat(mask, len(self.discs), axis=1)
+        near = np.linalg.norm(place - [self.middle, 0.0], axis=-1).min(axis=1, where=mask, initial=np.inf)
+        times, soon = np.concatenate([[0.0], self._distances]) / self.cruise, SOON if self.nimble else self.foresight
+        found = nearest(self.middles(points), times, place, np.zeros_like(place), mask, soon)
+        return np.asarray(found >= np.minimum(self.blocking, near))
+
+    def _covered(self, place: np.ndarray, forward: np.ndarray) -> np.ndarray:
+        """Return the centres, (rows, M times discs, 2), of the discs of cars at places (rows, M, 2)."""
+        centres = place[:, :, None] + self.discs[:, None] * forward[:, :, None]
+        return np.asarray(centres.reshape(len(place), -1, 2))
+
+    def middles(self, points: np.ndarray) -> np.ndarray:
+        """Return where the middle of the own body is, (rows, P, 2) in m, with the reference point at these of a way."""
+        ways = np.diff(points, axis=1)
+        ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
+        ahead = np.concatenate([np.broadcast_to([1.0, 0.0], ways[:, :1].shape), ways], axis=1)
+        return np.asarray(points + self.middle * ahead)
+
+    def motions(
         self, observations: np.ndarray, mask: np.ndarray, place: np.ndarray, forward: np.ndarray
     ) -> list[np.ndarray]:
-        """Return what velocities senders may have, (rows, M, 2) in m/s each: `paces` of the speed `cruise`.
+        """Return velocities that senders may have, (rows, M, 2) in m/s each, and the curvature of their way, (rows, M).
 
-        A car that stops slowly, and has stood for `PATIENCE`, measures those of the traffic by two messages, in its own
-        frame, whose motion is that of the odometry: otherwise both might wait for each other for ever.
+        Velocities are `paces` of the speed `cruise`. A car that stops slowly also measures both by two messages, in its
+        own frame, whose motion is that of the odometry. When it has stood for `PATIENCE` it expects of the traffic only
+        what it has measured: otherwise both might wait for each other for ever.
         """
         expected = [pace * self.cruise * forward for pace in self.paces]
         if self.nimble or not {"velocity", "angular_velocity", "message_age"} <= {*self.layout}:
-            return expected
+            return [*expected, np.zeros(mask.shape)]
         speed = self.read(observations, "velocity")[:, 0]
         turn = -self.period * self.read(observations, "angular_velocity")[:, -1]
         age = self.read(observations, "message_age")[..., None]
         if len(self._last[0]) != len(place):
-            self._last = np.zeros_like(mask), place, age, np.full_like(place, np.nan), np.zeros(len(place))
-        received, before, aged, velocity, stood = self._last
-        x, y, c, s = before[..., 0] - self.period * speed[:, None], before[..., 1], np.cos(turn), np.sin(turn)
-        before = np.stack([c[:, None] * x - s[:, None] * y, s[:, None] * x + c[:, None] * y], axis=-1)
+            unknown = np.full((*mask.shape, 3), np.nan)
+            self._last = np.zeros_like(mask), place, forward, age, unknown, np.zeros(len(place))
+        received, before, pointed, aged, motion, stood = self._last
+        moved = place - _turned(before - [self.period, 0.0] * speed[:, None, None], turn)
+        pointed = _turned(pointed, turn)
+        veer = pointed[..., 0] * forward[..., 1] - pointed[..., 1] * forward[..., 0]  # sine of the angle turned by
+        bend = veer / np.maximum(np.linalg.norm(moved, axis=-1), LEAST_MOVED)
         span = self.period + aged - age  # s, between the sendings
-        velocity = np.where(span > self.period / 2.0, (place - before) / np.maximum(span, self.period / 2.0), velocity)
-        velocity[~(mask & received)] = np.nan
+        new = np.concatenate([moved / np.maximum(span, self.period / 2.0), bend[..., None]], axis=-1)
+        motion = np.where(span > self.period / 2.0, new, motion)
+        motion[~(mask & received)] = np.nan
         stood = np.where(speed < STANDING, stood + self.period, np.where(speed < self.cruise / 2.0, stood, 0.0))
-        self._last = mask, place, age, velocity, stood
+        self._last = mask, place, forward, age, motion, stood
         waits = (stood < PATIENCE)[:, None, None]
         if len(place) % len(self.traffic) == 0:
             waits = waits | ~self.traffic[np.arange(len(place)) % len(self.traffic)][..., None]
-        measured = np.where(np.isnan(velocity), expected[-1], velocity)
-        return [measured, *(np.where(waits, each, measured) for each in expected)]
+        measured = np.where(np.isnan(motion[..., :2]), expected[-1], motion[..., :2])
+        return [measured, *(np.where(waits, each, measured) for each in expected), np.nan_to_num(motion[..., 2])]
 
     def reset(self, mask: np.ndarray) -> None:
         """See `Driver.reset`."""
@@ -308,6 +351,12 @@ class RouteFollower(Driver):
         return np.asarray(np.minimum(self.closest + std, self.clearance))
 
 
+def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return vectors (rows, M, 2) turned by angles (rows,), rad."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return np.stack([c * vectors[..., 0] - s * vectors[..., 1], s * vectors[..., 0] + c * vectors[..., 1]], axis=-1)
+
+
 class IntelligentDriver(RouteFollower):
     """Pure pursuit of the route, at the speed that keeps a time gap to the nearest sender on it.
 
@@ -329,7 +378,7 @@ class IntelligentDriver(RouteFollower):
         bodies = [vehicle.body.size[0] for vehicle in scenario.vehicles if vehicle.body]
         self.length = max(bodies, default=0.0)
 
-    def speed(self, observations: np.ndarray) -> np.ndarray:
+    def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
         """Return the speeds, (rows,) in m/s, that the model's acceleration leads to until the next decision."""
         own = np.maximum(self.read(observations, "velocity")[:, 0], 0.0)
         gap, closing = self._ahead(observations, own)
@@ -372,10 +421,10 @@ class StopWhenLost(RouteFollower):
         super().__init__(scenario)
         self.longest = round(self.patience * scenario.rates.decision)  # decisions
 
-    def speed(self, observations: np.ndarray) -> np.ndarray:
-        """Return the speeds, (rows,) in m/s."""
+    def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """See `RouteFollower.speed`."""
         lost = self.read(observations, "position_std")[:, 0] > np.log10(self.threshold)
         (waited,) = self.memory(observations)
         waited[:] = np.where(lost, waited + 1, 0)
         stands = lost & (waited <= self.longest)
-        return np.where(stands, 0.0, super().speed(observations))
+        return np.where(stands, 0.0, super().speed(observations, points))

@@ -32,11 +32,14 @@ SLACK = 0.25
 """Share of a constant by which it may be beyond the training."""
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""The vehicle itself (rows, E); landmarks (rows, K, 7) and cars (rows, M, 11), beginning with 1 where there is one."""
+"""The vehicle itself (rows, E); landmarks (rows, K, 7) and cars (rows, M, 12), beginning with 1 where there is one."""
 
 
 class SetDriver(LookAhead):
-    """Drives at the speed of `LookAhead`, which gives way; the network chooses the steering in place of its plans."""
+    """Drives at the speed of `LookAhead`, which gives way; the network steers in place of its plans.
+
+    Where something stands in the way, or so far off the route that plans lead back to it, it drives by a plan.
+    """
 
     needs = (*LookAhead.needs, "map_in_view", "last_action")
     remembers = 0
@@ -61,14 +64,16 @@ class SetDriver(LookAhead):
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
-        vehicle = np.arange(len(observations)) % len(self._top)
-        return self.speed(observations), self.steer(self.inputs(observations, vehicle))
+        vehicle, blocked = np.arange(len(observations)) % len(self._top), self.blocked(observations)
+        plans = blocked | (np.abs(self.read(observations, "route_offset")[:, 0]) > self.farthest)
+        plan, due = np.zeros(len(observations), dtype=int), np.flatnonzero(plans)
+        plan[due] = self.planned(observations, due)
+        around, points = self.way(observations, plan, blocked)
+        steering = np.where(plans, around, self.steer(self.inputs(observations, vehicle)))
+        return self.speed(observations, points), steering
 
     def inputs(self, observations: np.ndarray, vehicle: np.ndarray) -> Inputs:
-        """Return what the network sees in rows that are of these vehicles, (rows,).
-
-        Senders that have to give way to a vehicle are none of its cars.
-        """
+        """Return what the network sees in rows that are of these vehicles, (rows,)."""
         names = ("axis_std", "heading_std", "route_offset", "route_heading", "route_ahead")
         own = [self.read(observations, name) for name in names]
         alone = np.concatenate([*own, self.read(observations, "last_action")[:, 1:2], self.constants[vehicle]], axis=1)
@@ -76,8 +81,8 @@ class SetDriver(LookAhead):
         landmarks = _rows(self.known(observations), place, seen[..., None])
         received, place, forward = self.received(observations)
         sender = np.arange(received.shape[1]) + (np.arange(received.shape[1]) >= vehicle[:, None])
-        cars = self._cars[sender % len(self._cars)]
-        return alone.astype(np.float32), landmarks, _rows(self.avoided(received, vehicle), place, forward, cars)
+        cars = forward, self._cars[sender % len(self._cars)], self.avoided(received, vehicle)[..., None]
+        return alone.astype(np.float32), landmarks, _rows(received, place, *cars)
 
     def steer(self, inputs: Inputs) -> np.ndarray:
         """Return the steering angles, (rows,) in rad."""
@@ -111,7 +116,7 @@ class SavedSetDriver(SetDriver):
         path = folder / network.weights
         super().__init__(scenario, load_weights(path, network.sha256))
         try:
-            none = [np.zeros((1, width), dtype=np.float32) for width in (self._weights["mean"].size, 7, 11)]
+            none = [np.zeros((1, width), dtype=np.float32) for width in (self._weights["mean"].size, 7, 12)]
             self.steer((none[0], none[1][None], none[2][None]))
         except (KeyError, ValueError) as error:
             raise CoopenvError(f"{path}: not the weights of a network over sets: {error}") from None

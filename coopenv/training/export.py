@@ -129,13 +129,14 @@ def _card(trainer: Trainer | SetTrainer, environment: EnvironmentFile, results: 
     else:
         card = _network(trainer, digest)
     arm = f", arm {plan.arm}" if plan.arm else ""
+    others = [each.environment for each in plan.watched() if each is not plan]
     begun = f"Clone of {plan.settings.clone.agent}" if plan.settings.clone and plan.settings.steps == 0 else "PPO"
     document = {
-        "title": f"Learned driver of {environment.title}",
+        "title": f"Learned driver of {'many environments' if others else environment.title}",
         "description": f"{begun}, one policy for all vehicles{arm}, seed {plan.seed}.",
         "kind": "learned",
         "entry": sets.ENTRY if isinstance(trainer, SetTrainer) else ENTRY,
-        "environments": [environment.name],
+        "environments": [environment.name, *others],
         "network": _with_rows(card.model_dump(mode="json"), "observation", "action"),
         "training": {
             # trains the same once more, in the agent's folder

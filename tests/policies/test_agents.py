@@ -40,7 +40,7 @@ def test_agent_drives(agent: str, name: str) -> None:
     scenario = coopenv.load_scenario(name)
     envs = coopenv.make_vec(name, num_worlds=2)
     policy, again, alone = (load_agent(agent, scenario) for _ in range(3))
-    by_vehicle = "look_ahead" in agent or agent.endswith("_general")
+    by_vehicle = "look_ahead" in agent or agent == "general"
     rows, some = np.arange(envs.num_envs), len(scenario.vehicles) if by_vehicle else 1
     observations, _ = envs.reset(seed=1000)
     for each, count in ((policy, len(rows)), (again, len(rows)), (alone, some)):

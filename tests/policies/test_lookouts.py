@@ -173,6 +173,66 @@ def test_the_nearest_approach_is_that_of_fine_steps() -> None:
         assert found == pytest.approx(expected, abs=1e-3)
 
 
+def test_the_nearest_approach_to_a_car_on_a_circle_is_that_of_fine_steps() -> None:
+    """The own way is straight, the other's circle has a radius of 5 m; chords of 0.1 s are within 1 mm of it."""
+    times, speed, radius = np.linspace(0.0, 4.0, 41), 2.0, 5.0
+    path = np.stack([1.5 * times, 0.0 * times], axis=-1)[None]
+    for side in (1.0, -1.0):
+        place, velocity = np.array([[[3.0, -4.0 * side]]]), np.array([[[0.0, speed * side]]])
+        found = nearest(path, times, place, velocity, np.ones((1, 1), bool), 4.0, np.array([[side / radius]]))
+        t = np.linspace(0.0, 4.0, 4001)
+        angle = speed * t / radius
+        other = place[0, 0] + radius * np.stack([np.cos(angle) - 1.0, side * np.sin(angle)], axis=-1)
+        apart = np.linalg.norm(other - np.stack([1.5 * t, 0.0 * t], axis=-1), axis=-1)
+        assert found[0] == pytest.approx(apart.min(), abs=2e-3)
+        straight = nearest(path, times, place, velocity, np.ones((1, 1), bool), 4.0)
+        assert abs(straight[0] - apart.min()) > 0.1
+
+
+@pytest.mark.parametrize("y", [0.1, -0.1])
+def test_a_planner_drives_around_a_car_that_gives_way_and_blocks_its_way(y: float) -> None:
+    """One that only follows its route waits; one that has to give way waits as well, and does not come closer."""
+    row = rows(0, **other(1.3, y, np.pi), map_mask=0)
+    speed, steering = (values[0] for values in LookAhead(MUTUAL).drive(row))
+    assert speed > 0.0 and abs(steering) > 0.2
+    assert RouteFollower(MUTUAL).speed(row)[0] == 0.0
+    assert RouteFollower(MUTUAL).speed(rows(3, **other(1.3, y, np.pi)))[3] == 0.0
+
+
+def test_the_middle_of_a_body_counts() -> None:
+    """The car's reference point is its rear axle: two that meet head-on touch long before these are near."""
+    driver = RouteFollower(MUTUAL)
+    assert driver.middle == pytest.approx(MUTUAL.vehicles[0].body.center[0]) and driver.middle > 0.1
+    way, touching = driver.route_points(rows(0))[0], 1.0 + 2.0 * driver.middle + driver.blocking  # m, after 1 s
+    for more, clear in ((-0.05, False), (0.05, True)):
+        assert driver.clear(rows(0, **other(touching + more, 0.0, np.pi)), way)[0] == clear
+
+
+def test_it_measures_the_circle_that_a_car_drives_on() -> None:
+    """From two messages, in the frame of a car that itself moves and turns."""
+    scenario = load_scenario("highway_roundabout")
+    driver, own_speed, own_turn, radius = RouteFollower(scenario), 6.0, 0.3, 20.0
+    count, period = len(scenario.vehicles) - 1, 1.0 / scenario.rates.decision
+    curvature = velocity = np.zeros(0)
+    for time in (0.0, period):
+        angle = 12.0 * time / radius
+        place, forward = radius * np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        turned, moved = own_turn * time, own_speed * time
+        frame = np.array([[np.cos(turned), np.sin(turned)], [-np.sin(turned), np.cos(turned)]])
+        seen, ahead = frame @ (place - [moved, 0.0]), frame @ forward
+        row = observation(
+            scenario,
+            velocity=[own_speed, 0.0, 0.0],
+            angular_velocity=[0.0, 0.0, own_turn],
+            message_mask=np.arange(count) == 0,
+            message_position=[*seen, 0.0],
+            message_forward=[*ahead, 0.0],
+        )
+        velocity, *_, curvature = driver.motions(row, *driver.received(row))
+    assert curvature[0, 0] == pytest.approx(1.0 / radius, rel=0.02)
+    assert np.linalg.norm(velocity[0, 0]) == pytest.approx(12.0, rel=0.02)
+
+
 def test_the_intelligent_driver_keeps_its_distance() -> None:
     driver = IntelligentDriver(SCENARIO)
     free, near = (driver.drive(observation(velocity=[0.5, 0, 0], **way))[0][0] for way in ({}, other(0.9, 0, 0)))

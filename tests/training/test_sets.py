@@ -15,6 +15,7 @@ import torch
 from coopenv import load_scenario
 from coopenv.api.engine import Engine
 from coopenv.base.errors import AgentWarning, CoopenvError
+from coopenv.evaluation.episodes import play
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
 from coopenv.policies.sets import CONSTANTS, Inputs, SavedSetDriver, SetDriver
@@ -73,23 +74,24 @@ def test_neither_order_nor_absent_rows_matter(drawn: tuple[SetDriver, Inputs, to
     assert driver.steer((alone, landmarks[:, ::-1], more)) == pytest.approx(driver.steer((alone, landmarks, cars)))
 
 
-def inputs_at_start(**overrides: object) -> Inputs:
+def inputs_soon(**overrides: object) -> Inputs:
     scenario = load_scenario("open_square", {name.replace("__", "."): value for name, value in overrides.items()})
     engine = Engine(scenario, 4)
-    engine.reset([1, 2, 3, 4])
+    for _ in play(engine, [1, 2, 3, 4], 9):  # ticks, until messages have arrived
+        pass
     rows = engine.view("observation").reshape(16, -1)
     return SetDriver(scenario, {}).inputs(rows, np.arange(16) % 4)
 
 
 def test_inputs_have_units_whatever_the_scales() -> None:
-    usual, other = inputs_at_start(), inputs_at_start(observation__map_scale=11.0, observation__scales={})
+    usual, other = inputs_soon(), inputs_soon(observation__map_scale=11.0, observation__scales={})
     for before, after in zip(usual, other, strict=True):
         np.testing.assert_allclose(after, before, atol=1e-5)
     alone, landmarks, cars = usual
-    assert (alone.shape, landmarks.shape, cars.shape) == ((16, ALONE), (16, 6, 7), (16, 3, 11))
+    assert (alone.shape, landmarks.shape, cars.shape) == ((16, ALONE), (16, 6, 7), (16, 3, 12))
     np.testing.assert_allclose(np.linalg.norm(landmarks[..., 1:3], axis=-1), landmarks[..., 3], atol=1e-6)
     assert alone[:, -len(CONSTANTS)] == pytest.approx(1.0)  # m/s, the top speed
-    assert (cars[::4, :, 0] == 0.0).all()  # the first vehicle has the right of way over all
+    assert (cars[::4, :, -1] == 0.0).all() and cars[::4, :, 0].any()  # the first vehicle gives way to none
 
 
 def test_the_trained_environment_is_left_out() -> None:
