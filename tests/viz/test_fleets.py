@@ -69,7 +69,7 @@ def test_figures_show_them_and_say_so(fleet: Trajectory, unwritten: list[Figure]
         panels = {"errors": 2 * MOST_SHOWN, "topology": MOST_SHOWN, "consistency": 3 * MOST_SHOWN}
         assert len(figure.axes) == panels.get(name, len(figure.axes))
         if name.startswith("trajectories"):
-            drawn = {text for text in texts(figure.axes[0]) if text.startswith("$f")}
+            drawn = {text for text in texts(figure) if text.startswith("$f")}
             assert len(drawn) == len(shown)
 
 
