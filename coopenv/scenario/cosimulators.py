@@ -149,7 +149,7 @@ class Network:
     """Junctions where a road ends."""
 
 
-def with_sumo(raw: Any, where: str) -> Any:
+def with_sumo(raw: Any) -> Any:
     """Return the plain data of a scenario with what the files of its section `[sumo]` hold.
 
     What is not as it should be is left for the schema to complain about.
@@ -168,15 +168,12 @@ def with_sumo(raw: Any, where: str) -> Any:
     if made.included or not all(isinstance(given, list) for given in lists):
         return raw
     landmarks, obstacles, routes, vehicles, roads = lists
-    try:
-        network = _read_network(made)
-        marks, buildings = _shapes(made)
-        wanted = {name for v in vehicles if isinstance(v, Mapping) for name in _names(v.get("routes"))}
-        wanted -= {route.get("name") for route in routes if isinstance(route, Mapping)}
-        edges = route_edges(made) if wanted else {}
-        ways = [_route(network, name, edges[name]) for name in sorted(wanted & edges.keys())]
-    except ScenarioError as error:
-        raise ScenarioError(f"{where}: {error}") from None
+    network = _read_network(made)
+    marks, buildings = _shapes(made)
+    wanted = {name for v in vehicles if isinstance(v, Mapping) for name in _names(v.get("routes"))}
+    wanted -= {route.get("name") for route in routes if isinstance(route, Mapping)}
+    edges = route_edges(made) if wanted else {}
+    ways = [_route(network, name, edges[name]) for name in sorted(wanted & edges.keys())]
     return {
         **raw,
         "map": raw.get("map", {"origin": [*network.center, 0.0]}),

@@ -116,7 +116,7 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        text = json.dumps(with_groups(with_sumo(raw, where)), default=plain)
+        text = json.dumps(with_groups(with_sumo(raw)), default=plain)
     except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:
