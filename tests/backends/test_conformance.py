@@ -186,6 +186,12 @@ def begins_at(commands: dict[int, np.ndarray], wanted: np.ndarray) -> list[int]:
     return [k for k in possible if all(np.abs(wanted[n - k] - c).max() < 1e-6 for n, c in commands.items())]
 
 
+def driving(commands: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """Return the commands from the first speed on: a car stands until its estimate has settled."""
+    first = min((n for n, command in commands.items() if command[0]), default=len(commands) + 1)
+    return {n: command for n, command in commands.items() if n >= first}
+
+
 def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processes: Path) -> None:
     """What goes out to the gates is what the simulated vehicles follow, whatever network it takes.
 
@@ -216,13 +222,17 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
                         command = decode(arrival.payload, SVEA.topics[Role.COMMAND].type)
                         number = int(command.header.frame_id.rpartition(":")[2])
                         commands[number] = np.array([command.drive.speed, command.drive.steering_angle])
-                if min(map(len, heard.values())) >= 6:
+                if min(len(driving(commands)) for commands in heard.values()) >= 6:
                     break
         finally:
             env.close()
             network.close()
         for car, commands in heard.items():
-            assert len(commands) >= 6 and len(begins_at(commands, wanted[car])) == 1, (car, commands)
+            assert len(driving(commands)) >= 6, (car, commands)
+            assert len({k % 4 for k in begins_at(driving(commands), wanted[car])}) == 1, (
+                car,
+                commands,
+            )  # actions repeat
 
 
 @pytest.mark.parametrize("options", [{"nonsense": 1}])
