@@ -128,7 +128,7 @@ class LookAhead(RouteFollower):
         plan[due] = self.planned(observations, due)
         left[due] = HOLD
         left -= 1
-        steering, points = self.way(observations, plan, blocked)
+        steering, points = self.path(observations, plan, blocked)
         return np.minimum(self.speed(observations, points), self._pace[plan] * self.cruise), steering
 
     def blocked(self, observations: np.ndarray) -> np.ndarray:
@@ -144,8 +144,8 @@ class LookAhead(RouteFollower):
             plan[rows] = np.argmin(self.costs(observations[rows], vehicle, self.followers(observations, rows)), axis=1)
         return np.asarray(plan[np.sort(due)])
 
-    def way(self, observations: np.ndarray, plan: np.ndarray, blocked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the steering, (rows,) in rad, and the way, (rows, P, 2) in m: a first leg of the plan if blocked."""
+    def path(self, observations: np.ndarray, plan: np.ndarray, blocked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the steering, (rows,) in rad, and the path, (rows, P, 2) in m: the plan's first leg if blocked."""
         points, distance = self.route_points(observations)
         offset, along = self._first[plan], self.pursue(self.direction(observations))
         aside = offset - self.read(observations, "route_heading")[:, 0]
@@ -173,7 +173,7 @@ class LookAhead(RouteFollower):
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
         theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
-        avoided, others = self.avoided(mask, vehicle), others + self.middle * forward
+        avoided, others = self.avoided(mask, vehicle), others + self.body_center * forward
         # Whoever gives way is expected to stand, and is passed as closely as can be.
         theirs = np.where(avoided[..., None], theirs, 0.0)
         keep = np.where(avoided, keep, self.blocking)[:, None]
@@ -202,8 +202,8 @@ class LookAhead(RouteFollower):
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
             # Vehicles to give way to are expected to drive straight on at top speed.
             driven = theirs * (STEP * (step + 1)) * forward
-            middle = place + self.middle * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
-            apart = (others + driven)[:, None] - middle[:, :, None]
+            center = place + self.body_center * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
+            apart = (others + driven)[:, None] - center[:, :, None]
             lacking = keep - np.linalg.norm(apart, axis=-1)
             cost = cost + STEP * CLOSE * np.max(lacking, axis=2, where=mask[:, None], initial=0.0)
         rest = FAR + missing

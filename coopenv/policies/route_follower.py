@@ -50,7 +50,7 @@ class Driver(ABC):
         self.look_ahead = max(1.0, PURSUED * self.cruise / scenario.rates.decision)
         """Distance of the pursued point of the route, m."""
         driven = [vehicle.body for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
-        (self.length, self.width, _), (self.middle, *_) = max(
+        (self.length, self.width, _), (self.body_center, *_) = max(
             ((body.size, body.center) for body in driven), default=((*SMALL, 0.0), (0.0,))
         )
         self.scale = max(1.0, self.length / SMALL[0])
@@ -184,7 +184,7 @@ class RouteFollower(Driver):
         if scenario.topology.most_nearby is not None:
             self.traffic = np.zeros_like(self.goes_first)  # as the senders are not known
         """(N, N - 1), which senders are cars of a backend's traffic."""
-        self.discs = self.middle + (np.zeros(1) if nimble else discs_along(self.length, self.width))
+        self.discs = self.body_center + (np.zeros(1) if nimble else discs_along(self.length, self.width))
         """Centres of the discs that cover a car, m ahead of its reference point; a nimble car is one disc."""
         reach = (self.length + self.width) / 2.0 if nimble else np.hypot(self.length / len(self.discs), self.width)
         more = (self.clearance - self.closest) * self.scale
@@ -250,9 +250,9 @@ class RouteFollower(Driver):
             return np.asarray(np.min(found, axis=0))
 
         if self.nimble:
-            middles = self.middles(points)
-            going = least([middles], distance / self.cruise)
-            waiting = least([np.repeat(middles[:, :1], 2, axis=1)], np.array([0.0, 1.0]))
+            centers = self.body_centers(points)
+            going = least([centers], distance / self.cruise)
+            waiting = least([np.repeat(centers[:, :1], 2, axis=1)], np.array([0.0, 1.0]))
         else:
             times = np.linspace(0.0, self.foresight, PREDICTED)
             s = self.going(observations, times)
@@ -270,9 +270,9 @@ class RouteFollower(Driver):
         if not self.nimble:
             mask = mask & ((place[..., 0] > 0.0) | (forward[..., 0] < SAME_WAY))
         place, mask = self._covered(place, forward), np.repeat(mask, len(self.discs), axis=1)
-        near = np.linalg.norm(place - [self.middle, 0.0], axis=-1).min(axis=1, where=mask, initial=np.inf)
+        near = np.linalg.norm(place - [self.body_center, 0.0], axis=-1).min(axis=1, where=mask, initial=np.inf)
         times, soon = np.concatenate([[0.0], self._distances]) / self.cruise, SOON if self.nimble else self.foresight
-        found = nearest(self.middles(points), times, place, np.zeros_like(place), mask, soon)
+        found = nearest(self.body_centers(points), times, place, np.zeros_like(place), mask, soon)
         return np.asarray(found >= np.minimum(self.blocking, near))
 
     def _covered(self, place: np.ndarray, forward: np.ndarray) -> np.ndarray:
@@ -280,12 +280,12 @@ class RouteFollower(Driver):
         centres = place[:, :, None] + self.discs[:, None] * forward[:, :, None]
         return np.asarray(centres.reshape(len(place), -1, 2))
 
-    def middles(self, points: np.ndarray) -> np.ndarray:
-        """Return where the middle of the own body is, (rows, P, 2) in m, with the reference point at these of a way."""
+    def body_centers(self, points: np.ndarray) -> np.ndarray:
+        """Return where the center of the own body is, (rows, P, 2) in m, with the reference point at these of a way."""
         ways = np.diff(points, axis=1)
         ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
         ahead = np.concatenate([np.broadcast_to([1.0, 0.0], ways[:, :1].shape), ways], axis=1)
-        return np.asarray(points + self.middle * ahead)
+        return np.asarray(points + self.body_center * ahead)
 
     def motions(
         self, observations: np.ndarray, mask: np.ndarray, place: np.ndarray, forward: np.ndarray

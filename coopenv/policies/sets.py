@@ -68,7 +68,7 @@ class SetDriver(LookAhead):
         plans = blocked | (np.abs(self.read(observations, "route_offset")[:, 0]) > self.farthest)
         plan, due = np.zeros(len(observations), dtype=int), np.flatnonzero(plans)
         plan[due] = self.planned(observations, due)
-        around, points = self.way(observations, plan, blocked)
+        around, points = self.path(observations, plan, blocked)
         steering = np.where(plans, around, self.steer(self.inputs(observations, vehicle)))
         return self.speed(observations, points), steering
 

@@ -198,7 +198,7 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
     Commands are not sent again where a network loses one, so that actions go on until enough have been heard.
     """
     path, hub = lab
-    actions = 10 * [np.array(a, np.float32) for a in ((-1.0, 0.0), (0.5, 1.0), (1.0, -1.0), (0.0, 0.3))]
+    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (40, 2)).astype(np.float32)  # none repeats
     expected = simulated()
     expected.reset(seed=1)
     told = []
@@ -229,10 +229,7 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
             network.close()
         for car, commands in heard.items():
             assert len(driving(commands)) >= 6, (car, commands)
-            assert len({k % 4 for k in begins_at(driving(commands), wanted[car])}) == 1, (
-                car,
-                commands,
-            )  # actions repeat
+            assert len(begins_at(driving(commands), wanted[car])) == 1, (car, commands)
 
 
 @pytest.mark.parametrize("options", [{"nonsense": 1}])

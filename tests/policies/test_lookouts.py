@@ -199,11 +199,11 @@ def test_a_planner_drives_around_a_car_that_gives_way_and_blocks_its_way(y: floa
     assert RouteFollower(MUTUAL).speed(rows(3, **other(1.3, y, np.pi)))[3] == 0.0
 
 
-def test_the_middle_of_a_body_counts() -> None:
+def test_the_center_of_a_body_counts() -> None:
     """The car's reference point is its rear axle: two that meet head-on touch long before these are near."""
     driver = RouteFollower(MUTUAL)
-    assert driver.middle == pytest.approx(MUTUAL.vehicles[0].body.center[0]) and driver.middle > 0.1
-    way, touching = driver.route_points(rows(0))[0], 1.0 + 2.0 * driver.middle + driver.blocking  # m, after 1 s
+    assert driver.body_center == pytest.approx(MUTUAL.vehicles[0].body.center[0]) and driver.body_center > 0.1
+    way, touching = driver.route_points(rows(0))[0], 1.0 + 2.0 * driver.body_center + driver.blocking  # m, after 1 s
     for more, clear in ((-0.05, False), (0.05, True)):
         assert driver.clear(rows(0, **other(touching + more, 0.0, np.pi)), way)[0] == clear
 

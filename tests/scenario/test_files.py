@@ -185,6 +185,13 @@ def test_overrides(file: Path, key: str, value: Any, where: str, expected: Any) 
     assert get(load_scenario(file, {key: value}), where) == expected
 
 
+def test_a_missing_file_of_sumo_names_the_scenario_once(file: Path) -> None:
+    file.write_text(MINIMAL.replace("horizon", 'backend = "sumo"\nsumo.net = "none.net.xml"\nhorizon', 1))
+    with pytest.raises(ScenarioError, match=r"^mine\.toml: sumo\.net: .*none\.net\.xml'?: No such file") as failed:
+        load_scenario(file)
+    assert str(failed.value).count("mine.toml") == 1
+
+
 def test_star_means_every_entry_and_later_overrides_win(file: Path) -> None:
     every = {"vehicles.*.goal.radius": 0.9, "vehicles.*.initial_estimate.position_radius": 0.0}
     made = load_scenario(file, {**every, "vehicles.1.goal.radius": 1.1})

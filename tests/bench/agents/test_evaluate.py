@@ -67,6 +67,7 @@ def test_a_table_of_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", *SHORT, "--worlds", "2", "--agents", "own.py:still", "--stress"]) == 0
     out = capsys.readouterr().out
     assert "still, a third of the landmarks" in out and "still, vehicle_1 lies" in out and "…" not in out
+    assert "lies, share of the time under way" not in out
 
 
 def test_a_block_of_seeds_is_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
