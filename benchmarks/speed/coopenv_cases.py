@@ -23,6 +23,8 @@ BATCHES = (1, 32, 1024, 8192)
 QUICK_BATCHES = (1, 32, 1024)
 ROBUST = "robust"
 ROBUST_BATCH = 1024
+BIG = 1024
+"""Vehicles of one world on a grid, see `growth_scenario`."""
 BATCHES_DRAWN = 8
 """Batches of actions that are drawn beforehand, taken in turn."""
 
@@ -56,6 +58,14 @@ def own_cases(
         robust = {**sensed, "observer.name": ROBUST}
         for threads in sorted({1, all_threads()}):
             cases.append(case(f"{BATCH}, {ROBUST}", ROBUST_BATCH, threads, "float32", robust))
+        shape = {"vehicles": BIG, "landmarks": BIG, "sensed": True, "nearby": True}
+        for observer in ("riccati", ROBUST):
+            options = {"growth": {**shape, "observer": observer}}
+            name = f"{BIG:,} vehicles, {observer}"
+            cases += [
+                Case(name, COOPENV.name, 1, BIG, threads, "float32", options=options)
+                for threads in sorted({1, all_threads()})
+            ]
     if scenario.topology.mode != "sensed" and "topology.mode" not in given:
         mode = scenario.topology.mode
         cases.append(case(f"{SINGLE}, {mode}", 1, 1, "float32", given))

@@ -24,6 +24,7 @@ GROWTH_LOOKS = {
     "sensed": (style.BLUE, "o"),
     "three neighbours": (style.VERMILION, "s"),
     "nearby": (style.GREEN, "^"),
+    "nearby, robust": (style.SKY, "D"),
 }
 
 

@@ -29,6 +29,7 @@ RANGE, MOST_NEARBY = 30.0, 64
 SIZES: dict[str, tuple[int, ...]] = {
     "vehicles": (2, 4, 8, 16, 32, 64),
     "nearby": (64, 128, 256, 512, 1024, 2048, 4096),
+    "robust": (64, 128, 256, 512, 1024),
     "landmarks": (3, 6, 12, 24, 48, 64),
     "map": (64, 256, 1024, 4096, 10_000),
     "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384, 65536),
@@ -36,6 +37,7 @@ SIZES: dict[str, tuple[int, ...]] = {
 QUICK_SIZES: dict[str, tuple[int, ...]] = {
     "vehicles": (2, 8, 32),
     "nearby": (64, 256),
+    "robust": (64, 128),
     "landmarks": (3, 12, 48),
     "map": (64, 1024),
     "worlds": (1, 64, 4096),
@@ -53,11 +55,13 @@ class Sweep:
     sizes: tuple[int, ...]
     nearby: bool = False
     """A grid of vehicles and landmarks with ranges, in one world: its density stays the same."""
+    observer: str = "riccati"
 
     @property
     def kind(self) -> str:
-        """What vehicles measure."""
-        return "three neighbours" if not self.sensed else "nearby" if self.nearby else "sensed"
+        """What vehicles measure, and the observer if it is another one than in the other sweeps."""
+        kind = "three neighbours" if not self.sensed else "nearby" if self.nearby else "sensed"
+        return kind if self.observer == "riccati" else f"{kind}, {self.observer}"
 
     @property
     def label(self) -> str:
@@ -73,7 +77,8 @@ class Sweep:
                 shape = {"vehicles": NEARBY_VEHICLES, "landmarks": size, "worlds": 1}
             shape[self.quantity] = size
             worlds = shape.pop("worlds")
-            options = {"growth": {**shape, "sensed": self.sensed, "nearby": self.nearby}}
+            given = {"sensed": self.sensed, "nearby": self.nearby, "observer": self.observer}
+            options = {"growth": {**shape, **given}}
             cases.append(Case(self.label, COOPENV.name, worlds, shape["vehicles"], options=options))
         return cases
 
@@ -85,6 +90,7 @@ def sweeps(quick: bool = False) -> list[Sweep]:
         Sweep("vehicles", True, sizes["vehicles"]),
         Sweep("vehicles", False, sizes["vehicles"]),
         Sweep("vehicles", True, sizes["nearby"], nearby=True),
+        Sweep("vehicles", True, sizes["robust"], nearby=True, observer="robust"),
         Sweep("landmarks", True, sizes["landmarks"]),
         Sweep("landmarks", True, sizes["map"], nearby=True),
         Sweep("worlds", True, sizes["worlds"]),
@@ -97,7 +103,9 @@ def grid(count: int) -> list[tuple[float, float]]:
     return [(SPACING * (i % columns - columns // 2), SPACING * (i // columns - columns // 2)) for i in range(count)]
 
 
-def growth_scenario(vehicles: int, landmarks: int, sensed: bool, nearby: bool = False) -> Scenario:
+def growth_scenario(
+    vehicles: int, landmarks: int, sensed: bool, nearby: bool = False, observer: str = "riccati"
+) -> Scenario:
     """Return the busy intersection with other numbers of vehicles (two columns) and landmarks (on a circle).
 
     With `nearby` both stand on a grid and have ranges, and vehicles drive in circles.
@@ -110,6 +118,7 @@ def growth_scenario(vehicles: int, landmarks: int, sensed: bool, nearby: bool = 
         for i, (name, a) in enumerate(zip(names, angles, strict=True))
     ]
     raw["topology"] = {"mode": "sensed" if sensed else "fixed"}
+    raw["observer"]["name"] = observer
     template = raw["vehicles"][0]
     raw["vehicles"] = []
     for i in range(vehicles):

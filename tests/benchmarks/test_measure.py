@@ -267,6 +267,6 @@ def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert {case.name for case in peer_cases()} <= shown
     assert {row["worlds"] for row in document["rows"] if row["name"] == "make_vec"} == {1, 32, 1024}
     assert all(row["array_bytes_per_world"] > 1000 for row in document["rows"] if row["library"] == "coopenv")
-    assert len(document["growth"]) == 6
+    assert len(document["growth"]) == 7
     assert all(growth["costs"] for growth in document["growth"])
     assert "coopenv" in document["startup_s"]["imports"]

@@ -307,10 +307,8 @@ def fitted(model: Any) -> Embedded:
     return KALMAN if (model.observer.k.numpy() == 1.0).all() else RICCATI
 
 
-RICCATI = Embedded(
-    "riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION, fused=True
-)
-KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step))
+RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION)
+KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step), fused=True)
 """Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
 
 
@@ -344,4 +342,4 @@ def estimate_dead_reckoning(model: Any, state: Any, memory: Any, world: int, veh
         state.corrected_tick[world, vehicle] = now.tick
 
 
-DEAD_RECKONING = Embedded("dead_reckoning", estimate_dead_reckoning, start_dead_reckoning, send_nothing, fused=True)
+DEAD_RECKONING = Embedded("dead_reckoning", estimate_dead_reckoning, start_dead_reckoning, send_nothing)
