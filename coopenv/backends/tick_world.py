@@ -206,12 +206,12 @@ class TickWorld(SensingWorld):
             self._backend.broadcast([self._broadcast_of(i) for i in estimated])
 
     def _broadcast_of(self, vehicle: int) -> VehicleBroadcast:
-        view, message = self.view, None
-        if self.observer.messages is not None:
-            message = self.observer.messages.write(self._parts_of(vehicle))
+        view, messages = self.view, self.observer.messages
+        message = None if messages is None else messages.write(self._parts_of(vehicle))
         R = np.array(view("estimate_rotation")[0, vehicle], dtype=float)
         position = R @ np.array(view("estimate_position")[0, vehicle], dtype=float)
-        return VehicleBroadcast(vehicle, R, position, np.array(view("covariance")[0, vehicle], dtype=float), message)
+        P, level = np.array(view("covariance")[0, vehicle], dtype=float), view("protection_level")[0, vehicle, 0]
+        return VehicleBroadcast(vehicle, R, position, P, message, float(level))
 
     def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""

@@ -233,12 +233,15 @@ class Safety(Section):
     """Source of the positions for geofence and separation."""
     max_error: Positive | None = 0.15
     """Largest distance between a car's estimated position and that of motion capture, while this is known, m. A car
-    stands until its estimate has been within this and the next three limits for 0.2 s, 2 s at most. All cars are
+    stands until its estimate has been within this and the next four limits for 0.2 s, 2 s at most. All cars are
     stopped when one of them has then been exceeded for 0.2 s."""
     max_turn_error: Positive | None = 0.15
     """Largest angle between a car's estimated orientation and that of motion capture, rad."""
     max_std: Positive | None = None
     """Largest standard deviation of the estimated position, m."""
+    max_protection_level: Positive | None = None
+    """Largest horizontal protection level, if the observer states one, m: how far off it may be if one landmark, sender
+    or sensor is faulty. It is unknown, and thus too large, where the others do not determine the pose."""
     max_nis: Positive | None = 10.0
     """Largest normalised innovation squared per degree of freedom, the median over the bearings to static landmarks in
     the last second: below 1 where all is well. Bearings that the observer rejects count."""

@@ -106,7 +106,7 @@ class LinkMonitor:
             recent.append(Place(position, time, velocity))
             self.places = {**self.places, car: recent[-1]}
 
-    def judge(self, car: str, safety: Safety, error: float, turn: float, std: float, nis: Array) -> None:
+    def judge(self, car: str, safety: Safety, error: float, turn: float, std: float, level: float, nis: Array) -> None:
         """Compare an estimate with the limits.
 
         Args:
@@ -115,6 +115,7 @@ class LinkMonitor:
             error: distance to the true position, m; NaN: not known.
             turn: angle to the true orientation, rad; NaN: not known.
             std: of its position, m.
+            level: horizontal protection level, m.
             nis: per degree of freedom, of the bearings of its tick.
         """
         now, recent = self.looked, self._nis.setdefault(car, deque())
@@ -126,6 +127,7 @@ class LinkMonitor:
             (error, "max_error", " m from motion capture"),
             (turn, "max_turn_error", " rad from motion capture"),
             (std, "max_std", " m uncertain"),
+            (level, "max_protection_level", " m off at worst, if one source is faulty"),
             (median, "max_nis", " squared standard deviations from its bearings"),
         )
         for value, name, what in measured:

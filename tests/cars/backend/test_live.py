@@ -243,6 +243,7 @@ def test_cars_stand_before_they_break_a_rule(lab: Any, tmp_path: Path, safety: s
 
 
 BLIND = "max_error = 1e6\nmax_turn_error = 4.0\n"
+ROBUST = 'overrides = { "observer.name" = "robust" }\n'
 LOW = 'overrides = { "camera.position" = [0.165, 0.0, 0.065] }\n'
 
 
@@ -252,6 +253,7 @@ LOW = 'overrides = { "camera.position" = [0.165, 0.0, 0.065] }\n'
         ("", "swapped_signatures@0+6", "", "from motion capture"),
         ("", "swapped_signatures@0+6", BLIND, "its bearings"),
         (LOW, "swapped_signatures@60", "", "m from motion capture"),
+        (ROBUST, "swapped_signatures@0+6", BLIND + "max_protection_level = 0.5\n", "if one source is faulty"),
     ],
 )
 def test_cars_stand_until_an_estimate_settles_that_is_wrong(

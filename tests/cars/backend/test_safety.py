@@ -76,20 +76,21 @@ def test_places_come_from_what_judges() -> None:
 
 def test_an_estimate_that_is_wrong_for_long_is_doubted() -> None:
     monitor, none, unknown = LinkMonitor("truth"), np.zeros(0), (float("nan"), float("nan"))
-    safety = Safety(max_std=0.5)
+    safety = Safety(max_std=0.5, max_protection_level=1.0)
     cases = {
-        "0.2 m from motion capture, safety.max_error = 0.15": (0.2, 0.0, 0.1, none),
-        "0.3 rad from motion capture, safety.max_turn_error = 0.15": (0.0, 0.3, 0.1, none),
-        "0.6 m uncertain, safety.max_std = 0.5": (*unknown, 0.6, none),
-        "20 squared standard deviations from its bearings": (*unknown, 0.1, np.full(8, 20.0)),
-        "": (0.1, 0.1, 0.4, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
+        "0.2 m from motion capture, safety.max_error = 0.15": (0.2, 0.0, 0.1, 0.0, none),
+        "0.3 rad from motion capture, safety.max_turn_error = 0.15": (0.0, 0.3, 0.1, 0.0, none),
+        "0.6 m uncertain, safety.max_std = 0.5": (*unknown, 0.6, 0.0, none),
+        "inf m off at worst, if one source is faulty, safety.max_protection_level = 1": (*unknown, 0.1, np.inf, none),
+        "20 squared standard deviations from its bearings": (*unknown, 0.1, 0.0, np.full(8, 20.0)),
+        "": (0.1, 0.1, 0.4, 0.9, np.array([*[1.0] * 5, *[1e6] * 4])),  # false bearings are fewer than half
     }
     for (said, given), settled in itertools.product(cases.items(), (False, True)):
         monitor.begin(BEGIN)
         for ms in (0, 100, 190, 210) if settled else ():
             assert not monitor.settled("a")
             monitor.looked = BEGIN + ms * MS
-            monitor.judge("a", safety, 0.0, 0.0, 0.0, none)
+            monitor.judge("a", safety, 0.0, 0.0, 0.0, 0.0, none)
         assert monitor.settled("a") == settled
         begin, patience = monitor.looked, 200 if settled else 2000
         for ms in (0, patience // 2, patience - 10, patience + 10):
