@@ -19,8 +19,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Small matrices: more BLAS threads only get in each other's way. Read when NumPy is loaded, so not in a fixture.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Numba's functions of the observers are compiled in two thirds of the time, and run as fast and to the same bits.
-os.environ.setdefault("NUMBA_OPT", "2")
 # Containers often forbid byte code: each of hundreds of processes then compiles all the Python that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

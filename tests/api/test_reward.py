@@ -268,6 +268,7 @@ def test_standing_still_earns_least(name: str) -> None:
     assert all(run(name, driver, times=times_of[driver]).total > still for driver in times_of)
 
 
+@cache
 def returns_of(team: str, own_share: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rewards, flags of termination and of being alive, (steps, 2, 4), of worlds that `peek` drives."""
     scenario = load_scenario("open_square", {"reward.team": team, "reward.own_share": own_share, "horizon": 30.0})
