@@ -86,13 +86,13 @@ def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -
 
 LINES_AND_FILES = {
     ".": (123, 2),
-    "api": (4155, 19),
+    "api": (4165, 19),
     "backends": (3845, 20),
-    "base": (1765, 10),
+    "base": (1775, 10),
     "bench": (5325, 19),
     "cars": (10650, 47),
     "cli": (2607, 8),
-    "estimation": (1840, 8),
+    "estimation": (1845, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
     "policies": (1965, 9),

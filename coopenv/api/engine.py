@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 import warp as wp
@@ -340,6 +340,10 @@ class Saved(Explained):
     def __len__(self) -> int:
         """Return the number of vehicles in all worlds."""
         return self.engine.world.worlds * len(self.scenario.vehicles)
+
+    def __getitem__(self, key: object) -> NoReturn:
+        """Refuse, also iteration and `in`, which ask for this."""
+        raise TypeError(f"{type(self).__name__} has no entries; reset() and step() return those of its agents")
 
     def __repr__(self) -> str:
         return one_line(self, self.metadata["name"].removesuffix("_v0"), self._facts)

@@ -26,7 +26,7 @@ from coopenv.api.engine import NO_PICTURE, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of, shown, suggest, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, shown, suggest, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.reset import ABSENT
 from coopenv.world.state import FAULTS, LASTING_ERRORS
@@ -123,6 +123,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         check_one_of("unknown agent", agent, self._index)
         return self.action_spaces[agent]
 
+    @explained
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode.
 
@@ -269,6 +270,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         """Return the state for a central critic, (S,), with the truth; see `coopenv.api.arguments.world_states`."""
         return np.asarray(world_states(self.engine.view, self.scenario)[0])
 
+    @explained
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:

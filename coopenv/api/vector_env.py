@@ -25,7 +25,7 @@ from coopenv.api.arguments import (
 )
 from coopenv.api.engine import NO_PICTURE, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of, world_keys
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, world_keys
 from coopenv.base.installation import install_command
 from coopenv.scenario import Scenario
 
@@ -116,6 +116,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return rows (num_envs, ...) as (num_worlds, vehicles, ...), without a copy."""
         return rows.reshape(self.num_worlds, self.vehicles, *rows.shape[1:])
 
+    @explained
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -293,6 +294,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"{len(keys)} seeds for {self.num_worlds} worlds")
         return keys
 
+    @explained
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:

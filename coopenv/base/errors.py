@@ -181,6 +181,13 @@ def suggest(word: str, valid: Iterable[str]) -> str:
     return f" (did you mean '{known[near[0]]}'?)" if near else ""
 
 
+HINTS = {
+    "position_covariance": '; of an info: position_covariance(**info["estimate"])',
+    "render": "; render_mode is given where the environment is made",
+}
+"""What follows the list of arguments in the error of a function."""
+
+
 class Explained:
     """Has an error that lists what there is where an attribute is missing."""
 
@@ -196,20 +203,23 @@ class Explained:
 
 
 def explained(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function whose errors for wrong arguments list those that there are."""
+    """Return a function or method whose errors for wrong arguments list those that there are."""
     form = signature(function)
-    known = [*form.parameters]
+    known = [name for name in form.parameters if name != "self"]
+    hint = HINTS.get(function.__name__, "")
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for name in [name for name in kwargs if name not in known]:
-            there = f"{suggest(name, known)}; known: {listed(known)}; keys of a scenario are given in overrides"
-            raise TypeError(f"{function.__name__}: unknown argument '{name}'{there}")
+            there = f"{suggest(name, known)}; known: {listed(known) or 'none'}"
+            keys = "; keys of a scenario are given in overrides" if "overrides" in known else ""
+            raise TypeError(f"{function.__name__}: unknown argument '{name}'{there}{keys}{hint}")
         try:
             form.bind(*args, **kwargs)
         except TypeError as error:  # too many, twice, or missing
             by_name = [name for name, one in form.parameters.items() if one.kind is one.KEYWORD_ONLY]
-            raise TypeError(f"{function.__name__}: {error}; by name: {listed(by_name or known)}") from None
+            there = listed(by_name or known) or "none"
+            raise TypeError(f"{function.__name__}: {error}; by name: {there}{hint}") from None
         return function(*args, **kwargs)
 
     return call

@@ -72,7 +72,7 @@ class Entrant:
     policy: Policy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Contest:
     """Drivers, and the held-out worlds that each of them drives in."""
 
@@ -146,7 +146,7 @@ class Contest:
         return Evaluation(**vars(self), episodes=episodes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation(Contest, Tabular):
     """What drivers did, and their figures, by their names; printed, it is its tables.
 

@@ -54,7 +54,7 @@ class ObservabilityInterval(NamedTuple):
     observable: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordedGeometry:
     """Where vehicles and targets were, and what was seen; axes as in `Trajectory`."""
 
@@ -65,7 +65,7 @@ class RecordedGeometry:
     vehicles: Annotated[np.ndarray, "U N"]  # names
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory(RecordedGeometry, Tabular):
     """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).
 

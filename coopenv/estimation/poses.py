@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv, dpotrf
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import explained
 from coopenv.base.format import LARGEST
 
 Array = NDArray[np.float64]
@@ -243,6 +244,7 @@ def covariance_in_map(coordinates: Coordinates, rotation: Array, position: Array
     return np.asarray(J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2))
 
 
+@explained
 def position_covariance(rotation: Array, position: Array, covariance: Array) -> Array:
     """Return covariances (..., 3, 3) of estimated positions in the map frame, m^2, to first order.
 

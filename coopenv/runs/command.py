@@ -211,7 +211,7 @@ def report(run: Rollout, result: "Results", folder: Path, out: Console) -> None:
 _NEEDED = ("environment", "seed", "policy", "overrides", "versions", "steady_from_s", "vehicles")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Results(Tabular):
     """What a run has come to, as in its folder; printed, it is its table.
 

@@ -105,6 +105,9 @@ class Scenario(Section, metaclass=_Loaded):
 
         def __or__(self, overrides: Mapping[str, Any]) -> Self: ...
 
+    def __hash__(self) -> int:
+        return hash(repr(self))  # equal scenarios have equal facts
+
     def __repr__(self) -> str:
         return one_line(self, self.title, self.facts)
 

@@ -346,3 +346,40 @@ def test_the_shell_compares_under_the_name_of_python(capsys: pytest.CaptureFixtu
     short = ["--override", "horizon=0.3", "--seeds", "1", "--jobs", "1", "--json"]
     assert main(["compare", ENV, "--observers", "dead_reckoning", *short]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0]["observer"] == "dead_reckoning"
+
+
+CALLS: dict[str, tuple[Callable[[], Any], str]] = {
+    "render as in OpenAI Gym": (
+        lambda: coopenv.parallel_env(ENV).render("human"),
+        "render_mode is given where",
+    ),
+    "render by mode": (lambda: coopenv.parallel_env(ENV).render(mode="human"), "render_mode is given where"),
+    "reset of a batch by position": (lambda: coopenv.make_vec(ENV, num_worlds=1).reset(3), "by name: seed, options"),
+    "unknown argument of reset": (lambda: coopenv.parallel_env(ENV).reset(sede=3), r"did you mean 'seed'"),
+    "covariance without position": (lambda: coopenv.position_covariance(np.eye(3), np.eye(6)), r"\*\*info\["),
+    "entry of an environment": (lambda: coopenv.parallel_env(ENV)["vehicle_1"], r"reset\(\) and step\(\) return"),
+    "row of a batch": (lambda: coopenv.make_vec(ENV, num_worlds=1)[0], r"reset\(\) and step\(\) return"),
+    "agents by iteration": (lambda: [*coopenv.parallel_env(ENV)], r"reset\(\) and step\(\) return"),
+    "agent by `in`": (lambda: "vehicle_1" in coopenv.parallel_env(ENV), r"reset\(\) and step\(\) return"),
+}
+
+
+@pytest.mark.parametrize("habit", CALLS)
+def test_wrong_calls_are_answered_by_what_there_is(habit: str) -> None:
+    call, answer = CALLS[habit]
+    with pytest.raises(TypeError, match=answer) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert "self" not in str(caught.value)
+
+
+def test_results_and_scenarios_are_compared_and_hashed(scenario: Scenario) -> None:
+    """Results by identity, because equality of their arrays has no single truth value; scenarios by value."""
+    run = coopenv.run(scenario, seed=0)
+    results = [run, run.trajectory, coopenv.compare(["dead_reckoning"], scenario, seeds=1)]
+    results.append(coopenv.evaluate(scenario, ["peek"], worlds=2))
+    for result in results:
+        assert result == result and result != pickle.loads(pickle.dumps(result))
+        assert {result: 1}[result] == 1
+    assert {scenario: 1}[copy.deepcopy(scenario)] == 1
+    assert scenario != scenario | {"horizon": 1}

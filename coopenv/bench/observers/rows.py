@@ -293,7 +293,7 @@ def spread(rows: Sequence[Row] | Sequence[WindowRow], column: str) -> Spread:
     return Spread(float(np.median(values[known])), float(getattr(worst, column)), float(error), worst.vehicle)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Leaderboard:
     """How observers did on the same records, summed up over seeds."""
 
