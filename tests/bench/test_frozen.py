@@ -56,6 +56,14 @@ def test_an_own_observer_has_its_row_beside_the_zoo(
     assert rows["facade", "Ekf"]["rmse_m"] < 0.5 * rows["facade", "dead_reckoning"]["rmse_m"]
 
 
+def test_driven_scenes_are_the_frozen_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among cars that drivers plan for, a changed driver changes the records; then the version is frozen anew."""
+    monkeypatch.chdir(tmp_path)
+    scenes = "behind_truck,open_square"
+    assert main(["bench", "v1", "dead_reckoning", "--scenes", scenes, "--jobs", "1"]) == 0
+    assert json.loads((tmp_path / "bench_v1.json").read_text())["remarks"] == ["28 scenes were left out"]
+
+
 def test_differences_from_the_shipped_result_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (
         (frozen.FOLDER / "v1.toml")
