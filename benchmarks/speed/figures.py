@@ -93,7 +93,7 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
             _growth_curve(ax, g)
         _logarithmic(ax)
         low, high = ax.get_ylim()
-        ax.set_ylim(low, high * (high / low) ** 0.35)  # room for the legend
+        ax.set_ylim(low, high * (high / low) ** 0.45)  # room for the legend
         ax.legend(fontsize=style.SMALL, frameon=False, loc="upper left")
         held = "" if quantity == "worlds" else f" ({WORLDS} worlds)"
         style.tidy(ax, x_label=quantity, y_label=f"CPU time of one step{held} [ms]")
@@ -103,8 +103,7 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
 
 def _growth_curve(ax: Axes, g: Growth) -> None:
     colour, marker = GROWTH_LOOKS[g.sweep.kind]
-    kind = f"{g.sweep.kind}, one world" if g.sweep.nearby else g.sweep.kind
-    label = f"{kind}: $n^{{{g.large.exponent:.2f}}}$ (dotted)"
+    label = f"{g.sweep.kind}: $n^{{{g.large.exponent:.2f}}}$"
     ax.plot(
         g.sizes, 1e3 * np.array(g.costs), color=colour, marker=marker, markersize=4, linewidth=style.LINE, label=label
     )

@@ -240,8 +240,8 @@ class Safety(Section):
     max_std: Positive | None = None
     """Largest standard deviation of the estimated position, m."""
     max_protection_level: Positive | None = None
-    """Largest horizontal protection level, if the observer states one, m: how far off it may be if one landmark, sender
-    or sensor is faulty. It is unknown, and thus too large, where the others do not determine the pose."""
+    """Largest horizontal protection level of `robust`, m: how far off the estimate may be if one landmark, sender or
+    sensor is faulty. Unknown, and so too large, are those of other observers, and where the rest determines no pose."""
     max_nis: Positive | None = 10.0
     """Largest normalised innovation squared per degree of freedom, the median over the bearings to static landmarks in
     the last second: below 1 where all is well. Bearings that the observer rejects count."""
