@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import psutil
 
-from coopenv.base.errors import CoopenvError, error_text
+from coopenv.base.errors import CoopenvError, error_text, shown
 from coopenv.base.installation import ONE_THREAD, available_cores, environment, install_command, needing
 from coopenv.base.interrupts import end_with_parent, held
 
@@ -232,6 +232,10 @@ class Local:
     jobs: int
     limits: Limits | None = None
     """Of observers, in `coopenv.bench.observers.judge.judge_all`; None: none, and they may run in this process."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.jobs, int) or self.jobs < 1:
+            raise CoopenvError(f"jobs: expected a whole number from 1 on, got {shown(self.jobs)}")
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task."""

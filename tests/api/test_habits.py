@@ -16,7 +16,7 @@ import pytest
 
 import coopenv
 from coopenv.api.arguments import Info
-from coopenv.base.errors import Explained
+from coopenv.base.errors import CoopenvError, Explained
 from coopenv.cli import main
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
@@ -383,3 +383,9 @@ def test_results_and_scenarios_are_compared_and_hashed(scenario: Scenario) -> No
         assert {result: 1}[result] == 1
     assert {scenario: 1}[copy.deepcopy(scenario)] == 1
     assert scenario != scenario | {"horizon": 1}
+
+
+@pytest.mark.parametrize("jobs", [0, -3, 1.5, "x"])
+def test_jobs_are_a_whole_number_from_1_on(scenario: Scenario, jobs: Any) -> None:
+    with pytest.raises(CoopenvError, match="jobs: expected a whole number from 1 on, got"):
+        coopenv.compare("dead_reckoning", scenario, seeds=1, jobs=jobs)
