@@ -103,7 +103,8 @@ def draw_growth(found: list[Growth], path: Path) -> Path:
 
 def _growth_curve(ax: Axes, g: Growth) -> None:
     colour, marker = GROWTH_LOOKS[g.sweep.kind]
-    label = f"{g.sweep.kind}: $n^{{{g.large.exponent:.2f}}}$"
+    kind = f"{g.sweep.kind}, one world" if g.sweep.nearby else g.sweep.kind
+    label = f"{kind}: $n^{{{g.large.exponent:.2f}}}$"
     ax.plot(
         g.sizes, 1e3 * np.array(g.costs), color=colour, marker=marker, markersize=4, linewidth=style.LINE, label=label
     )

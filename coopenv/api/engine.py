@@ -314,6 +314,7 @@ class Engine:
 
 
 NO_PICTURE = "render() shows nothing: make the environment with render_mode='rgb_array'"
+RENDER_HINT = "; render_mode is given where the environment is made"
 
 
 class Saved(Explained):

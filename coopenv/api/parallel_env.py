@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import NO_PICTURE, Engine, Saved
+from coopenv.api.engine import NO_PICTURE, RENDER_HINT, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Broadcasting, Health
 from coopenv.backends.sources import simulation_of
@@ -270,7 +271,7 @@ class CooperativeLocalisationEnv(Saved, ParallelEnv[str, Any, np.ndarray]):
         """Return the state for a central critic, (S,), with the truth; see `coopenv.api.arguments.world_states`."""
         return np.asarray(world_states(self.engine.view, self.scenario)[0])
 
-    @explained
+    @partial(explained, hint=RENDER_HINT)
     def render(self) -> np.ndarray | None:
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:

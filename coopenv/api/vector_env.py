@@ -3,7 +3,7 @@
 import warnings
 from collections import deque
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from typing import Any, Literal
 
@@ -23,7 +23,7 @@ from coopenv.api.arguments import (
     world_parameters,
     world_states,
 )
-from coopenv.api.engine import NO_PICTURE, Engine, Saved
+from coopenv.api.engine import NO_PICTURE, RENDER_HINT, Engine, Saved
 from coopenv.api.terms.layout import action_space, observation_space
 from coopenv.base.errors import ActionError, CoopenvError, check_one_of, explained, world_keys
 from coopenv.base.installation import install_command
@@ -294,7 +294,7 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"{len(keys)} seeds for {self.num_worlds} worlds")
         return keys
 
-    @explained
+    @partial(explained, hint=RENDER_HINT)
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:

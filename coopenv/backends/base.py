@@ -76,7 +76,7 @@ class VehicleBroadcast:
     position: Array  # (3,) of the body's origin, map, m
     covariance: Array  # (6, 6) over (2 lambda, p)
     message: Message | None  # of an observer that has messages of its own
-    protection_level: float = 0.0  # m, horizontal; inf: unknown, 0: the observer states none
+    protection_level: float = np.inf  # m, horizontal; inf: unknown, or none stated
 
 
 @dataclass

@@ -210,8 +210,8 @@ class TickWorld(SensingWorld):
         message = None if messages is None else messages.write(self._parts_of(vehicle))
         R = np.array(view("estimate_rotation")[0, vehicle], dtype=float)
         position = R @ np.array(view("estimate_position")[0, vehicle], dtype=float)
-        P, level = np.array(view("covariance")[0, vehicle], dtype=float), view("protection_level")[0, vehicle, 0]
-        return VehicleBroadcast(vehicle, R, position, P, message, float(level))
+        P, level = np.array(view("covariance")[0, vehicle], dtype=float), float(view("protection_level")[0, vehicle, 0])
+        return VehicleBroadcast(vehicle, R, position, P, message, level or np.inf)
 
     def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""

@@ -181,13 +181,6 @@ def suggest(word: str, valid: Iterable[str]) -> str:
     return f" (did you mean '{known[near[0]]}'?)" if near else ""
 
 
-HINTS = {
-    "position_covariance": '; of an info: position_covariance(**info["estimate"])',
-    "render": "; render_mode is given where the environment is made",
-}
-"""What follows the list of arguments in the error of a function."""
-
-
 class Explained:
     """Has an error that lists what there is where an attribute is missing."""
 
@@ -202,11 +195,10 @@ class Explained:
             raise AttributeError(f"{type(self).__name__} has no attribute '{name}'{known}")
 
 
-def explained(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function or method whose errors for wrong arguments list those that there are."""
+def explained(function: Callable[P, R], hint: str = "") -> Callable[P, R]:
+    """Return a function or method whose errors for wrong arguments list those that there are, before a hint."""
     form = signature(function)
     known = [name for name in form.parameters if name != "self"]
-    hint = HINTS.get(function.__name__, "")
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -8,6 +8,7 @@ for Robotics, 2017, chapter 7 (there translations come first).
 import math
 from collections.abc import Callable, Mapping
 from enum import Enum
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,7 +245,7 @@ def covariance_in_map(coordinates: Coordinates, rotation: Array, position: Array
     return np.asarray(J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2))
 
 
-@explained
+@partial(explained, hint='; of an info: position_covariance(**info["estimate"])')
 def position_covariance(rotation: Array, position: Array, covariance: Array) -> Array:
     """Return covariances (..., 3, 3) of estimated positions in the map frame, m^2, to first order.
 

@@ -6,6 +6,7 @@ import copy
 import json
 import pickle
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -16,7 +17,7 @@ import pytest
 
 import coopenv
 from coopenv.api.arguments import Info
-from coopenv.base.errors import CoopenvError, Explained
+from coopenv.base.errors import Explained
 from coopenv.cli import main
 from coopenv.runs import record, rollout
 from coopenv.scenario import Scenario
@@ -224,6 +225,10 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a policy": (lambda: coopenv.run(ENV, policy="PEEK"), r"^unknown policy 'PEEK' \(did you mean 'peek'\?\)"),
     "an observer's number": (lambda: coopenv.compare(3, ENV), r"^expected a name, a class or a list"),  # type: ignore[arg-type]
     "worlds": (lambda: coopenv.make_vec(ENV, num_worlds=2.0), "^num_worlds must be at least 1, whole"),  # type: ignore[arg-type]
+    **{
+        f"{jobs!r} jobs": (partial(coopenv.compare, "dead_reckoning", ENV, jobs=jobs), "^jobs: expected a whole number")
+        for jobs in (0, -3, 1.5, "x")
+    },
 }
 
 
@@ -235,7 +240,7 @@ def test_a_mistake_is_one_line(mistake: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-UNKNOWN: dict[str, tuple[Callable[[], Any], str]] = {
+WRONG_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a keyword of Gymnasium": (
         lambda: coopenv.make_vec(ENV, num_envs=2),  # type: ignore[call-arg]
         r"^make_vec: unknown argument 'num_envs' \(did you mean 'num_worlds'\?\); known: name_or_path, num_worlds, .*",
@@ -247,15 +252,27 @@ UNKNOWN: dict[str, tuple[Callable[[], Any], str]] = {
     "an option of the shell": (lambda: coopenv.run(ENV, set={}), r"^run: .*'set' \(did you mean 'overrides'\?\)"),  # type: ignore[call-arg]
     "seeds": (lambda: coopenv.run(ENV, seeds=3), r"^run: .*'seeds' \(did you mean 'seed'\?\)"),  # type: ignore[call-arg]
     "through Gymnasium": (lambda: gymnasium.make("coopenv/Facade-v0", observr="mekf"), r"did you mean 'observer'\?"),
+    "render as in OpenAI Gym": (
+        lambda: coopenv.parallel_env(ENV).render("human"),
+        "render_mode is given where",
+    ),
+    "render by mode": (lambda: coopenv.parallel_env(ENV).render(mode="human"), "render_mode is given where"),
+    "reset of a batch by position": (lambda: coopenv.make_vec(ENV, num_worlds=1).reset(3), "by name: seed, options"),
+    "unknown argument of reset": (lambda: coopenv.parallel_env(ENV).reset(sede=3), r"did you mean 'seed'"),
+    "covariance without position": (lambda: coopenv.position_covariance(np.eye(3), np.eye(6)), r"\*\*info\["),
+    "entry of an environment": (lambda: coopenv.parallel_env(ENV)["vehicle_1"], r"reset\(\) and step\(\) return"),
+    "row of a batch": (lambda: coopenv.make_vec(ENV, num_worlds=1)[0], r"reset\(\) and step\(\) return"),
+    "agents by iteration": (lambda: [*coopenv.parallel_env(ENV)], r"reset\(\) and step\(\) return"),
+    "agent by `in`": (lambda: "vehicle_1" in coopenv.parallel_env(ENV), r"reset\(\) and step\(\) return"),
 }
 
 
-@pytest.mark.parametrize("mistake", UNKNOWN)
-def test_an_unknown_argument_is_one_line(mistake: str) -> None:
-    attempt, words = UNKNOWN[mistake]
+@pytest.mark.parametrize("mistake", WRONG_CALLS)
+def test_a_wrong_call_is_one_line(mistake: str) -> None:
+    attempt, words = WRONG_CALLS[mistake]
     with pytest.raises(TypeError, match=words) as caught:
         attempt()
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and "self" not in str(caught.value)
 
 
 ABSENT: dict[str, tuple[Callable[[], Any], str]] = {
@@ -348,31 +365,6 @@ def test_the_shell_compares_under_the_name_of_python(capsys: pytest.CaptureFixtu
     assert json.loads(capsys.readouterr().out)["rows"][0]["observer"] == "dead_reckoning"
 
 
-CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "render as in OpenAI Gym": (
-        lambda: coopenv.parallel_env(ENV).render("human"),
-        "render_mode is given where",
-    ),
-    "render by mode": (lambda: coopenv.parallel_env(ENV).render(mode="human"), "render_mode is given where"),
-    "reset of a batch by position": (lambda: coopenv.make_vec(ENV, num_worlds=1).reset(3), "by name: seed, options"),
-    "unknown argument of reset": (lambda: coopenv.parallel_env(ENV).reset(sede=3), r"did you mean 'seed'"),
-    "covariance without position": (lambda: coopenv.position_covariance(np.eye(3), np.eye(6)), r"\*\*info\["),
-    "entry of an environment": (lambda: coopenv.parallel_env(ENV)["vehicle_1"], r"reset\(\) and step\(\) return"),
-    "row of a batch": (lambda: coopenv.make_vec(ENV, num_worlds=1)[0], r"reset\(\) and step\(\) return"),
-    "agents by iteration": (lambda: [*coopenv.parallel_env(ENV)], r"reset\(\) and step\(\) return"),
-    "agent by `in`": (lambda: "vehicle_1" in coopenv.parallel_env(ENV), r"reset\(\) and step\(\) return"),
-}
-
-
-@pytest.mark.parametrize("habit", CALLS)
-def test_wrong_calls_are_answered_by_what_there_is(habit: str) -> None:
-    call, answer = CALLS[habit]
-    with pytest.raises(TypeError, match=answer) as caught:
-        call()
-    assert "\n" not in str(caught.value)
-    assert "self" not in str(caught.value)
-
-
 def test_results_and_scenarios_are_compared_and_hashed(scenario: Scenario) -> None:
     """Results by identity, because equality of their arrays has no single truth value; scenarios by value."""
     run = coopenv.run(scenario, seed=0)
@@ -383,9 +375,3 @@ def test_results_and_scenarios_are_compared_and_hashed(scenario: Scenario) -> No
         assert {result: 1}[result] == 1
     assert {scenario: 1}[copy.deepcopy(scenario)] == 1
     assert scenario != scenario | {"horizon": 1}
-
-
-@pytest.mark.parametrize("jobs", [0, -3, 1.5, "x"])
-def test_jobs_are_a_whole_number_from_1_on(scenario: Scenario, jobs: Any) -> None:
-    with pytest.raises(CoopenvError, match="jobs: expected a whole number from 1 on, got"):
-        coopenv.compare("dead_reckoning", scenario, seeds=1, jobs=jobs)

@@ -111,7 +111,7 @@ def board(folder: Path, monkeypatch: pytest.MonkeyPatch, names: list[str], *more
 
 
 def test_what_misbehaves_is_ended_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ["Waits", "Allocates", "Raises", "Ends", "Fine"]
+    names = ["Loops", "Allocates", "Raises", "Ends", "Fine"]
     for name, reason in board(tmp_path, monkeypatch, names, "--seeds", "2", "--jobs", "1").items():
         assert reason.startswith(REASONS[name]) and bool(reason) == (name != "Fine")
 
@@ -122,24 +122,24 @@ def test_an_observer_that_takes_too_long_is_not_tried_in_other_scenes(
     """One that raises is tried in all of them. That the rows of others stay is tested above."""
     counted = "class My{0}({0}):\n    def reset(self, *start):\n        print('{0}', file=open('log', 'a'))\n"
     counted += "        super().reset(*start)\n"
-    (tmp_path / "own.py").write_text(PLUGINS + counted.format("Waits") + counted.format("Raises"))
+    (tmp_path / "own.py").write_text(PLUGINS + counted.format("Loops") + counted.format("Raises"))
     monkeypatch.chdir(tmp_path)
     benchmark, names = Frozen("v1"), ["lane", "ring"]
-    observers = ["own.py:MyWaits", "own.py:MyRaises"]
+    observers = ["own.py:MyLoops", "own.py:MyRaises"]
     result = benchmark.run(observers, names, 1, Limits(seconds=2.0), lambda share: None)
     rows = {(row["observer"], row["scene"]): row for row in result["rows"]}
     log = (tmp_path / "log").read_text().split()
-    for name, started, seeds in (("Waits", ["lane"], 1), ("Raises", names, 4)):
+    for name, started, seeds in (("Loops", ["lane"], 1), ("Raises", names, 4)):
         assert all(rows[f"My{name}", scene]["failure"] for scene in names)
         vehicles = sum(len(scene.source.scenario.vehicles) for scene in benchmark.scenes(started))
         assert log.count(name) == seeds * vehicles
         [line] = [part for part in report(benchmark, result) if isinstance(part, str) and part.startswith(f"My{name}")]
-        assert line.endswith(NOT_RUN) == (name == "Waits")
+        assert line.endswith(NOT_RUN) == (name == "Loops")
 
 
 @pytest.mark.slow
-def test_what_loops_delegates_or_crashes_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ["Loops", "Delegates", "Interrupts", "Crashes"]
+def test_what_waits_delegates_or_crashes_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["Waits", "Delegates", "Interrupts", "Crashes"]
     for name, reason in board(tmp_path, monkeypatch, names, "--seeds", "1").items():
         assert reason.startswith(REASONS[name])
 

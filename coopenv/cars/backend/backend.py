@@ -254,8 +254,7 @@ class Svea:
         if tick.truth is not None:
             error = float(np.linalg.norm(p - tick.truth.position[i]))
             turn = float(np.arccos(np.clip(0.5 * (np.vdot(R, tick.truth.rotation[i]) - 1.0), -1.0, 1.0)))
-        level = sent.protection_level or float("inf")
-        self.monitor.judge(name, self.deployment.safety, error, turn, std, level, nis)
+        self.monitor.judge(name, self.deployment.safety, error, turn, std, sent.protection_level, nis)
 
     def notes(self, vehicle: int) -> dict[str, Any]:
         """Return the entries of a vehicle's info about its car and the network; it is one that is estimated here."""

@@ -115,7 +115,7 @@ class LinkMonitor:
             error: distance to the true position, m; NaN: not known.
             turn: angle to the true orientation, rad; NaN: not known.
             std: of its position, m.
-            level: horizontal protection level, m.
+            level: horizontal protection level, m; inf: unknown.
             nis: per degree of freedom, of the bearings of its tick.
         """
         now, recent = self.looked, self._nis.setdefault(car, deque())
