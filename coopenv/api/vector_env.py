@@ -218,9 +218,8 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
             return view.reshape(self.num_envs, *view.shape[2:]).copy()
         tensor = self._tensors.get(name)
         if tensor is None:
-            whole = wp.to_torch(self.engine.array(name))
-            tensor = self._tensors[name] = whole.reshape(self.num_envs, *whole.shape[2:])
-        return tensor
+            tensor = self._tensors[name] = wp.to_torch(self.engine.array(name))
+        return tensor.reshape(self.num_envs, *tensor.shape[2:])  # copies what the state holds of a vehicle on a GPU
 
     def _time(self) -> Any:
         """Return (num_envs,) s since the start of each row's episode."""

@@ -23,8 +23,10 @@ from coopenv.world.state import (
     allocate,
     allocate_state,
     checked_state,
+    interleaves_worlds,
     overwrite,
     parts,
+    repeated,
     size_of,
     state_fields,
     state_sizes,
@@ -44,6 +46,7 @@ from coopenv.world.step import (
     observer_kernels,
     source_kernels,
 )
+from coopenv.world.warp_internals import field_types
 
 BY_AGENT = {
     "bearing": 0.0,
@@ -119,7 +122,8 @@ class World:
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
         anew = np.concatenate([covariance, np.broadcast_to(UNKNOWN, (N, 6, 6))])
         self.model.start.covariance = wp.array(anew, dtype=mat66d, device=self.device)
-        self.memory = allocate(self.observer.memory, sizes, self.device, "" if lanes == N else SCRATCH)
+        shared = "" if lanes == N else SCRATCH
+        self.memory = allocate(self.observer.memory, sizes, self.device, shared, interleaves_worlds(self.device))
         """What the embedded observer remembers besides the state."""
         others = [with_own_scratch(self.memory, sizes) for _ in range(1, self.threads)] if lanes > 1 else []
         self._memories = PerLane([PerWorld(memory) for memory in (self.memory, *others)])
@@ -127,6 +131,9 @@ class World:
         self._turns.vehicle.assign(np.tile(self.model.order.numpy(), (worlds, 1)))
         self._turns.first.assign(np.tile(np.minimum(np.arange(N + 1), 1) * N, (worlds, 1)))
         self._set_due(0, 1)
+        by_level = self.device != "cpu" and lanes == 1 and self.in_parts
+        self._levels = [self._turns_of_level(level) for level in range(N if by_level else 0)]
+        """Turns for every level that there could be; none where levels are looked up."""
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
@@ -239,6 +246,10 @@ class World:
     def _follow_by_level(self) -> None:
         """Let vehicles follow, those of a large level at once; small levels are not worth the handing over."""
         self._run("levels", host_kernels(self.precision)["find_levels"], PerWorld(self.mask), PerWorld(self._turns))
+        for level, turns in enumerate(self._levels):  # idle launches cost less than to wait for the GPU
+            self.launch.by_lane(("follow", level), *self._follow(turns=turns))
+        if self._levels:
+            return
         sizes = np.trim_zeros(np.diff(self._turns.first.numpy()).sum(axis=0), "b")
         large = (sizes >= VEHICLES_PER_LEVEL * self.launch.lanes) | (self.device != "cpu") | self.in_parts
         changes = np.flatnonzero(large[1:] | large[:-1]) + 1
@@ -257,15 +268,25 @@ class World:
         else:
             self._turns.due.assign(np.full((self.worlds, 2), (first, last), dtype=np.int32))
 
+    def _turns_of_level(self, level: int) -> Any:
+        """Return turns that share everything with those of the world but the level that is due."""
+        result = Turns()
+        for name in field_types(self._turns):
+            setattr(result, name, getattr(self._turns, name))
+        row: Any = wp.array([[level, level + 1]], dtype=wp.int32, device=self.device)
+        result.due = repeated(row, 0, self.worlds)
+        return result
+
     def _sense(self, stages: int) -> Call:
         """Return the launch of stages of a tick before observers."""
         sense = source_kernels(self.source, self.precision)["sense"]
         return sense, [self.model, PerWorld(self.state), self._record, PerWorld(self.mask), stages]
 
-    def _follow(self, ends: int = 0) -> list[Call]:
+    def _follow(self, ends: int = 0, turns: Any = None) -> list[Call]:
         """Return the launches of the observers, in turn; with `ends` the last one ends the tick."""
         *others, last = follow_kernels(self.observer, self.precision, self.in_parts)
-        given = [self.model, PerWorld(self.state), self._memories, PerWorld(self.mask), PerWorld(self._turns)]
+        due = PerWorld(self._turns if turns is None else turns)
+        given = [self.model, PerWorld(self.state), self._memories, PerWorld(self.mask), due]
         return [*((follow, [*given, 0]) for follow in others), (last, [*given, ends])]
 
     def _move(self) -> None:

@@ -15,8 +15,10 @@ import pytest
 import warp as wp
 
 import coopenv
+from coopenv.api.vector_env import INFO_FIELDS
 from coopenv.backends.simulated import Simulated
-from coopenv.world import launch
+from coopenv.world import launch, state
+from coopenv.world import world as batches
 from coopenv.world.launch import start_warp
 from coopenv.world.warp_internals import device_function
 from tests.helpers.four_way import FOUR_WAY
@@ -44,6 +46,47 @@ def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
             np.testing.assert_allclose(there[name_of], value, rtol=1e-7, atol=1e-8, err_msg=name_of)
         else:
             np.testing.assert_array_equal(there[name_of], value, err_msg=name_of)
+
+
+def as_on_a_gpu(patch: pytest.MonkeyPatch) -> None:
+    """Let worlds on the CPU lie in memory as those on a GPU do."""
+    for module in (state, batches):
+        patch.setattr(module, "interleaves_worlds", lambda device: True)
+
+
+@pytest.mark.parametrize("observer", ["riccati", "robust"])
+def test_neither_layout_nor_levels_change_anything(observer: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = coopenv.load_scenario("busy_intersection", {**OVERRIDES, "observer.name": observer})
+    found = []
+    for is_gpu in (False, True):
+        if is_gpu:
+            as_on_a_gpu(monkeypatch)
+            monkeypatch.setattr(batches, "threads_and_lanes", lambda *given: (1, 2 if observer == "robust" else 1))
+        batch = Simulated(scenario).world(5, "float64", "cpu", None)
+        if is_gpu and observer == "robust":
+            batch._levels = [batch._turns_of_level(level) for level in range(len(scenario.vehicles))]
+        batch.reset(range(5))
+        for _ in range(10):
+            batch.advance(scenario.ticks_per_decision)
+        found.append(batch.get_state())
+    for name, value in found[0].items():
+        if value.dtype.kind == "f":
+            np.testing.assert_allclose(found[1][name], value, rtol=1e-7, atol=1e-8, err_msg=name)
+        else:
+            np.testing.assert_array_equal(found[1][name], value, err_msg=name)
+
+
+def test_infos_of_interleaved_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch", reason="needs the extra 'train'")
+    plain = coopenv.make_vec(FOUR_WAY, num_worlds=3)
+    as_on_a_gpu(monkeypatch)
+    tensors = coopenv.make_vec(FOUR_WAY, num_worlds=3, arrays="torch")
+    plain.reset(seed=1)
+    tensors.reset(seed=1)
+    for _ in range(5):
+        expected, found = (batch.step(plain.action_space.sample() * 0.0)[4] for batch in (plain, tensors))
+    for name in INFO_FIELDS:
+        np.testing.assert_allclose(found[name].numpy(), expected[name], atol=1e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
