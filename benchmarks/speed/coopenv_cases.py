@@ -112,4 +112,5 @@ def array_bytes(engine: Engine) -> int:
     records = [engine.results, world.state, world.memory]
     fields = [getattr(record, name) for record in records for name in field_types(record)]
     arrays = [field for field in fields if isinstance(field, wp.array)]
-    return sum(a.capacity for a in [*arrays, world.actions, world.mask])
+    stored = [getattr(a, "row", a) for a in [*arrays, world.actions, world.mask]]  # what all indices share counts once
+    return sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in stored)
