@@ -175,6 +175,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "a title": (lambda: coopenv.parallel_env("Facade"), r"did you mean 'facade'\?"),
     "a dash": (lambda: coopenv.make_vec("urban-crossing", num_worlds=1), r"did you mean 'urban_crossing'\?"),
     "None": (lambda: coopenv.parallel_env(None), "^environment: expected a name.*got NoneType"),  # type: ignore[arg-type]
+    "arguments in turn": (lambda: coopenv.compare(ENV, "robust"), "'robust' is an observer; observers come first"),
     "a list": (lambda: coopenv.compare(["riccati"], [ENV]), "^environment: .* got list"),  # type: ignore[arg-type]
     "a set attribute": (
         lambda: setattr(coopenv.load_scenario(ENV), "horizon", 3.0),

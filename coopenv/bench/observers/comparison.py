@@ -181,6 +181,8 @@ def compare(
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
+    if isinstance(environment, str) and environment in list_observers():
+        raise CoopenvError(f"compare: environment '{environment}' is an observer; observers come first")
     source = find_source(environment, overrides, data, topics, faults, policy)
     plan = Plan.of(observers, source, seeds, variants, steady_from, windows)
     plan.source.check()
