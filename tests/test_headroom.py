@@ -74,11 +74,13 @@ HELPERS = {"scout_platoon": 1, "lighthouse": 1, "broken_camera": 3, "take_turns"
 
 
 @cache
-def team_episodes(environment: str, agent: str, setting: str) -> tuple[Episodes, dict[str, tuple[float, float, float]]]:
+def team_episodes(
+    environment: str, agent: str, setting: str, worlds: int = 32
+) -> tuple[Episodes, dict[str, tuple[float, float, float]]]:
     """Return episodes with each vehicle's own reward, and their figures, in worlds that nothing was tuned on."""
     overrides = cooperation_settings(load_scenario(environment))[setting]
     scenario = load_scenario(environment, {**overrides, "reward.team": "own"})
-    found = drive(Engine(scenario, 32), load_agent(agent, scenario), held_out_seeds(9, 32))
+    found = drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
     return found, {r.metric: (r.mean, r.ci_low, r.ci_high) for r in score(found)}
 
 
@@ -116,7 +118,8 @@ def test_cooperation_is_learnt_from_what_each_vehicle_observes(environment: str)
     agents = ("look_ahead", "team_look_ahead", f"{environment}_team")
     selfish, team, learned = (team_episodes(environment, agent, "as it is")[1] for agent in agents)
     assert learned["e95_m"][0] <= 1.15 * team["e95_m"][0] and learned["e95_m"][2] < selfish["e95_m"][1]
-    assert learned["arrival_rate"][0] >= 0.97 and learned["collision_rate"][0] < 0.01
+    often = team_episodes(environment, f"{environment}_team", "as it is", 256)[1]  # one crash in 32 worlds is over 1 %
+    assert often["arrival_rate"][0] >= 0.97 and often["collision_rate"][0] < 0.01
     unseen = [dependent_e95(team_episodes(environment, agent, "cars unseen")[0], environment) for agent in agents]
     assert unseen[2] > 0.8 * unseen[0]
 

@@ -303,6 +303,11 @@ class TeamLookAhead(LookAhead):
         """See `LookAhead.avoided`: here all, as others do not expect a vehicle to slow down or turn aside for them."""
         return senders
 
+    def distance_to_keep(self, observations: np.ndarray) -> np.ndarray:
+        """See `RouteFollower.distance_to_keep`; here without an upper bound, for the same reason."""
+        variances = 100.0 ** self.read(observations, "axis_std")[:, :2].astype(float)
+        return np.asarray(self.closest + np.sqrt(variances.sum(axis=1)))
+
     def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
         """See `LookAhead.followers`.
 
