@@ -1,7 +1,8 @@
 """Frozen benchmarks, `coopenv bench v1`: scenes, seeds and limits that do not change, and the rows of the zoo.
 
-`v1.toml` defines scenes, seeds and limits. `v1.json` is the result file of the zoo: results are comparable if their
-hashes and figures of records agree with it.
+`v1.toml` defines scenes, seeds and limits. `v1_actions.npz` has the actions of driven vehicles, so that records do not
+depend on drivers, which may change. `v1.json` is the result file of the zoo: results are comparable if their hashes and
+figures of records agree with it.
 """
 
 import inspect
@@ -10,7 +11,7 @@ import math
 import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from itertools import islice
@@ -48,7 +49,7 @@ class FrozenScene(NamedTuple):
     source: SimulatedRecords
     variant: str
     hash: str
-    """Of its scenario, fault, policy and seeds."""
+    """Of its scenario, fault, policy or actions, and seeds."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,15 @@ class Frozen:
         """The result file that ships with coopenv; without rows before the version is frozen."""
         path = FOLDER / f"{self.version}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"rows": [], "scenes": {}}
+
+    @cached_property
+    def actions(self) -> dict[str, np.ndarray]:
+        """Actions (seeds, decisions, vehicles, A) by the name of a driven scene; empty before they are recorded."""
+        path = FOLDER / f"{self.version}_actions.npz"
+        if not path.is_file():
+            return {}
+        with np.load(path, allow_pickle=False) as archive:
+            return dict(archive)
 
     @property
     def seeds(self) -> range:
@@ -96,9 +106,13 @@ class Frozen:
         source = find_source(about["environment"], about.get("set"), faults=[fault] * bool(fault), policy=policy)
         assert isinstance(source, SimulatedRecords)
         variant = source.added[0] if fault else source.fault(NOMINAL)
+        driven_by: Any = policy
+        if (actions := self.actions.get(about["name"])) is not None:
+            source = replace(source, actions=dict(zip(self.seeds, actions.astype(np.float64), strict=True)))
+            driven_by = sha256(actions.tobytes()).hexdigest()
         words = {"title", "description", "source"}
         world = (variant.scenario or source.scenario).model_dump(mode="json", exclude_unset=True, exclude=words)
-        text = json.dumps([world, policy, fault, [*self.seeds]], sort_keys=True)
+        text = json.dumps([world, driven_by, fault, [*self.seeds]], sort_keys=True)
         return FrozenScene(about["name"], source, variant.name, sha256(text.encode()).hexdigest())
 
     def run(

@@ -73,5 +73,11 @@ def random_policy(seed: int, width: int = 2) -> Policy:
     return lambda observations: generator.uniform(-1.0, 1.0, (len(observations), width))
 
 
+def played_back(actions: np.ndarray) -> Policy:
+    """Return the policy that takes actions, (decisions, rows, A), in turn, whatever is observed; then the last ones."""
+    decisions = iter(actions)
+    return lambda observations: next(decisions, actions[-1])
+
+
 PLAIN: dict[str, Callable[[int, int], Policy]] = {"zero": zero_policy, "random": random_policy}
 """By name, made from a seed and the length of an action."""

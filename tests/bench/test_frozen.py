@@ -9,11 +9,16 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
+import numpy as np
 import pytest
 
+from benchmarks import freeze
 from coopenv.bench import frozen
 from coopenv.bench.frozen import Frozen, totals_of
 from coopenv.cli import main
+from coopenv.policies.base import played_back
+from coopenv.policies.route_follower import RouteFollower
+from coopenv.runs.recorder import record
 from tests.helpers.commands import refused
 
 MINE = Path(__file__).parents[2] / "examples" / "own_observer.py"
@@ -56,9 +61,9 @@ def test_an_own_observer_has_its_row_beside_the_zoo(
     assert rows["facade", "Ekf"]["rmse_m"] < 0.5 * rows["facade", "dead_reckoning"]["rmse_m"]
 
 
-def test_driven_scenes_are_the_frozen_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Among cars that drivers plan for, a changed driver changes the records; then the version is frozen anew."""
+def test_driven_scenes_are_the_frozen_ones_whatever_drivers_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(RouteFollower, "speed", lambda self, observations, points=None: np.zeros(len(observations)))
     scenes = "behind_truck,open_square"
     assert main(["bench", "v1", "dead_reckoning", "--scenes", scenes, "--jobs", "1"]) == 0
     assert json.loads((tmp_path / "bench_v1.json").read_text())["remarks"] == ["28 scenes were left out"]
@@ -72,6 +77,7 @@ def test_differences_from_the_shipped_result_are_named(tmp_path: Path, monkeypat
     )
     zoo = json.loads((frozen.FOLDER / "v1.json").read_text())
     zoo["scenes"]["facade"]["records"][0] *= 1.01
+    copyfile(frozen.FOLDER / "v1_actions.npz", tmp_path / "v1_actions.npz")
     (tmp_path / "v1.toml").write_text(text)
     (tmp_path / "v1.json").write_text(json.dumps(zoo))
     monkeypatch.setattr(frozen, "FOLDER", tmp_path)
@@ -85,6 +91,23 @@ def test_differences_from_the_shipped_result_are_named(tmp_path: Path, monkeypat
         "scene road_slow: its scenario is not the frozen one",
         "scene facade: its records are not the frozen ones",
     ]
+
+
+def test_actions_are_recorded_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert freeze.main(["v1"]) == 2
+    assert "exists: a version never changes" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        freeze.main(["v0"])
+    assert "invalid choice: 'v0'" in capsys.readouterr().err
+
+
+def test_actions_of_a_driver_are_played_back() -> None:
+    """Those of `peek` now, rounded, lead to the record that they are from."""
+    [scene] = Frozen("v1").scenes(["facade"])
+    driver = freeze.Rounded(scene, 1000)
+    first = record(driver.scenario, 1000, driver)
+    second = record(driver.scenario, 1000, played_back(np.array(driver.taken, dtype=np.float64)))
+    np.testing.assert_array_equal(first.truth.position, second.truth.position)
 
 
 def test_mistakes_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

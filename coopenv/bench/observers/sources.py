@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from coopenv.backends.base import Backend
 from coopenv.backends.mrclam.dataset import IN_SPACE
 from coopenv.backends.sources import SourceKind, is_bag, kind_of, open_backend, open_recording
@@ -29,6 +31,7 @@ from coopenv.bench.observers.faults import (
 from coopenv.estimation.metrics import steady_start
 from coopenv.observers.recording import Recording
 from coopenv.policies import load_policy
+from coopenv.policies.base import played_back
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
 
@@ -117,6 +120,8 @@ class SimulatedRecords(RecordSource):
     scenario: Scenario
     policy: str = "zero"
     """Policy of the driven vehicles, as for `coopenv.runs.recorder.record`."""
+    actions: Mapping[int, np.ndarray] | None = field(default=None, compare=False)
+    """By seed the actions (decisions, rows, A) that driven vehicles take in place of those of the policy."""
     seeded: ClassVar[bool] = True
 
     def world(self) -> Scenario:
@@ -126,7 +131,8 @@ class SimulatedRecords(RecordSource):
     def recording(self, variant: str, seed: int) -> Recording:
         """Return the world of a seed with a fault."""
         fault = self.fault(variant)
-        return fault.applied(record(fault.scenario or self.scenario, seed, self.policy), seed)
+        policy = self.policy if self.actions is None else played_back(self.actions[seed])
+        return fault.applied(record(fault.scenario or self.scenario, seed, policy), seed)
 
     def check(self) -> None:
         """Nothing is recorded, and faults have become keys of the scenario."""
