@@ -212,7 +212,10 @@ class LookAhead(RouteFollower):
         for each in followers:
             later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
             cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
-        return np.asarray(cost - now.along / top + BACK * np.abs(now.aside))
+        # The offset may be larger than what an observation can hold: from there no plan leads farther away.
+        aside = self.read(observations, "route_offset")
+        away = (np.abs(aside) >= 0.999 * self.layout["route_offset"].scale) & (self._first * aside > 0.0)
+        return np.where(away, np.inf, cost - now.along / top + BACK * np.abs(now.aside))
 
     def _sight(self, observations: np.ndarray, vehicle: np.ndarray) -> _Sight:
         """Return what can be measured in rows that are of these vehicles."""
