@@ -15,7 +15,7 @@ from coopenv.runs.recorder import record
 
 
 class Rounded:
-    """A policy whose actions are rounded to float16 and kept."""
+    """The policy of a scene, with its actions (rows, A) rounded to float16 and kept, one entry per decision."""
 
     def __init__(self, scene: FrozenScene, seed: int) -> None:
         self.scenario = scene.source.fault(scene.variant).scenario or scene.source.scenario
@@ -48,10 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for policy, seed in zip(rounded, frozen.seeds, strict=True):
                 record(policy.scenario, seed, policy)
             actions[scene.name] = np.array([policy.taken for policy in rounded])
+        np.savez_compressed(path, allow_pickle=False, **actions)
     except (CoopenvError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    np.savez_compressed(path, allow_pickle=False, **actions)
     print(f"{path}: {', '.join(f'{name} {a.shape}' for name, a in actions.items())}")
     return 0
 

@@ -212,14 +212,14 @@ class CooperativeVectorEnv(Saved, gymnasium.vector.VectorEnv[Any, Any, Any]):
         wp.set_stream(self._stream, device, sync=wp.get_stream(device) != self._stream)
 
     def _rows(self, name: str) -> Any:
-        """Return a field of the engine: a copy on the host, or a tensor that shares memory."""
+        """Return a field of the engine: a copy on the host, or a tensor that shares memory, but for a GPU's state."""
         if self.arrays == "numpy":
             view = self.engine.view(name)
             return view.reshape(self.num_envs, *view.shape[2:]).copy()
         tensor = self._tensors.get(name)
         if tensor is None:
             tensor = self._tensors[name] = wp.to_torch(self.engine.array(name))
-        return tensor.reshape(self.num_envs, *tensor.shape[2:])  # copies what the state holds of a vehicle on a GPU
+        return tensor.reshape(self.num_envs, *tensor.shape[2:])
 
     def _time(self) -> Any:
         """Return (num_envs,) s since the start of each row's episode."""

@@ -75,7 +75,7 @@ class Frozen:
 
     @cached_property
     def actions(self) -> dict[str, np.ndarray]:
-        """Actions (seeds, decisions, vehicles, A) by the name of a driven scene; empty before they are recorded."""
+        """Actions (seeds, decisions, vehicles, A), float16 in [-1, 1], by driven scene; none before `freeze`."""
         path = FOLDER / f"{self.version}_actions.npz"
         if not path.is_file():
             return {}

@@ -212,9 +212,9 @@ class LookAhead(RouteFollower):
         for each in followers:
             later = each.covariance.driven(np.array(FAR), np.array(0.0), 0.0, 0.0)
             cost[each.row] += self.price * FAR / each.speed * np.maximum(later.std - self.tolerated, 0.0)
-        # The offset may be larger than what an observation can hold: from there no plan leads farther away.
+        # An observed offset is clipped at its scale and may be larger: from there no plan leads farther away.
         aside = self.read(observations, "route_offset")
-        away = (np.abs(aside) >= 0.999 * self.layout["route_offset"].scale) & (self._first * aside > 0.0)
+        away = (np.abs(aside) >= self.layout["route_offset"].scale) & (self._first * aside > 0.0)
         return np.where(away, np.inf, cost - now.along / top + BACK * np.abs(now.aside))
 
     def _sight(self, observations: np.ndarray, vehicle: np.ndarray) -> _Sight:
@@ -292,7 +292,8 @@ class TeamLookAhead(LookAhead):
     all vehicles, which no vehicle has by itself: a reference for cooperation, which needs the rows of the whole fleet.
     """
 
-    needs = (*LookAhead.needs, "message_position", "route_left")
+    needs = (*LookAhead.needs, "position_std", "message_position", "route_left")
+    clearance = np.inf  # others do not expect a vehicle to slow down or turn aside for them
     plan_paces = (1.0, 0.75, 0.5, 0.25)
 
     def __init__(self, scenario: Scenario) -> None:
@@ -303,13 +304,8 @@ class TeamLookAhead(LookAhead):
         self._radius = np.array([vehicle.goal_radius for vehicle in scenario.vehicles])
 
     def avoided(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
-        """See `LookAhead.avoided`: here all, as others do not expect a vehicle to slow down or turn aside for them."""
+        """See `LookAhead.avoided`: here all, for the reason for which `clearance` has no bound."""
         return senders
-
-    def distance_to_keep(self, observations: np.ndarray) -> np.ndarray:
-        """See `RouteFollower.distance_to_keep`; here without an upper bound, for the same reason."""
-        variances = 100.0 ** self.read(observations, "axis_std")[:, :2].astype(float)
-        return np.asarray(self.closest + np.sqrt(variances.sum(axis=1)))
 
     def followers(self, observations: np.ndarray, due: np.ndarray) -> list[_Follower]:
         """See `LookAhead.followers`.

@@ -125,8 +125,8 @@ WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between 
 VEHICLES_PER_THREAD = 64
 """Of a world. Two threads run one world of 64, 128, 256 and 1,024 vehicles with `riccati` 1.3, 1.4, 1.6 and 1.9 times
 as fast as one, by the CPU time of the slower thread."""
-BLOCK = 32
-"""Threads of a block on a GPU: one warp, so that a small batch keeps all multiprocessors busy. 4,096 worlds run twice
+THREADS_PER_BLOCK = 32
+"""On a GPU: one warp, so that a small batch keeps all multiprocessors busy. 4,096 worlds run twice
 as fast on an H200 as with blocks of 256, 65,536 worlds equally fast."""
 VEHICLES_PER_LEVEL = 8  # and lane; smaller levels (`coopenv.world.step.Turns`) are taken in turn
 
@@ -168,7 +168,7 @@ def kernel(function: Function, precision_name: str, differentiable: bool = False
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
-    module.options.update(compiler_options(), enable_backward=differentiable, block_dim=BLOCK)
+    module.options.update(compiler_options(), enable_backward=differentiable, block_dim=THREADS_PER_BLOCK)
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
@@ -182,7 +182,7 @@ def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options
         options: of the module.
     """
     module = wp.get_module(f"coopenv.{name}.{p.name}")
-    module.options.update({**compiler_options(), **options}, enable_backward=False, block_dim=BLOCK)
+    module.options.update({**compiler_options(), **options}, enable_backward=False, block_dim=THREADS_PER_BLOCK)
     return {function.__name__: wp.Kernel(func=function, key=function.__name__, module=module) for function in functions}
 
 
@@ -340,7 +340,7 @@ class Launcher:
             dim=(share[1] - share[0], *inner),
             inputs=[a.part(share, self._worlds) if isinstance(a, PerWorld) else a for a in given],
             device=self._device,
-            block_dim=1 if self._device == "cpu" else BLOCK,
+            block_dim=1 if self._device == "cpu" else THREADS_PER_BLOCK,
             record_cmd=True,
         )
         return replay_of(command)

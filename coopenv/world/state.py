@@ -406,7 +406,7 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
-    """Return a zeroed `State` for `worlds` worlds of a model; `shared` as for `records.allocate`."""
+    """Return a zeroed `State` for `worlds` worlds of a model; `shared` as for `allocate`."""
     return allocate(state_struct(p), state_sizes(model, worlds), device, shared, interleaves_worlds(device))
 
 

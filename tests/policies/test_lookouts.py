@@ -10,7 +10,7 @@ import pytest
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
-from coopenv.policies.look_ahead import LookAhead, Peek
+from coopenv.policies.look_ahead import LookAhead, Peek, TeamLookAhead
 from coopenv.policies.prediction import (
     FieldOfView,
     Occluder,
@@ -155,6 +155,23 @@ def test_plans_that_lead_towards_others_cost_more(side: float) -> None:
 def test_who_is_sure_of_its_place_passes_closer(std: float, speed: float) -> None:
     crossing = other(3.0, -(3.0 - 0.83 * np.sqrt(2.0)), np.pi / 2)  # passes 0.83 m away
     assert RouteFollower(SCENARIO).speed(observation(position_std=np.log10(std), **crossing))[0] == speed
+
+
+def test_the_team_planner_keeps_its_whole_deviation_away() -> None:
+    lost = observation(position_std=np.log10(0.6))
+    kept = [driver(SCENARIO).distance_to_keep(lost)[0] for driver in (RouteFollower, LookAhead, TeamLookAhead)]
+    assert kept == pytest.approx([0.9, 1.0, 0.85 + 0.6])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_no_plan_leads_farther_from_a_route_than_is_observed(side: float) -> None:
+    """The offset in the observation is clipped at its scale: the true one may be larger."""
+    planner, scale = LookAhead(SCENARIO), observation_layout(SCENARIO)["route_offset"].scale
+    near, at_the_end = (
+        planner.costs(observation(route_offset=share * side * scale), np.zeros(1, int), [])[0] for share in (0.95, 1.0)
+    )
+    assert np.isfinite(near).all()
+    np.testing.assert_array_equal(np.isinf(at_the_end), planner._first * side > 0.0)
 
 
 def test_the_nearest_approach_is_that_of_fine_steps() -> None:
