@@ -112,6 +112,7 @@ class JointBelief:
     first_sender: wp.int32  # the first of them that is another vehicle; before it the calibration states
     depends_on: wp.uint64  # bits of vehicles
     rejected_share: wp.float64  # mean share of bearings that fail the gate
+    rejected_sources: wp.uint64  # bits of the slots of which any has failed since that share was last low
     healthy_time: wp.float64  # s for which it has been low
     gate_disabled: wp.int32  # whether all bearings count, because most have failed the gate
     gate_disabled_time: wp.float64  # s for which they have counted

@@ -103,7 +103,10 @@ def gate(frame: BearingFrame, memory: Any, world: int, i: int):
         used = not is_excluded(memory, world, i, q)
         if used:
             counted += 1
-            missed += wp.where(fits, 0, 1)
+            if not fits:
+                missed += 1
+                rejected = memory.belief[world, i].rejected_sources | bit_of(1 + q)
+                memory.belief[world, i].rejected_sources = rejected
         elif ahead:
             test_excluded(frame, memory, world, i, n, q)
         memory.measurement[world, i, n].fits = 0
@@ -139,14 +142,19 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
 
 @device_function
 def note_rejections(model: Any, memory: Any, world: int, i: int, share: Any, now: Any):
-    """Let all bearings count from when most fail the gate until few do; begin a search if that does not help."""
+    """Let all bearings count from when most fail the gate until few do; begin a search if that does not help.
+
+    Most fail if the own pose is wrong. If those of one source alone fail, that source is as likely to be wrong.
+    """
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.MEAN_TIME))
     missed = memory.belief[world, i].rejected_share + (share - memory.belief[world, i].rejected_share) * weight
     memory.belief[world, i].rejected_share = missed
-    if missed > wp.float64(constants.LOST_SHARE):
+    several = wp.bit_count(memory.belief[world, i].rejected_sources) > wp.uint64(1)
+    if missed > wp.float64(constants.LOST_SHARE) and several:
         memory.belief[world, i].gate_disabled = 1
     elif missed < wp.float64(constants.FOUND_SHARE):
         memory.belief[world, i].gate_disabled = 0
+        memory.belief[world, i].rejected_sources = wp.uint64(0)
         memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
     memory.belief[world, i].gate_disabled_time += wp.float64(memory.belief[world, i].gate_disabled) * now.period
     healthy = memory.belief[world, i].healthy_time + now.period
@@ -241,6 +249,7 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     begin_belief(memory, world, i, estimate)
     begin_sources(memory, world, i)
     memory.belief[world, i].rejected_share = wp.float64(0.0)
+    memory.belief[world, i].rejected_sources = wp.uint64(0)
     memory.belief[world, i].gate_disabled = 0
     memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
     bits = wp.uint64(0)

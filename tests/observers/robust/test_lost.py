@@ -131,6 +131,17 @@ def every_pose(bearings: dict[int, np.ndarray], rng: np.random.Generator) -> lis
     return found
 
 
+@pytest.mark.parametrize(("targets", "led"), [((1,), False), ((1, 2, 3), True)])
+def test_one_source_alone_does_not_show_that_a_vehicle_is_lost(targets: tuple[int, ...], led: bool) -> None:
+    """Bearings of a pose 0.6 m aside: either the vehicle is there, or its targets stand as much aside."""
+    known, shown = (np.eye(3), np.zeros(3)), displaced((np.eye(3), np.zeros(3)), np.array([0, 0, 0, 0, 0.6, 0.0]))
+    observer = started(known, np.diag([1e-3] * 3 + [1e-2] * 3) ** 2)
+    for k in range(1, 181):
+        observer.update(tick(observer, k, bearings={n: direction(shown, LANDMARKS[n]) for n in targets}))
+    moved = np.linalg.norm(pose_of(observer)[1])
+    assert (moved > 0.3) == led and (led or moved < 0.1)
+
+
 @pytest.mark.parametrize("triple", TRIPLES)
 def test_every_pose_that_fits_three_bearings_is_followed(triple: tuple[int, int, int]) -> None:
     """A vehicle stands still. Of solutions that are followed each is one of SciPy's, and each of those is followed."""
