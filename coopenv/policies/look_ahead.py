@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.policies.prediction import LEAST_ODDS, FieldOfView, Occluder, Occluders, PlanarCovariance, unhidden
-from coopenv.policies.route_follower import RouteFollower
+from coopenv.policies.route_follower import RouteFollower, by_place
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
 
@@ -171,7 +171,8 @@ class LookAhead(RouteFollower):
         zero = np.zeros((len(observations), len(offsets)), dtype=np.float32)
         now = _Path(zero, zero, zero, zero, np.repeat(self.read(observations, "route_offset"), zero.shape[1], axis=1))
         (mask, others, forward), keep = self.received(observations), self.distance_to_keep(observations)[:, None]
-        theirs = self._top[_senders(vehicle, mask.shape[1]) % len(self._top)][..., None]
+        senders = _senders(vehicle, self.reported(observations)[0].shape[1]) % len(self._top)
+        theirs = self._top[by_place(senders, mask.shape[1])][..., None]
         followers = [each._replace(covariance=_repeated(each.covariance, zero.shape[1])) for each in followers]
         avoided, others = self.avoided(mask, vehicle), others + self.body_center * forward
         # Whoever gives way is expected to stand, and is passed as closely as can be.
@@ -316,7 +317,7 @@ class TeamLookAhead(LookAhead):
         count = len(self._top)
         if len(observations) % count:
             raise ValueError(f"it plans for all vehicles: rows: {len(observations)}, allowed: multiples of {count}")
-        mask, place, forward = (part[due] for part in self.received(observations))
+        mask, place, forward = (part[due] for part in self.reported(observations))
         axes, std = (10.0 ** self.read(observations, name).astype(float) for name in ("axis_std", "heading_std"))
         heading, left = (self.read(observations, name)[:, 0] for name in ("route_heading", "route_left"))
         found, own = [], due % count

@@ -146,6 +146,9 @@ REACTION = 0.5
 SAME_WAY = np.cos(np.pi / 4.0)
 """Cosine of the angle up to which a car drives the same way; one behind that does keeps its own distance."""
 
+LEAP = 1.5
+"""m, by which a car's reported place changes at most by corrections. Where landmarks are rare, 0.5 costs arrivals."""
+
 PATIENCE, STANDING = 3.0, 0.5
 """s for which a car waits that is slower than this, m/s, before it takes others to go on as they do now, until it
 drives at half of its top speed."""
@@ -162,7 +165,8 @@ class RouteFollower(Driver):
 
     In the leader-follower order a vehicle receives from its leaders only, so giving way to senders cannot deadlock.
     Where all driven vehicles receive each other's messages, those before it in order have the right of way, and it
-    waits for the others only while they block its way.
+    waits for the others only while they block its way. A sender whose place leaps farther than it can drive may be a
+    liar: it counts twice, where it reports to be, and where it would be without the leap.
     """
 
     clearance = 0.9
@@ -181,8 +185,9 @@ class RouteFollower(Driver):
         """(N, N - 1), whether a vehicle has the right of way over the sender of each message."""
         traffic = [vehicle.motion.kind == "traffic" for vehicle in scenario.vehicles]
         self.traffic = np.array([traffic[:i] + traffic[i + 1 :] for i in range(len(traffic))])
-        if scenario.topology.most_nearby is not None:
-            self.traffic = np.zeros_like(self.goes_first)  # as the senders are not known
+        self.senders_known = scenario.topology.most_nearby is None
+        if not self.senders_known:
+            self.traffic = np.zeros_like(self.goes_first)
         """(N, N - 1), which senders are cars of a backend's traffic."""
         self.discs = self.body_center + (np.zeros(1) if nimble else discs_along(self.length, self.width))
         """Centres of the discs that cover a car, m ahead of its reference point; a nimble car is one disc."""
@@ -197,13 +202,52 @@ class RouteFollower(Driver):
         self.period = 1.0 / scenario.rates.decision
         self._last = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(4)), np.zeros(0))
         """Of the last decision: messages, places, directions, ages and motions of their senders, and s of standing."""
+        self._reported = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(3)))
+        """Of the last decision: senders, their places, how old these are, and how far they have leapt."""
+        self._size = self.layout.size
         self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """See `Driver.__call__`; the leaps of senders are appended to what it observes."""
+        observations = np.asarray(observations, dtype=np.float32)
+        return super().__call__(np.concatenate([observations, self.leaps(observations)], axis=1))
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
         return self.speed(observations), self.pursue(self.direction(observations))
 
+    def leaps(self, observations: np.ndarray) -> np.ndarray:
+        """Return by how much senders have leapt, (rows, 2 M) in m, own frame; no columns where that is not known."""
+        known = {"message_position", "message_age", "velocity", "angular_velocity"} <= {*self.layout}
+        if not known or not self.senders_known:
+            return np.zeros((len(observations), 0), dtype=np.float32)
+        mask, place, _ = self.reported(observations)
+        age, there = self.read(observations, "message_age")[..., None], mask[..., None]
+        if len(self._reported[0]) != len(place):
+            self._reported = np.zeros_like(mask), place, age, np.zeros_like(place)
+        received, before, aged, leapt = self._reported
+        turn = -self.period * self.read(observations, "angular_velocity")[:, -1]
+        driven = [self.period, 0.0] * self.read(observations, "velocity")[:, None, :1]
+        stood = _turned(before - driven, turn)
+        observed = np.maximum(np.abs(place), np.abs(before)).max(axis=-1) < self.layout["message_position"].scale
+        apart = np.linalg.norm(place - stood, axis=-1)
+        most = LEAP * self.scale + 2.0 * self.cruise * (self.period + np.abs(age - aged)[..., 0])
+        leaps = mask & received & observed & (apart > most)
+        leapt = _turned(leapt, turn) + np.where(leaps[..., None], place - stood, 0.0)
+        age = np.where(there, age, aged + self.period)
+        self._reported = mask | received, np.where(there, place, stood), age, leapt
+        return leapt.reshape(len(place), -1).astype(np.float32)
+
     def received(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what `reported` does, and behind it the senders that have leapt where they would be otherwise."""
+        mask, place, forward = self.reported(observations)
+        if observations.shape[1] == self._size:
+            return mask, place, forward
+        leapt = observations[:, self._size :].reshape(place.shape)
+        where = np.concatenate([place, place - leapt], axis=1)
+        return np.concatenate([mask, mask & leapt.any(axis=-1)], axis=1), where, np.tile(forward, (1, 2, 1))
+
+    def reported(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the senders of received messages, (rows, M), their places and directions, (rows, M, 2), own frame.
 
         Where nobody can send there is one sender, from whom nothing is received.
@@ -217,7 +261,9 @@ class RouteFollower(Driver):
 
     def before(self, senders: np.ndarray, vehicle: np.ndarray) -> np.ndarray:
         """Return those of the senders, (rows, M), over which the rows' vehicles, (rows,), have no right of way."""
-        return np.asarray(senders & ~self.goes_first[vehicle]) if self.goes_first.any() else senders
+        if not self.goes_first.any():
+            return senders
+        return np.asarray(senders & ~by_place(self.goes_first[vehicle], senders.shape[1]))
 
     def speed(self, observations: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
         """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
@@ -301,7 +347,7 @@ class RouteFollower(Driver):
             return [*expected, np.zeros(mask.shape)]
         speed = self.read(observations, "velocity")[:, 0]
         turn = -self.period * self.read(observations, "angular_velocity")[:, -1]
-        age = self.read(observations, "message_age")[..., None]
+        age = by_place(self.read(observations, "message_age"), mask.shape[1])[..., None]
         if len(self._last[0]) != len(place):
             unknown = np.full((*mask.shape, 3), np.nan)
             self._last = np.zeros_like(mask), place, forward, age, unknown, np.zeros(len(place))
@@ -318,13 +364,16 @@ class RouteFollower(Driver):
         self._last = mask, place, forward, age, motion, stood
         waits = (stood < PATIENCE)[:, None, None]
         if len(place) % len(self.traffic) == 0:
-            waits = waits | ~self.traffic[np.arange(len(place)) % len(self.traffic)][..., None]
+            traffic = self.traffic[np.arange(len(place)) % len(self.traffic)]
+            waits = waits | ~by_place(traffic, mask.shape[1])[..., None]
         measured = np.where(np.isnan(motion[..., :2]), expected[-1], motion[..., :2])
         return [measured, *(np.where(waits, each, measured) for each in expected), np.nan_to_num(motion[..., 2])]
 
     def reset(self, mask: np.ndarray) -> None:
         """See `Driver.reset`."""
         super().reset(mask)
+        if len(self._reported[0]) == len(mask):
+            self._reported[0][mask], self._reported[-1][mask] = False, 0.0
         if len(self._last[0]) == len(mask):
             self._last[0][mask], self._last[-1][mask] = False, 0.0
 
@@ -349,6 +398,11 @@ class RouteFollower(Driver):
             return np.full(len(observations), self.clearance)
         std = 10.0 ** self.read(observations, "position_std")[:, 0]
         return np.asarray(np.minimum(self.closest + std, self.clearance))
+
+
+def by_place(of_senders: np.ndarray, places: int) -> np.ndarray:
+    """Return a table (rows, M) of the senders by their places, which are two for each, see `received`, or one."""
+    return np.tile(of_senders, (1, places // max(1, of_senders.shape[1])))
 
 
 def _turned(vectors: np.ndarray, angle: np.ndarray) -> np.ndarray:

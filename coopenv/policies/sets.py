@@ -79,7 +79,7 @@ class SetDriver(LookAhead):
         alone = np.concatenate([*own, self.read(observations, "last_action")[:, 1:2], self.constants[vehicle]], axis=1)
         place, seen = self.read(observations, "map_position")[..., :2], self.read(observations, "map_in_view")
         landmarks = _rows(self.known(observations), place, seen[..., None])
-        received, place, forward = self.received(observations)
+        received, place, forward = self.reported(observations)
         sender = np.arange(received.shape[1]) + (np.arange(received.shape[1]) >= vehicle[:, None])
         cars = forward, self._cars[sender % len(self._cars)], self.avoided(received, vehicle)[..., None]
         return alone.astype(np.float32), landmarks, _rows(received, place, *cars)

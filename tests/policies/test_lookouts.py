@@ -130,6 +130,25 @@ def test_rows_keep_their_vehicle_when_others_have_ended() -> None:
     assert set(act(lambda rows: rows[:, :2], {"other": row})) == {"other"}
 
 
+@pytest.mark.parametrize("kind", [RouteFollower, LookAhead])
+def test_a_sender_that_leaps_counts_where_it_would_be_too(kind: type[RouteFollower]) -> None:
+    """It is about to cross, and reports a moment later to be two metres farther, where it would have passed."""
+    driver, full = kind(SCENARIO), 1.0
+    driver.foresight = 6.0
+    meeting, passed = (observation(**other(3.0, y, np.pi / 2)) for y in (-3.0, -1.0))
+    assert [driver(row)[0, 0] for row in (meeting, passed, passed)] == [-full, -full, -full]
+    assert driver(meeting)[0, 0] == -full and driver(passed)[0, 0] == -full
+    driver.reset(np.array([True]))
+    assert driver(passed)[0, 0] == full
+
+
+def test_neither_driving_nor_small_corrections_are_leaps() -> None:
+    driver, rng = RouteFollower(SCENARIO), np.random.default_rng(0)
+    for k in range(40):
+        x, y = np.array([3.0 - 0.05 * k, 0.1 * k - 3.0]) + rng.uniform(-0.3, 0.3, 2)
+        assert not driver.leaps(observation(**other(x, y, 1.6), velocity=[0.5, 0.0, 0.0])).any()
+
+
 @pytest.mark.parametrize(("away", "speed"), [(2.0, 0.0), (4.8, 1.0)])
 def test_who_looks_around_gives_way_to_what_is_soon(away: float, speed: float) -> None:
     """Cars that turn to landmarks and back would otherwise wait for meetings that never come."""

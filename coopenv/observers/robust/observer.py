@@ -2,9 +2,9 @@
 
 A vehicle estimates a joint state of itself and of the vehicles that it receives. Bearings to landmarks and to vehicles
 correct it. A neighbour's message adds the information that is new since its last message. So no information counts
-twice, and the neighbour's slowly varying error does not count as white noise. If most bearings fail the gate, all of
-them count for a while. If that does not help, or without a useful prior, the pose is searched for; during a search the
-vehicle broadcasts nothing.
+twice, and the neighbour's slowly varying error does not count as white noise. If most bearings fail the gate, to more
+than one target, all of them count for a while. If that does not help, or without a useful prior, the pose is searched
+for; during a search the vehicle broadcasts nothing.
 
 After a search, the own pose is resected from one frame alone, and the other members stay. The own covariance becomes
 that of the solution, members' errors included: G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W. The
