@@ -17,8 +17,8 @@ from coopenv.api.arguments import FIELDS, OTHERS, Step, check_function
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.pages import has_value_of_sensing
 from coopenv.policies import load_agent
-from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
+from coopenv.policies.scripted import Peek
 from coopenv.scenario import load_scenario
 from tests.helpers.env_suite import SHIPPED, largest_slow
 from tests.helpers.four_way import FOUR_WAY

@@ -10,7 +10,7 @@ import pytest
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import act, load_agent
-from coopenv.policies.look_ahead import LookAhead, Peek, TeamLookAhead
+from coopenv.policies.look_ahead import LookAhead, TeamLookAhead
 from coopenv.policies.prediction import (
     FieldOfView,
     Occluder,
@@ -20,7 +20,8 @@ from coopenv.policies.prediction import (
     nearest,
     unhidden,
 )
-from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost
+from coopenv.policies.route_follower import RouteFollower
+from coopenv.policies.scripted import IntelligentDriver, Peek, StopWhenLost
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.geometry import is_occluded
@@ -133,13 +134,13 @@ def test_rows_keep_their_vehicle_when_others_have_ended() -> None:
 @pytest.mark.parametrize("kind", [RouteFollower, LookAhead])
 def test_a_sender_that_leaps_counts_where_it_would_be_too(kind: type[RouteFollower]) -> None:
     """It is about to cross, and reports a moment later to be two metres farther, where it would have passed."""
-    driver, full = kind(SCENARIO), 1.0
+    driver = kind(SCENARIO)
     driver.foresight = 6.0
     meeting, passed = (observation(**other(3.0, y, np.pi / 2)) for y in (-3.0, -1.0))
-    assert [driver(row)[0, 0] for row in (meeting, passed, passed)] == [-full, -full, -full]
-    assert driver(meeting)[0, 0] == -full and driver(passed)[0, 0] == -full
+    assert [driver(row)[0, 0] for row in (meeting, passed, passed)] == [-1.0, -1.0, -1.0]
+    assert driver(meeting)[0, 0] == driver(passed)[0, 0] == -1.0
     driver.reset(np.array([True]))
-    assert driver(passed)[0, 0] == full
+    assert driver(passed)[0, 0] == 1.0
 
 
 def test_neither_driving_nor_small_corrections_are_leaps() -> None:
