@@ -151,7 +151,9 @@ LEAST = {
     ("facade_quality", "facade"): 0.95,
     ("open_square_quality", "open_square"): 0.75,
 }
-"""Share of arrivals in each kind of worlds; a vehicle that lies is not among them."""
+"""Share of arrivals in each kind of worlds, but for those in which a vehicle lies."""
+LEAST_IF_ONE_LIES = 0.65
+"""The same where a vehicle lies, of drivers that compare its messages."""
 
 
 @pytest.mark.slow
@@ -161,6 +163,9 @@ def test_learned_agents_arrive_whatever_they_sense(agent: str, environment: str)
     found = {name: {r.metric: r.mean for r in results} for name, results in contest.drive().results.items()}
     arrived = {name: rates["arrival_rate"] for name, rates in found.items() if not name.endswith(" lies")}
     assert len(arrived) > 8 and min(arrived.values()) >= LEAST[agent, environment], arrived
+    if agent == "general":
+        lied = [rates["arrival_rate"] for name, rates in found.items() if name.endswith(" lies")]
+        assert min(lied, default=1.0) >= LEAST_IF_ONE_LIES, lied
 
 
 @pytest.mark.slow

@@ -157,8 +157,8 @@ class RouteFollower(Driver):
 
     In the leader-follower order a vehicle receives from its leaders only, so giving way to senders cannot deadlock.
     Where all driven vehicles receive each other's messages, those before it in order have the right of way, and it
-    waits for the others only while they block its way. A sender whose place leaps farther than it can drive may be a
-    liar: it counts twice, where it reports to be, and where it would be without the leap.
+    waits for the others only while they block its way. A sender whose place leaps farther than it can drive may lie:
+    it counts twice, where it reports to be, and where it would be without the leap.
     """
 
     clearance = 0.9
