@@ -138,8 +138,8 @@ REACTION = 0.5
 SAME_WAY = np.cos(np.pi / 4.0)
 """Cosine of the angle up to which a car drives the same way; one behind that does keeps its own distance."""
 
-LEAP = 1.5
-"""m, by which a car's reported place changes at most by corrections. Where landmarks are rare, 0.5 costs arrivals."""
+LEAP = 2.0
+"""m, by which a car's reported place changes at most by corrections. Where landmarks are rare, 1.5 costs arrivals."""
 
 PATIENCE, STANDING = 3.0, 0.5
 """s for which a car waits that is slower than this, m/s, before it takes others to go on as they do now, until it

@@ -133,10 +133,10 @@ def test_rows_keep_their_vehicle_when_others_have_ended() -> None:
 
 @pytest.mark.parametrize("kind", [RouteFollower, LookAhead])
 def test_a_sender_that_leaps_counts_where_it_would_be_too(kind: type[RouteFollower]) -> None:
-    """It is about to cross, and reports a moment later to be two metres farther, where it would have passed."""
+    """It is about to cross, and reports a moment later to be four metres farther, where it has passed."""
     driver = kind(SCENARIO)
     driver.foresight = 6.0
-    meeting, passed = (observation(**other(3.0, y, np.pi / 2)) for y in (-3.0, -1.0))
+    meeting, passed = (observation(**other(3.0, y, np.pi / 2)) for y in (-3.0, 1.0))
     assert [driver(row)[0, 0] for row in (meeting, passed, passed)] == [-1.0, -1.0, -1.0]
     assert driver(meeting)[0, 0] == driver(passed)[0, 0] == -1.0
     driver.reset(np.array([True]))
