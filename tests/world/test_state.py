@@ -291,7 +291,8 @@ def test_every_field_has_a_rule() -> None:
     world = World(coopenv.load_scenario("busy_intersection"), observer=find_embedded("robust"))
     rules = world.state_rules()
     whole = {name for name, array in world.state_arrays().items() if array.numpy().dtype.kind in "iu"}
-    free = {f"observer_{name}.depends_on" for name in ("belief", "member.report", "outbox", "inbox")}
+    masks = ("belief.rejected_sources", *(f"{x}.depends_on" for x in ("belief", "member.report", "outbox", "inbox")))
+    free = {f"observer_{name}" for name in masks}
     assert whole - rules.keys() == free
     assert rules.keys() <= world.state_arrays().keys()
 
