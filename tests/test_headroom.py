@@ -153,7 +153,7 @@ LEAST = {
 }
 """Share of arrivals in each kind of worlds, but for those in which a vehicle lies."""
 LEAST_IF_ONE_LIES = 0.65
-"""The same where a vehicle lies, of drivers that compare its messages."""
+"""The same of `general` where a vehicle lies."""
 
 
 @pytest.mark.slow

@@ -196,7 +196,6 @@ class RouteFollower(Driver):
         """Of the last decision: messages, places, directions, ages and motions of their senders, and s of standing."""
         self._reported = (np.zeros((0, 0), dtype=bool), *(np.zeros((0, 0, 0)) for _ in range(3)))
         """Of the last decision: senders, their places, how old these are, and how far they have leapt."""
-        self._size = self.layout.size
         self.paces = (1.0,) if nimble else (0.0, 0.25, 0.5, 0.75, 1.0)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
@@ -233,9 +232,9 @@ class RouteFollower(Driver):
     def received(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what `reported` does, and behind it the senders that have leapt where they would be otherwise."""
         mask, place, forward = self.reported(observations)
-        if observations.shape[1] == self._size:
+        if observations.shape[1] == self.layout.size:
             return mask, place, forward
-        leapt = observations[:, self._size :].reshape(place.shape)
+        leapt = observations[:, self.layout.size :].reshape(place.shape)
         where = np.concatenate([place, place - leapt], axis=1)
         return np.concatenate([mask, mask & leapt.any(axis=-1)], axis=1), where, np.tile(forward, (1, 2, 1))
 
