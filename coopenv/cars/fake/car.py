@@ -92,7 +92,8 @@ class Fake:
             if self._drives:
                 transport.subscribe(self._profile.topic_of(name, Role.MANUAL), self._later(self.obey))  # on the car
             transport.announce(presence_of(name))
-        self._events, self._phases, start = sched.scheduler(clock.steady, lambda _: None), self._rng, clock.steady()
+        self._now = start = clock.steady()
+        self._events, self._phases = sched.scheduler(lambda: self._now, lambda _: None), self._rng
         for number, (rate, act) in enumerate(acts):
             self._repeat(number, start + 1e9 / rate * self._phases.uniform(0.1, 1.0), 1e9 / rate, act)
 
@@ -118,7 +119,7 @@ class Fake:
 
     def advance(self) -> None:
         """Do all that is due by the clock."""
-        now = self._clock.steady()
+        self._now = now = self._clock.steady()  # what falls due meanwhile waits: messages go out first
         if self._faults.value("kill", now):
             end_process()
             return

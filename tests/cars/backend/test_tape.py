@@ -310,7 +310,9 @@ def test_of_a_drive_that_is_cut_off_what_is_whole_is_replayed(recorded: Any, tmp
         assert str(warning.message).startswith(f"{path}: cut off, the end of the MCAP file is missing: nothing after ")
         for tick, same in zip(ticks, all_ticks, strict=False):
             np.testing.assert_array_equal(tick.bearings, same.bearings)
-            np.testing.assert_array_equal(tick.truth.position, same.truth.position)
+            assert (tick.truth is None) == (same.truth is None)  # no motion capture for a while: a busy computer
+            if tick.truth is not None:
+                np.testing.assert_array_equal(tick.truth.position, same.truth.position)
         numbers.append(len(ticks))
     assert numbers == sorted(numbers) and numbers[-1] == len(all_ticks)
     assert len(set(numbers)) > 3
