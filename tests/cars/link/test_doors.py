@@ -15,7 +15,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.attack import Intruder, attack
-from coopenv.cars.backend.station import Gates, neutral_command
+from coopenv.cars.backend.station import OLD, Gates, neutral_command
 from coopenv.cars.deployment import parse_deployment
 from coopenv.cars.gate.core import write_drive
 from coopenv.cars.keys import load_signer, make_keys
@@ -120,7 +120,9 @@ def test_a_bridge_in_the_router_itself_is_behind_the_same_doors(tmp_path: Path) 
                 allowed_origin=zenoh.Locality.REMOTE,
             ),
             bridge.session.declare_queryable(f"fleet/{CAR}/mavros/cmd/arming", asked.append),
-            stranger.session.declare_subscriber("fleet/**", lambda sample: seen.append(str(sample.key_expr))),
+            stranger.session.declare_subscriber(
+                "fleet/**", lambda sample: seen.append(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+            ),
         ]
         state = f"fleet/{CAR}/mavros/state"
 
@@ -145,6 +147,7 @@ def test_an_open_router_is_noticed_and_no_gate_behind_it_is_armed(tmp_path: Path
         gate = start_gate(endpoint, tmp_path)
         try:
             gates, station = Gates(transport, (CAR,), USUAL, None), Station(transport, None)
+            wait_until(lambda: gates.states[CAR].age < OLD)
             with pytest.raises(CoopenvError, match=rf"^not armed: {CAR}: commands get to its wheels without its gate"):
                 gates.begin()
             Gates(transport, (CAR,), USUAL, None, probed=False).begin(release=True)
