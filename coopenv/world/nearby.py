@@ -132,7 +132,9 @@ def clear_entries(model: Any, state: Any, world: int, vehicle: int):
     for box in range(state.inbox_tick.shape[2]):
         clear_box(state, world, vehicle, box)
     state.crowded[world, vehicle] = 0
-    state.kept_count[world, vehicle] = wp.where(model.listed * model.kept > 0, model.target_count[vehicle], 0)
+    state.kept_count[world, vehicle] = 0
+    if model.listed * model.kept > 0:
+        state.kept_count[world, vehicle] = model.target_count[vehicle]
     for entry in range(model.kept):
         state.kept_order[world, vehicle, entry] = entry
         state.kept_agent[world, vehicle, entry] = -1

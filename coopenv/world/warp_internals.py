@@ -8,9 +8,11 @@
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | CUDA: no copies of records, no kernels of the host |
+| `_function_source` | `codegen.codegen_func`, `codegen.*_module_header` | indices and loops as in C: a seventh faster |
 """
 
 import ctypes
+import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -59,6 +61,41 @@ def _has_arrays(kind: Any) -> bool:
     return any(isinstance(field.type, wp.array) or _has_arrays(field.type) for field in fields)
 
 
+ELEMENT = """
+template <typename T, typename... Indices>
+CUDA_CALLABLE inline T& element(const wp::array_t<T>& array, Indices... indices)
+{{
+    return *wp::data_at_byte_offset(array, wp::byte_offset(array, indices...));
+}}
+"""
+codegen.cpu_module_header += ELEMENT
+codegen.cuda_module_header += ELEMENT
+
+
+def _as_in_c(source: str, function: Callable[..., Any], options: Mapping[str, Any]) -> str:
+    """Return the source of a function of this package with indices and loops of C.
+
+    Warp looks at every index whether it is negative and counts from the end, and at every turn of a loop which way it
+    goes. Here no index of an array is negative, and loops count up. Debug builds (`wp.config.mode`) check indices, and
+    stay as they are.
+    """
+    if options["enable_backward"] or wp.config.mode == "debug" or not function.__module__.startswith("coopenv."):
+        return source
+    source = re.sub(r"wp::array_store\((.*), (\w+)\);", r"element(\1) = \2;", source)
+    source = source.replace("wp::address(", "&element(").replace("wp::index(", "element(")
+    return re.sub(r"iter_cmp\((\w+)\) == 0", r"\1.i >= \1.end", source)
+
+
+_generate_function: Any = codegen.codegen_func
+
+
+def _function_source(adj: Any, c_func_name: str, device: str = "cpu", options: Any = None, **others: Any) -> str:
+    source: str = _generate_function(adj, c_func_name, device, options, **others)
+    return _as_in_c(source, adj.func, options)
+
+
+codegen.codegen_func = _function_source
+
 _generate: Any = codegen.codegen_kernel
 
 
@@ -71,7 +108,7 @@ def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
     """
     if device == "cuda" and getattr(kernel.func, "host_only", False):
         return ""
-    source: str = _generate(kernel, device, options)
+    source = _as_in_c(_generate(kernel, device, options), kernel.func, options | kernel.options)
     if device != "cuda" or options["enable_backward"] or not kernel.module.name.startswith("coopenv."):
         return source
     head, brace, body = source.partition("\n{\n")

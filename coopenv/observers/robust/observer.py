@@ -253,7 +253,10 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: PoseEs
     memory.belief[world, i].gate_disabled = 0
     memory.belief[world, i].gate_disabled_time = wp.float64(0.0)
     bits = wp.uint64(0)
-    for n in range(wp.where(model.listed == 1, model.target_count[i], model.agents)):
+    agents = model.agents
+    if model.listed == 1:
+        agents = model.target_count[i]
+    for n in range(agents):
         target = n
         if model.listed == 1:
             target = model.targets[i, n]
