@@ -89,9 +89,8 @@ def _as_in_c(source: str, function: Callable[..., Any], options: Mapping[str, An
 _generate_function: Any = codegen.codegen_func
 
 
-def _function_source(adj: Any, c_func_name: str, device: str = "cpu", options: Any = None, **others: Any) -> str:
-    source: str = _generate_function(adj, c_func_name, device, options, **others)
-    return _as_in_c(source, adj.func, options)
+def _function_source(adj: Any, *arguments: Any, **options: Any) -> str:
+    return _as_in_c(_generate_function(adj, *arguments, **options), adj.func, options["options"])
 
 
 codegen.codegen_func = _function_source
