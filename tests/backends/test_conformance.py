@@ -161,7 +161,7 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
         env.reset(seed=5)
         ever_seen, ever_heard, steps = False, False, 0
         known, errors = env.engine.backend.capabilities.truth, dict[str, float]()
-        while env.agents and (steps < 25 or not ever_heard) and steps < 55:
+        while env.agents and (steps < 25 or not (ever_heard and ever_seen)) and steps < 55:
             observations, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, AHEAD))
             steps += 1
             for agent, seen in observations.items():

@@ -106,9 +106,10 @@ def update_covariance(memory: Any, world: int, i: int, bearings: int):
         for j in range(k, memory.belief[world, i].members):
             block = mat66d()
             for n in range(bearings):
-                if memory.measurement[world, i, n].fits == 1:
-                    K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
-                    block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
+                if memory.measurement[world, i, n].fits != 1:
+                    continue
+                K = memory.measurement[world, i, n].weight * memory.projection[world, i, n, k]
+                block = block + transposed_by_rows(K, memory.projection[world, i, n, j])
             set_block(memory, world, i, k, j, memory.P[world, i, k, j] - block)
 
 
