@@ -8,7 +8,7 @@
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
 | `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | CUDA: no copies of records, no kernels of the host |
-| `_function_source` | `codegen.codegen_func`, `codegen.*_module_header` | indices and loops as in C: a seventh faster |
+| `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
 """
 
 import ctypes
@@ -69,17 +69,17 @@ CUDA_CALLABLE inline T& element(const wp::array_t<T>& array, Indices... indices)
 }}
 """
 codegen.cpu_module_header += ELEMENT
-codegen.cuda_module_header += ELEMENT
 
 
-def _as_in_c(source: str, function: Callable[..., Any], options: Mapping[str, Any]) -> str:
-    """Return the source of a function of this package with indices and loops of C.
+def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> str:
+    """Return the source of a function of this package with indices and loops of C, a seventh faster.
 
     Warp looks at every index whether it is negative and counts from the end, and at every turn of a loop which way it
     goes. Here no index of an array is negative, and loops count up. Debug builds (`wp.config.mode`) check indices, and
-    stay as they are.
+    stay as they are; so does CUDA, where more values would be spilled (`make cuda-check`).
     """
-    if options["enable_backward"] or wp.config.mode == "debug" or not function.__module__.startswith("coopenv."):
+    ours = device == "cpu" and function.__module__.startswith("coopenv.")
+    if not ours or options["enable_backward"] or wp.config.mode == "debug":
         return source
     source = re.sub(r"wp::array_store\((.*), (\w+)\);", r"element(\1) = \2;", source)
     source = source.replace("wp::address(", "&element(").replace("wp::index(", "element(")
@@ -89,8 +89,8 @@ def _as_in_c(source: str, function: Callable[..., Any], options: Mapping[str, An
 _generate_function: Any = codegen.codegen_func
 
 
-def _function_source(adj: Any, *arguments: Any, **options: Any) -> str:
-    return _as_in_c(_generate_function(adj, *arguments, **options), adj.func, options["options"])
+def _function_source(adj: Any, *arguments: Any, **given: Any) -> str:
+    return _as_in_c(_generate_function(adj, *arguments, **given), adj.func, given["device"], given["options"])
 
 
 codegen.codegen_func = _function_source
@@ -107,7 +107,7 @@ def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
     """
     if device == "cuda" and getattr(kernel.func, "host_only", False):
         return ""
-    source = _as_in_c(_generate(kernel, device, options), kernel.func, options | kernel.options)
+    source = _as_in_c(_generate(kernel, device, options), kernel.func, device, options | kernel.options)
     if device != "cuda" or options["enable_backward"] or not kernel.module.name.startswith("coopenv."):
         return source
     head, brace, body = source.partition("\n{\n")
