@@ -72,7 +72,7 @@ codegen.cpu_module_header += ELEMENT
 
 
 def _as_in_c(source: str, function: Callable[..., Any], device: str, options: Mapping[str, Any]) -> str:
-    """Return the source of a function of this package with indices and loops of C, a seventh faster.
+    """Return the source of a function of this package with indices and loops of C: a sixth less time.
 
     Warp looks at every index whether it is negative and counts from the end, and at every turn of a loop which way it
     goes. Here no index of an array is negative, and loops count up. No kernel writes to a record of arrays: its strides

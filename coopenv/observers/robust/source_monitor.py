@@ -61,7 +61,7 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     for n in range(frame.bearings):
         fits = memory.measurement[world, i, n].fits
         if fits == 0:
-            continue
+            continue  # no `if` around the rest: matrices that change in one are copied by Warp
         H = memory.derivative[world, i, n, 0].jacobian
         M = H * own
         if frame.mounting > 0:
