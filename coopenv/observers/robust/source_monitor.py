@@ -56,39 +56,38 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
     turn = wp.transpose(memory.scratch[world, i, 0].pose.R)
     own = memory.sensitivity[world, i, q, 0]
     errors = memory.sensitivity[world, i, q, ERRORS]
+    mounting = memory.sensitivity[world, i, q, MOUNTING]
     vector = memory.source[world, i, q].vector
     A = memory.information[world, i, q, 0]
     for n in range(frame.bearings):
         fits = memory.measurement[world, i, n].fits
-        if fits == 0:
-            continue  # no `if` around the rest: matrices that change in one are copied by Warp
-        H = memory.derivative[world, i, n, 0].jacobian
-        M = H * own
-        if frame.mounting > 0:
-            M = M + memory.derivative[world, i, n, 2].jacobian * memory.sensitivity[world, i, q, MOUNTING]
-        if memory.measurement[world, i, n].source == q:
-            M = M - H[:, 3:] * turn
-        if q == CAMERA:
-            M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
-        WM = memory.measurement[world, i, n].weight * M
-        weighted = share_of(frame, memory, world, i, n) * WM
-        A = A + wp.transpose(weighted) * M
-        memory.effect[world, i, n, q] = M
-        memory.weighted_effect[world, i, n, q] = weighted
-        vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
-        if fits != 1:
-            continue
-        own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
-        errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
-        if first_sender > MOUNTING:
-            memory.sensitivity[world, i, q, MOUNTING] -= wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
+        if fits != 0:
+            H = memory.derivative[world, i, n, 0].jacobian
+            M = H * own
+            if frame.mounting > 0:
+                M = M + memory.derivative[world, i, n, 2].jacobian * mounting
+            if memory.measurement[world, i, n].source == q:
+                M = M - H[:, 3:] * turn
+            if q == CAMERA:
+                M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
+            WM = memory.measurement[world, i, n].weight * M
+            weighted = share_of(frame, memory, world, i, n) * WM
+            A = A + wp.transpose(weighted) * M
+            memory.effect[world, i, n, q] = M
+            memory.weighted_effect[world, i, n, q] = weighted
+            vector = vector + wp.transpose(weighted) * memory.measurement[world, i, n].innovation
+            if fits == 1:
+                own = own - wp.transpose(memory.projection[world, i, n, 0]) * WM
+                errors = errors - wp.transpose(memory.projection[world, i, n, ERRORS]) * WM
+                if first_sender > MOUNTING:
+                    mounting = mounting - wp.transpose(memory.projection[world, i, n, MOUNTING]) * WM
     memory.source[world, i, q].vector = vector
     memory.information[world, i, q, 0] = A
     memory.sensitivity[world, i, q, 0] = diagonal_by_rows(memory.scratch[world, i, 0].recentring, own)
     memory.sensitivity[world, i, q, ERRORS] = errors
     if first_sender > MOUNTING:
         memory.sensitivity[world, i, q, MOUNTING] = diagonal_by_rows(
-            memory.scratch[world, i, MOUNTING].recentring, memory.sensitivity[world, i, q, MOUNTING]
+            memory.scratch[world, i, MOUNTING].recentring, mounting
         )
 
 
@@ -147,9 +146,8 @@ def add_information(frame: BearingFrame, memory: Any, world: int, i: int, q: int
     """Add the information of a frame on the faults of a source and of a sender."""
     A = memory.information[world, i, q, c]
     for n in range(frame.bearings):
-        if memory.measurement[world, i, n].fits == 0:
-            continue
-        A = A + wp.transpose(memory.weighted_effect[world, i, n, q]) * memory.effect[world, i, n, c]
+        if memory.measurement[world, i, n].fits != 0:
+            A = A + wp.transpose(memory.weighted_effect[world, i, n, q]) * memory.effect[world, i, n, c]
     memory.information[world, i, q, c] = A
 
 
