@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from coopenv.base.errors import shown
-from coopenv.base.sections import Section
-from coopenv.scenario.base import (
+from coopenv.base.sections import (
     Direction,
     Loss,
     NonNegative,
@@ -22,6 +21,7 @@ from coopenv.scenario.base import (
     QuaternionWxyz,
     Rate,
     Sample,
+    Section,
     Vector2,
     Vector3,
     rotation_of,
