@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.base import sections
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role, VisionSettings
 from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
 from coopenv.estimation.poses import Array, log_so3
 from coopenv.observers.contract import Message
+from coopenv.scenario import base
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ def rotation_of(quaternion: Any, field: str) -> Array:
     length = math.hypot(*wxyz)
     if not abs(length - 1.0) <= UNIT:
         raise CoopenvError(f"{field}: no unit quaternion, its length is {length:.6g}")
-    return sections.rotation_of(None, wxyz)
+    return base.rotation_of(None, wxyz)
 
 
 MOST = 1000

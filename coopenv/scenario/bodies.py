@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import Field, field_serializer, field_validator, model_validator
 
-from coopenv.base.sections import (
+from coopenv.base.sections import Section
+from coopenv.scenario.base import (
     NonNegative,
     NonNegativeVector3,
     Number,
@@ -16,7 +17,6 @@ from coopenv.base.sections import (
     PositiveVector3,
     Probability,
     QuaternionWxyz,
-    Section,
     Vector2,
     Vector3,
     Word,

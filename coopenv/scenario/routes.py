@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from coopenv.base.sections import NonNegative, Positive, Section, Vector2, rotation_of
+from coopenv.base.sections import Section
+from coopenv.scenario.base import NonNegative, Positive, Vector2, rotation_of
 from coopenv.scenario.bodies import ConstantMotion, Landmark, SegmentMotion, Vehicle, WaypointMotion
 
 SPACING = 0.25  # m between the points of a route that is not straight ...

@@ -12,7 +12,8 @@ from pydantic import Field, field_validator, model_validator
 
 from coopenv.base.columns import facts_html, one_line
 from coopenv.base.errors import ScenarioError, ScenarioWarning, check_one_of, listed, shown, suggest
-from coopenv.base.sections import Positive, Section, Text, Vector3, overlaid, rotation_of, validated
+from coopenv.base.sections import Section, validated
+from coopenv.scenario.base import Positive, Text, Vector3, overlaid, rotation_of
 from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.cosimulators import COSIMULATORS, Cosimulator, Highway, Program, Sumo
 from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination

@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from coopenv.base.errors import shown
-from coopenv.base.sections import (
+from coopenv.base.sections import Section
+from coopenv.scenario.base import (
     Direction,
     Loss,
     NonNegative,
@@ -21,7 +22,6 @@ from coopenv.base.sections import (
     QuaternionWxyz,
     Rate,
     Sample,
-    Section,
     Vector2,
     Vector3,
     rotation_of,

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from coopenv.base.sections import rotation_of
 from coopenv.estimation.lens import distort
 from coopenv.estimation.outcomes import Sight
+from coopenv.scenario.base import rotation_of
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.scene import Frame
 from coopenv.viz.stage import Box, Stage

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.base.sections import rotation_of
 from coopenv.estimation.lens import largest_radius, undistort
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
+from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.routes import compile_motion, even_points, left_jacobian
 from coopenv.scenario.schema import agent_starts

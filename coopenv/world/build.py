@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.base.sections import rotation_of
 from coopenv.estimation.lens import largest_radius
 from coopenv.estimation.outcomes import KINDS, Outcome
 from coopenv.scenario import Scenario
+from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
 from coopenv.scenario.routes import Signal, compile_motion, even_points, followers, point_count

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, DataError, listed
-from coopenv.base.sections import rotation_of
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
@@ -32,6 +31,7 @@ from coopenv.cars.gate.core import read_drive
 from coopenv.cars.profile import Role
 from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, read
 from coopenv.cars.vision import Calibration
+from coopenv.scenario.base import rotation_of
 
 NS = 1_000_000_000
 
