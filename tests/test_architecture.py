@@ -98,7 +98,7 @@ LINES_AND_FILES = {
     "policies": (2040, 10),
     "runs": (3370, 13),
     "scenario": (3770, 13),
-    "training": (1720, 7),
+    "training": (1726, 7),
     "viz": (4820, 19),
     "world": (5560, 20),
 }
