@@ -7,7 +7,7 @@
 | `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record by its instance |
 | `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 | `kernel_hashes` | `context.user_modules`, `Module.get_module_hash` | what a report of a run was computed with |
-| `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | CUDA: no copies of records, no kernels of the host |
+| `_kernel_source` | `codegen.codegen_kernel`, `Adjoint.args` | no copies of records; no kernels of the host on CUDA |
 | `_function_source` | `codegen.codegen_func`, `codegen.cpu_module_header` | CPU: indices and loops as in C |
 """
 
@@ -102,19 +102,24 @@ _generate: Any = codegen.codegen_kernel
 
 
 def _kernel_source(kernel: Any, device: str, options: Mapping[str, Any]) -> str:
-    """Return the source of a kernel; on CUDA, records of arrays are read from where the launch puts them.
+    """Return the source of a kernel of this package, which reads records of arrays from where the launch puts them.
 
-    They are handed to functions by reference. A parameter whose address is taken is copied into the local memory of
-    every thread, 10 kB for the records of a world, unless it is a `__grid_constant__`. No kernel writes to one.
+    Warp copies them for every thread, some kilobytes. No kernel writes to one. On CUDA a parameter whose address is
+    taken is copied into local memory, too, unless it is a `__grid_constant__`.
     Source: CUDA C++ Programming Guide, `__grid_constant__`.
     """
     if device == "cuda" and getattr(kernel.func, "host_only", False):
         return ""
     source = _as_in_c(_generate(kernel, device, options), kernel.func, device, options | kernel.options)
-    if device != "cuda" or options["enable_backward"] or not kernel.module.name.startswith("coopenv."):
+    if options["enable_backward"] or not kernel.module.name.startswith("coopenv."):
+        return source
+    records = [(arg.ctype(), f"var_{arg.label}") for arg in kernel.adj.args if _has_arrays(arg.type)]
+    if device == "cpu":
+        for kind, name in records:
+            source = source.replace(f"{kind} {name} = _wp_args->", f"{kind}& {name} = _wp_args->")
         return source
     head, brace, body = source.partition("\n{\n")
-    for kind, name in ((arg.ctype(), f"var_{arg.label}") for arg in kernel.adj.args if _has_arrays(arg.type)):
+    for kind, name in records:
         head = head.replace(f"{kind} {name}", f"const __grid_constant__ {kind} constant_{name}")
         body = f"    {kind}& {name} = const_cast<{kind}&>(constant_{name});\n{body}"
     return head + brace + body
