@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3770, 13),
     "training": (1726, 7),
     "viz": (4820, 19),
-    "world": (5560, 20),
+    "world": (5580, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

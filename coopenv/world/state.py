@@ -208,6 +208,20 @@ KEPT_AGENT = Rule(
     ),
 )
 KEPT_ORDER = Rule("a number of an entry", lambda values, fields, model: (values >= 0) & (values < model.kept))
+
+
+def _lists(values: Array, fields: Fields, model: Any) -> Mask:
+    """Return where no item is named twice, by cells and by items before it: all lists end then."""
+    items = values.shape[1]
+    named = np.sort(np.concatenate([fields["first_item"], values], axis=1), axis=1)
+    once = np.all((named[:, 1:] > named[:, :-1]) | (named[:, 1:] < 0), axis=1)
+    return np.asarray((values >= -1) & (values < items) & once[:, None])
+
+
+FIRST_ITEM = Rule(
+    "-1 or an item", lambda values, fields, model: (values >= -1) & (values < fields["next_item"].shape[1])
+)
+NEXT_ITEM = Rule("part of lists of items, each once", _lists)
 DIRECTION = Rule(
     "a unit vector, or zero",
     lambda values, fields, model: are_unit_vectors(values, TOLERANCE[values.dtype]) | everywhere(values == 0.0, -1),
@@ -376,8 +390,8 @@ def state_struct(p: Precision) -> Any:
         kept_order: array("WNV", wp.int32, KEPT_ORDER)  # entries in the order of their agents
         crowded: array("WN", wp.int32, whole(0, "agents"))  # agents in range for which there is no room
 
-        first_item: array("WG", wp.int32, ANYTHING)  # of each cell; scratch, like the next, see `coopenv.world.cells`
-        next_item: array("WI", wp.int32, ANYTHING)  # in the same cell; -1: none
+        first_item: array("WG", wp.int32, FIRST_ITEM)  # of each cell; scratch, like the next, see `coopenv.world.cells`
+        next_item: array("WI", wp.int32, NEXT_ITEM)  # in the same cell; -1: none
         body_reach: array("W", scalar)  # m, the farthest point of a box from its item
 
     return State
@@ -406,8 +420,11 @@ def state_sizes(model: Any, worlds: int) -> dict[str, int]:
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
-    """Return a zeroed `State` for `worlds` worlds of a model; `shared` as for `allocate`."""
-    return allocate(state_struct(p), state_sizes(model, worlds), device, shared, interleaves_worlds(device))
+    """Return a `State` of zeros, with an empty grid, for `worlds` worlds of a model; `shared` as for `allocate`."""
+    state = allocate(state_struct(p), state_sizes(model, worlds), device, shared, interleaves_worlds(device))
+    state.first_item.fill_(-1)
+    state.next_item.fill_(-1)
+    return state
 
 
 def state_fields(p: Precision) -> dict[str, Any]:

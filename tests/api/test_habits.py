@@ -72,6 +72,7 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
     assert "<img" not in env._repr_html_()  # nothing has begun
     assert len(env) == 1 and len(coopenv.make_vec("lane:3", num_worlds=2)) == 6
     assert (env.unwrapped, env.agents, env.max_num_agents) == (env, [], 1)
+    assert copy.deepcopy(env).agents == []  # before the first reset
     env.reset(seed=np.int64(3))
     assert "data:image/png;base64," in env._repr_html_()
     action = {"vehicle_1": [0.5, 0.0]}
@@ -83,6 +84,15 @@ def test_an_environment_prints_copies_pickles_and_closes() -> None:
     env.close()
     env.close()
     env.reset(seed=3)
+
+
+def test_a_state_whose_lists_never_end_is_refused() -> None:
+    env = coopenv.parallel_env(ENV)
+    env.reset(seed=0)
+    state = env.get_state()
+    state["next_item"][0, :2] = [1, 0]
+    with pytest.raises(coopenv.CoopenvError, match=r"'next_item' at \(0, 0\)"):
+        env.set_state(state)
 
 
 def test_infos_have_the_entries_that_their_type_names() -> None:
