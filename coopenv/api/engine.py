@@ -160,8 +160,7 @@ class Engine:
         self._drive_scripted()
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self._own_terms.end_episodes()
-        self.refresh()
-        self._reward_anew(self._nowhere)
+        self._fill("results", self._nowhere, self._everywhere, stepped=True)
 
     def step_or_restart(self) -> None:
         """Restart the worlds that are over, advance the others by one decision; nothing leaves the device."""
@@ -173,8 +172,7 @@ class Engine:
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision)
         self._restart()
         self._own_terms.end_episodes()
-        self._fill("results some fresh", self.world.mask, self._everywhere)
-        self._reward_anew(self.world.mask)
+        self._fill("results some fresh", self.world.mask, self._everywhere, stepped=True)
         self.world.mask.zero_()
 
     def restart_finished(self) -> None:
@@ -206,13 +204,19 @@ class Engine:
                 self.scripted.act(self.view("observation"), actions)
                 self.set_actions(actions)
 
-    def _fill(self, key: str, fresh: Any, chosen: Any) -> None:
-        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun."""
+    def _fill(self, key: str, fresh: Any, chosen: Any, stepped: bool = False) -> None:
+        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun.
+
+        After a step, a function in Python replaces the reward of the worlds where none has.
+        """
         world = self.world
         parts = [PerWorld(part) for part in (self._own_terms.records, self.results, fresh, chosen)]
         arguments = [world.model, PerWorld(world.state), self._table, *parts]
         world.launch.by_vehicle(key, step_results, arguments, world.model.vehicles)
         self._own_terms.fill(key, fresh, chosen)
+        if stepped and self._reward is not None:
+            earning = self.view("alive") & (fresh.numpy()[:, None] == 0)
+            self.view("reward")[...] = reward_of(self._reward, self._step, earning)
         if self._team != "own":
             least = int(self._team == "min")
             share = self.backend.scenario.reward.own_share
@@ -220,12 +224,6 @@ class Engine:
             world.launch(f"{key} of the team", team_results, arguments)
         if world.device == "cpu":  # reading from a GPU would wait for it
             self._own_terms.check(self.view)
-
-    def _reward_anew(self, fresh: Any) -> None:
-        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
-        if self._reward is not None:
-            earning = self.view("alive") & (fresh.numpy()[:, None] == 0)
-            self.view("reward")[...] = reward_of(self._reward, self._step, earning)
 
     def set_actions(self, actions: np.ndarray) -> None:
         """Copy host actions, (W, N, A), to the device."""

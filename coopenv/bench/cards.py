@@ -17,11 +17,12 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.base.columns import Columns, Tabular, one_line, terminal_html
-from coopenv.base.errors import CoopenvError, check_one_of
+from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, terminal_html
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
+from coopenv.base.terminal import text_of
 from coopenv.evaluation import METRICS, Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.policies.loader import CARD_FILES
@@ -109,6 +110,9 @@ class Contest:
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
         """
+        for what, value, least in (("worlds", worlds, 1), ("seed_block", block, 0)):
+            if not isinstance(value, int) or value < least:
+                raise CoopenvError(f"{what}: expected a whole number, at least {least}, got {value!r}")
         scenario, name = open_simulation(environment, overrides), scenario_name(environment)
         if not scenario.driven:
             raise CoopenvError(f"{name}: all motion here is prescribed, there is nothing to drive")
@@ -121,7 +125,7 @@ class Contest:
             entrants += [Entrant(a, f"{a.name}, {row}", a.kind, other, a.policy(other)) for a in found]
         names = [entrant.name for entrant in entrants]
         for twice in (word for word in names if names.count(word) > 1 or (ideal and word == IDEAL)):
-            raise CoopenvError(f"--agents: two are called '{twice}'")
+            raise CoopenvError(f"agents: two are called '{twice}'")
         if ideal:
             agent, seeing = find_agent(BASELINE), open_simulation(environment, {**overrides, **IDEAL_SENSING})
             entrants.append(Entrant(agent, IDEAL, "reference", seeing, agent.policy(seeing)))
@@ -142,7 +146,10 @@ class Contest:
                     def report(share: float, place: int = place, name: str = entrant.name) -> None:
                         on_progress(place + share, name)
 
-                    episodes[entrant.name] = drive(engine, entrant.policy, seeds, report)
+                    try:
+                        episodes[entrant.name] = drive(engine, entrant.policy, seeds, report)
+                    except ActionError as error:
+                        raise ActionError(f"agent {entrant.name}: {error}") from error
         return Evaluation(**vars(self), episodes=episodes)
 
 
@@ -196,6 +203,9 @@ class Evaluation(Contest, Tabular):
 
     def _repr_html_(self) -> str:
         return terminal_html(self)
+
+    def __str__(self) -> str:
+        return text_of(self, WIDTH)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield f"{self.environment}: {self.worlds} held-out worlds, block {self.block} of the seeds, the same for all."

@@ -306,6 +306,14 @@ def test_a_share_of_the_reward_is_the_vehicles_own() -> None:
     np.testing.assert_allclose(mixed, 0.25 * own[: len(mixed)] + 0.75 * team, atol=1e-5)
 
 
+def test_a_team_shares_the_rewards_of_a_function() -> None:
+    changes = {"reward.team": "mean", "reward.own_share": 0.5}
+    env = coopenv.parallel_env(FOUR_WAY, overrides=changes, reward=lambda step: np.array([[1.0, 2.0, 3.0, 6.0]]))
+    env.reset(seed=0)
+    rewards = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})[1]
+    assert list(rewards.values()) == [2.0, 2.5, 3.0, 4.5]
+
+
 def test_a_team_reward_needs_a_team() -> None:
     with pytest.raises(coopenv.CoopenvError, match=r"reward\.own_share: only with reward\.team = 'mean' or 'min'"):
         load_scenario("open_square", {"reward.own_share": 0.5})

@@ -100,7 +100,7 @@ def test_cards(capsys: pytest.CaptureFixture[str]) -> None:
         (["busy_intersection"], "all motion here is prescribed, there is nothing to drive"),
         (["mine.toml"], "no agent of agents/ was made for mine; name some with --agents A,B"),
         ([*SHORT, "--agents", "nobody"], "unknown agent 'nobody'; known: "),
-        ([*SHORT, "--agents", "own.py:still,own.py:still"], "--agents: two are called 'still'"),
+        ([*SHORT, "--agents", "own.py:still,own.py:still"], "agents: two are called 'still'"),
         ([*SHORT, "--agents", "own.py:still", "--write-card"], "still is a place in code; a card needs"),
         ([*SHORT, "--agents", "mine", "--write-card"], "mine/card.json: not a card"),
         ([*SHORT, "--stress", "--write-card"], "--stress prints a table: leave out --film and --write-card"),
