@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +77,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None and spec.max_episode_steps is None:
-            spec = replace(spec, max_episode_steps=round(self.scenario.horizon * self.scenario.rates.decision))
+            decisions = math.ceil(self.scenario.horizon_ticks / self.scenario.ticks_per_decision)
+            spec = replace(spec, max_episode_steps=decisions)
         self._spec = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -98,11 +100,11 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             ActionError: the action has the wrong shape or is not finite.
         """
-        observed, width = self.world.engine.view("observation")[0], self.scenario.action_size
-        chosen = dict(zip(self.scenario.vehicle_names, decide(self._others, observed, width), strict=True))
-        actions = {agent: chosen[agent] for agent in self.world.agents}
-        if self.vehicle in actions:
-            actions[self.vehicle] = action
+        actions = {agent: action for agent in self.world.agents if agent == self.vehicle}
+        if others := [agent for agent in self.world.agents if agent != self.vehicle]:
+            observed, width = self.world.engine.view("observation")[0], self.scenario.action_size
+            chosen = dict(zip(self.scenario.vehicle_names, decide(self._others, observed, width), strict=True))
+            actions.update({agent: chosen[agent] for agent in others})
         observations, rewards, terminated, truncated, infos = self.world.step(actions)
         v = self.vehicle
         if v not in rewards:

@@ -58,6 +58,20 @@ def test_time_aware_observation_knows_the_horizon() -> None:
     assert aware.observation_space.contains(aware.reset(seed=0)[0])
 
 
+@pytest.mark.parametrize("horizon", [1.05, 1.25])  # in the midst of a decision
+def test_the_spec_says_how_long_an_episode_is(horizon: float) -> None:
+    def never(observations: np.ndarray) -> np.ndarray:
+        raise AssertionError("nobody else is here")
+
+    env = gymnasium.make("coopenv/Facade-v0", overrides={"horizon": horizon}, others=never)
+    env.reset(seed=0)
+    steps = 1
+    while not env.step(np.zeros(2, dtype=np.float32))[3]:
+        steps += 1
+    assert env.spec is not None and steps == env.spec.max_episode_steps
+    assert env.unwrapped.world.engine.view("truncated").all()  # type: ignore[attr-defined]
+
+
 # PettingZoo
 
 
