@@ -18,7 +18,7 @@ from coopenv.base.sections import one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
 
 if TYPE_CHECKING:
-    from coopenv.scenario import Scenario
+    from coopenv.scenario import Scenario, ScenarioLike
 
 
 Kind = Literal["learned", "scripted", "reference"]
@@ -215,24 +215,27 @@ def agents_for(environment: str) -> list[str]:
     return [name for name in list_agents() if environment in find_agent(name).environments]
 
 
-def load_agent(name_or_place: str | Path, scenario: Scenario) -> Policy:
-    """Return a driver for an environment's vehicles (`env.scenario`), by what `find_agent` takes.
+def load_agent(name_or_place: str | Path | Callable[..., Any], scenario: ScenarioLike) -> Policy:
+    """Return a driver for the vehicles of an environment or scenario, by what `find_agent` takes.
 
     Raises:
         CoopenvError: no such agent, or it cannot drive this environment.
     """
-    return find_agent(name_or_place).policy(scenario)
+    from coopenv.scenario import load_scenario
+
+    return find_agent(name_or_place).policy(load_scenario(scenario))
 
 
-def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
+def load_policy(name: str | Path | Callable[..., Any], scenario: Scenario, seed: int) -> Policy:
     """Return a policy by what `--policy` takes: `zero`, `random` (with a seed), or what `find_agent` takes.
 
     Raises:
         CoopenvError: there is no such policy, or the agent cannot drive in this scenario.
     """
-    if name in PLAIN:
-        return PLAIN[name](seed, scenario.action_size)
-    check_agent(name, "policy", PLAIN)
+    if isinstance(name, str):
+        if name in PLAIN:
+            return PLAIN[name](seed, scenario.action_size)
+        check_agent(name, "policy", PLAIN)
     return load_agent(name, scenario)
 
 

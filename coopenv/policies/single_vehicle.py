@@ -23,9 +23,9 @@ MOST_EPISODES = 1000
 
 
 def driver_of(others: str | Policy | None, scenario: Scenario) -> Policy:
-    """Return a policy, the agent of a name, or for None `route_follower`, or straight on where that cannot drive."""
+    """Return what `load_agent` does, for None `route_follower`, or straight on where that cannot drive."""
     try:
-        return load_agent(others or "route_follower", scenario) if isinstance(others, str | None) else others
+        return load_agent("route_follower" if others is None else others, scenario)
     except CoopenvError:
         if others is not None:
             raise

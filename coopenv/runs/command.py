@@ -161,7 +161,7 @@ def run(
     Args:
         environment: name, TOML file, dict or scenario, as for `coopenv.load_scenario`, or a recording.
         seed: of all that is drawn.
-        policy: of driven vehicles: "zero", "random", an agent, or a function of the observations.
+        policy: of driven vehicles: "zero", "random", or what `coopenv.policies.find_agent` takes.
         observer: name, class or import path; None: that of the scenario.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steps: decisions; None: up to the horizon.

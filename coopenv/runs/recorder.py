@@ -42,7 +42,7 @@ def record(
     Args:
         source: where the ticks come from: a backend, a scenario as for `coopenv.load_scenario`, or a recording.
         seed: of the episode.
-        policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
+        policy: of driven vehicles: "zero", "random", or what `find_agent` takes.
         on_progress: called with the share of the horizon that is done.
         on_tick: called with the engine and the tick's number after every tick, 0 included.
 
@@ -51,7 +51,7 @@ def record(
     """
     backend = source if isinstance(source, Backend) else open_backend(source, None, {})
     scenario = backend.scenario
-    driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
+    driver = load_policy(policy, scenario, seed)
     engine = Engine(scenario, 1, "float64", backend=backend)
     views = Views(engine, ("rotation", "position", "estimate_rotation", "estimate_position", "inbox_tick"))
     ticks: list[Sensed] = []

@@ -57,7 +57,7 @@ class Rollout:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
         self.engine = Engine(scenario, 1, dtype, device, backend=backend)
         self.scenario, self.seed = self.engine.backend.scenario, seed
-        self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
+        self.policy = load_policy(policy, scenario, seed)
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         if self.engine.backend.capabilities.recorded:  # whoever drove then
             self.policy_name = "recorded"

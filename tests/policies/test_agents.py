@@ -17,6 +17,7 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation import METRICS, drive
 from coopenv.policies import agents_for, decide, find_agent, load_agent, load_policy, restart
 from coopenv.policies.route_follower import RouteFollower
+from coopenv.policies.scripted import Peek
 from coopenv.policies.single_vehicle import SingleVehicleEnv
 from coopenv.runs.rollouts import rollout
 from tests.helpers.four_way import FOUR_WAY
@@ -121,6 +122,19 @@ def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(load_policy("own.py:Left", scenario, 0)(rows), [[0.0, 1.0]] * 3)
     np.testing.assert_array_equal(load_policy("own:right", scenario, 0)(rows), [[0.0, -1.0]] * 3)
     assert find_agent("own.py:right").name == "right"
+
+
+def test_whatever_is_an_agent_drives_a_run() -> None:
+    class Model:
+        """As Stable-Baselines3's."""
+
+        def predict(self, rows: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
+            return Peek(coopenv.load_scenario("facade"))(rows), None
+
+    names: list[Any] = ["peek", Peek, Model(), load_agent("peek", "facade")]
+    ways = [coopenv.run("facade", policy=policy, steps=5).trajectory.position for policy in names]
+    for way in ways[1:]:
+        np.testing.assert_array_equal(way, ways[0])
 
 
 def test_agents_made_for_an_environment() -> None:
@@ -238,6 +252,8 @@ def test_others_are_an_agent_or_a_policy() -> None:
     policy = paths_of(SingleVehicleEnv(scenario, others=load_agent("peek", scenario)), 60)
     straight = paths_of(SingleVehicleEnv("urban_crossing"), 60)
     np.testing.assert_array_equal(peek["vehicle_2"], policy["vehicle_2"])
+    of_a_class = paths_of(SingleVehicleEnv("urban_crossing", others=Peek), 60)
+    np.testing.assert_array_equal(peek["vehicle_2"], of_a_class["vehicle_2"])
     assert not np.array_equal(peek["vehicle_2"], straight["vehicle_2"])
     with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'peak' \(did you mean 'peek'\?\)"):
         SingleVehicleEnv("urban_crossing", others="peak")
