@@ -129,7 +129,7 @@ def record_count(where: str, function: Any, allowed: tuple[int, ...]) -> int:
     """
     plain = getattr(function, "func", function)  # a Warp function holds the plain one
     if not inspect.isfunction(plain) or plain.__name__ == "<lambda>":
-        raise CoopenvError(f"{where}: expected a function with a name, got {shown(function)}")
+        raise CoopenvError(f"{where}: expected a function with a name (def, not lambda), got {shown(function)}")
     taken = len(inspect.signature(plain).parameters)
     if taken not in allowed:
         expected = " or ".join(map(str, allowed))

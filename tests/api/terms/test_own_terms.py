@@ -219,7 +219,7 @@ def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path) -> Non
     [
         ("def error(ego:\n", "my_terms.py:error' cannot be loaded: SyntaxError"),
         ("def eror(ego):\n    return 1.0\n", "no 'error' in .*my_terms.py .did you mean 'eror'"),
-        ("error = 3\n", "expected a function with a name, got 3"),
+        ("error = 3\n", "expected a function with a name .*, got 3"),
         ("error = lambda ego: 1.0\n", "expected a function with a name"),
         ("def error(ego, truth, more):\n    return 1.0\n", "takes 3 records, expected 1 or 2"),
         ("def error(ego):\n    return ego.poistion\n", "cannot compile .* to return a number: .*poistion"),
@@ -290,7 +290,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         (lambda: coopenv.register_reward("progress", control_again), "reward term cannot be named 'progress'"),
         (lambda: coopenv.register_reward("error_again", control_again), "'error_again' is registered already"),
         (lambda: coopenv.register_reward("my reward", control_again), "is an identifier, got 'my reward'"),
-        (lambda: coopenv.register_reward("mine", 3), "reward term 'mine': expected a function with a name, got 3"),
+        (lambda: coopenv.register_reward("mine", 3), "reward term 'mine': expected a function with a name .*, got 3"),
         (lambda: coopenv.register_reward("mine", lambda ego: 1.0), "expected a function with a name"),
         (lambda: coopenv.register_observation("goal", velocity_again), "cannot be named 'goal'"),
         (lambda: coopenv.register_observation("mine", velocity_again, per="target"), "takes 1 records, expected 2"),
