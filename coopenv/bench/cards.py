@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import groupby
+from numbers import Integral
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -111,7 +112,7 @@ class Contest:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
         """
         for what, value, least in (("worlds", worlds, 1), ("seed_block", block, 0)):
-            if not isinstance(value, int) or value < least:
+            if not isinstance(value, Integral) or value < least:
                 raise CoopenvError(f"{what}: expected a whole number, at least {least}, got {value!r}")
         scenario, name = open_simulation(environment, overrides), scenario_name(environment)
         if not scenario.driven:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import coopenv
 from coopenv.base.installation import data_directory
 from coopenv.bench.cards import shown
 from coopenv.cli import main
@@ -127,3 +128,19 @@ def test_mistakes_are_one_line(options: list[str], message: str) -> None:
 )
 def test_figures_have_the_digits_that_their_interval_allows(values: tuple[float, ...], expected: object) -> None:
     assert shown(dict(zip(("mean", "ci_low", "ci_high"), values, strict=True)), 1.0) == expected
+
+
+def test_in_python_it_prints_tables_and_names_what_is_wrong() -> None:
+    found = coopenv.evaluate("facade", "own.py:still", worlds=np.int64(2), overrides={"horizon": 1.0})
+    assert "2 held-out worlds" in str(found) and "few: share of that time" in str(found)
+    assert repr(found).startswith("Evaluation('facade'")
+    with pytest.raises(coopenv.CoopenvError, match=r"worlds: expected a whole number, at least 1, got 2\.5"):
+        coopenv.evaluate("facade", "peek", worlds=2.5)  # type: ignore[arg-type]
+    with pytest.raises(coopenv.CoopenvError, match="seed_block: expected a whole number, at least 0, got -1"):
+        coopenv.evaluate("facade", "peek", worlds=2, seed_block=-1)
+
+    def wrong(observations: np.ndarray) -> np.ndarray:
+        return np.zeros((len(observations), 3))
+
+    with pytest.raises(coopenv.ActionError, match="agent wrong: the policy returned actions of shape"):
+        coopenv.evaluate("facade", ["peek", wrong], worlds=2)
