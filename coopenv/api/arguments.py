@@ -171,7 +171,7 @@ class Step:
       rotation (W, N, 3, 3), body to map; `estimate`: position, rotation, and covariance (W, N, 6, 6);
     - `visible`: (W, N, T), the targets measured in this frame; `time`: (W, 1), s since the reset;
     - `observation`: (W, N, D), scaled and clipped; `action`: (W, N, A) in [-1, 1];
-    - `reward_terms`: (W, N) by name, and `reward`, what the scenario's weights make of them;
+    - `reward_terms`: (W, N) by name, and `reward`, what the scenario's weights make of them, for each vehicle itself;
     - `alive`, `terminated`, `truncated`: (W, N) bool; `ended`: (W, N), 0 under way, 1 arrived, 2 collided, 3 off
       route, from 4 on the scenario's own conditions.
     """

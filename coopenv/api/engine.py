@@ -68,7 +68,7 @@ class Engine:
             device: "cpu" or a CUDA device.
             threads: shares of the batch on the CPU.
             backend: where ticks come from (None: computed).
-            reward: in place of the scenario's weighted sum; on the CPU only.
+            reward: in place of the scenario's weighted sums, before a team's; on the CPU only.
 
         Raises:
             CoopenvError: also where a term does not exist or fails, or the results would not fit into memory.
@@ -207,7 +207,7 @@ class Engine:
     def _fill(self, key: str, fresh: Any, chosen: Any, stepped: bool = False) -> None:
         """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun.
 
-        After a step, a function in Python replaces the reward of the worlds where none has.
+        After a step, the reward of a function in Python, if there is one, is each vehicle's own; 0 in fresh worlds.
         """
         world = self.world
         parts = [PerWorld(part) for part in (self._own_terms.records, self.results, fresh, chosen)]

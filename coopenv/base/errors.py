@@ -67,13 +67,13 @@ class DataWarning(UserWarning):
     """A recorded or deployment file is what it claims to be, but lacks something that it should hold."""
 
 
-def checked_seed(seed: object) -> int:
-    """Return a seed as an int. Raises CoopenvError: it is not a whole number, or negative."""
+def checked_seed(seed: object, what: str = "seed") -> int:
+    """Return a seed, or `what` it is, as an int. Raises CoopenvError: it is not a whole number, or negative."""
     if isinstance(seed, bool) or not hasattr(seed, "__index__"):
-        raise CoopenvError(f"seed must be a whole number, got {seed!r}")
+        raise CoopenvError(f"{what} must be a whole number, got {seed!r}")
     number = seed.__index__()
     if number < 0:
-        raise CoopenvError(f"seed must not be negative, got {number}")
+        raise CoopenvError(f"{what} must not be negative, got {number}")
     return int(number)
 
 

@@ -6,7 +6,6 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import groupby
-from numbers import Integral
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -19,7 +18,7 @@ from rich.table import Table
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.base.columns import WIDTH, Columns, Tabular, one_line, terminal_html
-from coopenv.base.errors import ActionError, CoopenvError, check_one_of
+from coopenv.base.errors import ActionError, CoopenvError, check_one_of, checked_seed
 from coopenv.base.files import check_file, replace_text
 from coopenv.base.format import NONE, json_text
 from coopenv.base.installation import version
@@ -111,9 +110,9 @@ class Contest:
         Raises:
             CoopenvError: an agent does not exist or cannot drive here, two have one name, or nothing is driven here.
         """
-        for what, value, least in (("worlds", worlds, 1), ("seed_block", block, 0)):
-            if not isinstance(value, Integral) or value < least:
-                raise CoopenvError(f"{what}: expected a whole number, at least {least}, got {value!r}")
+        worlds, block = checked_seed(worlds, "worlds"), checked_seed(block, "seed_block")
+        if worlds < 1:
+            raise CoopenvError(f"worlds must be at least 1, got {worlds}")
         scenario, name = open_simulation(environment, overrides), scenario_name(environment)
         if not scenario.driven:
             raise CoopenvError(f"{name}: all motion here is prescribed, there is nothing to drive")

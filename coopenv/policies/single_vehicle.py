@@ -50,8 +50,8 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         Args:
             name_or_path: as for `coopenv.parallel_env`.
             vehicle: the one that the action drives (None: the last driven one, which receives from most others).
-            others: drives the other vehicles: name or folder of an agent, or a policy (None: `route_follower`, or where
-                it cannot drive, straight on).
+            others: drives the other vehicles: what `find_agent` takes (None: `route_follower`, or where it cannot
+                drive, straight on).
             **options: the other arguments of `coopenv.parallel_env`.
 
         Raises:

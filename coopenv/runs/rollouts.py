@@ -150,8 +150,8 @@ def rollout(
         steps: decisions (None: up to the horizon, where a run ends in any case).
         dtype: "float32" or "float64".
         device: "cpu" or a CUDA device.
-        policy: "zero", "random", an agent's name, or a function of the observations (N, D) that returns actions
-            (N, A); vehicles with prescribed motion ignore their actions.
+        policy: "zero", "random", or what `find_agent` takes, such as a function of the observations (N, D) that returns
+            actions (N, A); vehicles with prescribed motion ignore their actions.
         on_tick: called with the engine and the tick's number after every tick, 0 included.
 
     Raises:

@@ -18,16 +18,16 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples, Schedule
 from stable_baselines3.common.utils import explained_variance
 from torch import Tensor, nn
 
-ONEDNN = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
+ONEDNN: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)  # private to torch
 CPUINFO = Path("/proc/cpuinfo")
 LOG_DENSITY = 0.5 * math.log(2.0 * math.pi)  # of a standard normal number at 0, negated
 
 
 @cache
 def onednn_pays() -> bool:
-    """Whether oneDNN's products are faster than torch's own: MKL uses half the width of AMD's vector units.
+    """Return whether oneDNN's products are faster than torch's own, those of MKL.
 
-    On Intel oneDNN's take up to twice as long.
+    On AMD MKL uses half the width of the vector units; on Intel oneDNN's products take up to twice as long.
     """
     amd = CPUINFO.exists() and "AuthenticAMD" in CPUINFO.read_text(encoding="utf-8")
     return amd and ONEDNN is not None and torch.backends.mkldnn.is_available()
@@ -35,7 +35,7 @@ def onednn_pays() -> bool:
 
 def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Return rows (R, D) times the transpose of weight (A, D), plus bias (A,)."""
-    if ONEDNN is not None and onednn_pays():
+    if onednn_pays():
         found: Tensor = ONEDNN(rows, weight, bias, "none", [], "")
         return found
     return nn.functional.linear(rows, weight, bias)

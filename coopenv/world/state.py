@@ -211,11 +211,13 @@ KEPT_ORDER = Rule("a number of an entry", lambda values, fields, model: (values 
 
 
 def _lists(values: Array, fields: Fields, model: Any) -> Mask:
-    """Return where no item is named twice, by cells and by items before it: all lists end then."""
-    items = values.shape[1]
+    """Return where no item is named twice, by cells and by items before it: all lists end then.
+
+    A grid of a single cell has none.
+    """
     named = np.sort(np.concatenate([fields["first_item"], values], axis=1), axis=1)
-    once = np.all((named[:, 1:] > named[:, :-1]) | (named[:, 1:] < 0), axis=1)
-    return np.asarray((values >= -1) & (values < items) & once[:, None])
+    once = np.all((named[:, 1:] > named[:, :-1]) | (named[:, 1:] < 0), axis=1) | (model.cells.across == 1)
+    return np.asarray((values >= -1) & (values < values.shape[1]) & once[:, None])
 
 
 FIRST_ITEM = Rule(

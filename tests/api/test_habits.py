@@ -93,6 +93,10 @@ def test_a_state_whose_lists_never_end_is_refused() -> None:
     state["next_item"][0, :2] = [1, 0]
     with pytest.raises(coopenv.CoopenvError, match=r"'next_item' at \(0, 0\)"):
         env.set_state(state)
+    single = coopenv.parallel_env("lane:3")  # whose grid is a single cell, without lists
+    single.reset(seed=0)
+    state = single.get_state()
+    single.set_state({**state, "next_item": 0 * state["next_item"]})
 
 
 def test_infos_have_the_entries_that_their_type_names() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def test_an_update_is_that_of_sb3(ppo: dict[str, Any]) -> None:
 @pytest.mark.parametrize("available", [True, False])
 def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of transposed views as well, with oneDNN and without."""
-    if available and not torch.backends.mkldnn.is_available():
+    if available and not (ppo.ONEDNN and torch.backends.mkldnn.is_available()):
         pytest.skip("this torch has no oneDNN")
     monkeypatch.setattr(ppo, "onednn_pays", lambda: available)
     rng = np.random.default_rng(1)
@@ -98,3 +99,20 @@ def test_products_are_those_of_float64(available: bool, monkeypatch: pytest.Monk
     assert product(rows, weight, bias).numpy() == pytest.approx((exact + bias).numpy(), abs=1e-4)
     turned = weight.t().contiguous().t(), rows.t().contiguous().t()
     assert product(turned[1], turned[0]).numpy() == pytest.approx(exact.numpy(), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("processor", "built", "pays"),
+    [("AuthenticAMD", True, True), ("AuthenticAMD", False, False), ("GenuineIntel", True, False), (None, True, False)],
+)
+def test_onednn_multiplies_on_amd_alone(
+    processor: str | None, built: bool, pays: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ppo, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(ppo, "ONEDNN", print)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: built)
+    if processor is not None:
+        ppo.CPUINFO.write_text(f"vendor_id\t: {processor}\n")
+    ppo.onednn_pays.cache_clear()
+    assert ppo.onednn_pays() is pays
+    ppo.onednn_pays.cache_clear()

@@ -134,9 +134,11 @@ def test_in_python_it_prints_tables_and_names_what_is_wrong() -> None:
     found = coopenv.evaluate("facade", "own.py:still", worlds=np.int64(2), overrides={"horizon": 1.0})
     assert "2 held-out worlds" in str(found) and "few: share of that time" in str(found)
     assert repr(found).startswith("Evaluation('facade'")
-    with pytest.raises(coopenv.CoopenvError, match=r"worlds: expected a whole number, at least 1, got 2\.5"):
+    with pytest.raises(coopenv.CoopenvError, match=r"worlds must be a whole number, got 2\.5"):
         coopenv.evaluate("facade", "peek", worlds=2.5)  # type: ignore[arg-type]
-    with pytest.raises(coopenv.CoopenvError, match="seed_block: expected a whole number, at least 0, got -1"):
+    with pytest.raises(coopenv.CoopenvError, match="worlds must be at least 1, got 0"):
+        coopenv.evaluate("facade", "peek", worlds=0)
+    with pytest.raises(coopenv.CoopenvError, match="seed_block must not be negative, got -1"):
         coopenv.evaluate("facade", "peek", worlds=2, seed_block=-1)
 
     def wrong(observations: np.ndarray) -> np.ndarray:
