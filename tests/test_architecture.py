@@ -95,7 +95,7 @@ LINES_AND_FILES = {
     "estimation": (1845, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
-    "policies": (2044, 10),
+    "policies": (2050, 10),
     "runs": (3370, 13),
     "scenario": (3770, 13),
     "training": (1726, 7),

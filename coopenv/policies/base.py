@@ -54,10 +54,16 @@ def act(policy: Policy, observations: Mapping[str, np.ndarray]) -> dict[str, np.
     """Return the action of every agent of a `ParallelEnv` that a policy chooses from its flat observations.
 
     A policy with an attribute `agents` (their names in order) gets a row for each of them, 0 for those that have ended.
+
+    Raises:
+        ActionError: the observations are no vectors of one length by agent.
     """
+    rows = [*observations.values()] if isinstance(observations, Mapping) else []
+    if not rows or any(not isinstance(row, np.ndarray) or row.ndim != 1 or len(row) != len(rows[0]) for row in rows):
+        raise ActionError(f"expected flat observations by agent, got {shown(observations)}")
     agents = list(getattr(policy, "agents", ()))
     names = agents if {*observations} <= {*agents} else list(observations)
-    ended = np.zeros_like(next(iter(observations.values())))
+    ended = np.zeros_like(rows[0])
     actions = policy(np.stack([observations.get(name, ended) for name in names]))
     return {name: action for name, action in zip(names, actions, strict=True) if name in observations}
 

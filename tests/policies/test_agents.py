@@ -15,7 +15,8 @@ from coopenv.api.engine import Engine
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation import METRICS, drive
-from coopenv.policies import agents_for, decide, find_agent, load_agent, load_policy, restart
+from coopenv.policies import act, agents_for, decide, find_agent, load_agent, load_policy, restart
+from coopenv.policies.base import played_back
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.scripted import Peek
 from coopenv.policies.single_vehicle import SingleVehicleEnv
@@ -200,6 +201,12 @@ def test_bad_agents(tmp_path: Path) -> None:
 def test_actions_that_are_none(actions: np.ndarray, message: str) -> None:
     with pytest.raises(coopenv.CoopenvError, match=message):
         decide(lambda observations: np.asarray(actions), np.zeros((2, 132)))
+
+
+@pytest.mark.parametrize("observations", [np.zeros((2, 132)), {}, None, {"a": {"b": np.zeros(3)}}, {"a": 1.0}])
+def test_observations_of_another_kind(observations: Any) -> None:
+    with pytest.raises(coopenv.CoopenvError, match="expected flat observations by agent"):
+        act(played_back(np.zeros((1, 2, 2))), observations)
 
 
 def test_a_policy_that_remembers_is_told_when_an_episode_begins() -> None:
