@@ -233,7 +233,7 @@ class Plan:
     @property
     def work(self) -> str:
         """The work to do, for the progress bar."""
-        parts = {"observer": self.observers, "variant": self.variants, "seed": self.seeds}
+        parts = {"observer": self.observers, "variant": self.variants, "seed": self._used}
         return ", ".join(f"{len(part)} {word}{'s' if len(part) > 1 else ''}" for word, part in parts.items())
 
     def run(self, executor: Executor, on_progress: Callable[[float], None] = lambda share: None) -> Comparison:

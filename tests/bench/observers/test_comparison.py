@@ -21,6 +21,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.format import in_parentheses, with_error
 from coopenv.bench.observers import compare, find_source
 from coopenv.bench.observers.command import report_text
+from coopenv.bench.observers.comparison import Plan
 from coopenv.bench.observers.faults import VARIANTS
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import variants_of
@@ -295,6 +296,7 @@ def test_variants() -> None:
     assert variants_of(source, None) == ("nominal",) and variants_of(source, "all") == tuple(VARIANTS)
     assert variants_of(source, "v2x_loss, nominal,v2x_loss") == ("v2x_loss", "nominal")
     assert variants_of(find_source("mrclam_6"), None) == ("landmarks", "landmarks+robots", "blind")
+    assert Plan.of("mekf", find_source("mrclam_6"), 3).work == "1 observer, 3 variants, 1 seed", "one record"
 
 
 def test_observers_are_compared_where_they_are_meant_to_be() -> None:
