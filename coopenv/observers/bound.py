@@ -55,10 +55,6 @@ def error_states(recording: Recording) -> tuple[list[int], Array, Array]:
 BLOCK = 10_000_000
 """Numbers of the matrices over all vehicles that are kept at a time."""
 
-EXACT, COARSE = 12, 0.1
-"""Of more vehicles than that the ticks of 0.1 s count as one, half of the odometry's noise before what they measured
-and half after it: six times as fast, and less than 1 % off (`tests/observers/test_bound.py`)."""
-
 
 @dataclass(frozen=True)
 class Bound:
@@ -125,47 +121,24 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
     blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
     blocks[0] = P[:, rows, columns][..., :6, :6]
     identity = np.eye(part.shape[1])
-    at_once = 1 if len(own) <= EXACT else max(1, round(COARSE / recording.dt))
-    for ticks in _stretches(recording, at_once, w):
+    for ticks in _stretches(recording, w):
         E, M = steps(recording, ticks, states), information(recording, joint, members, ticks, states)
         M[~recording.due[ticks.start : ticks.stop]] = 0.0
-        for first in range(0, len(ticks), at_once):
-            last = min(first + at_once, len(ticks))
-            moved, noise, info = _together(E[first:last], M[first:last], Q) if at_once > 1 else (E[first], Q, M[first])
-            after = 0.5 * (1.0 - 1.0 / (last - first))  # of the noise, so that the error is of second order
+        for k, moved, info in zip(ticks, E, M, strict=True):
             P = _moved(P, moved[members])
-            P[:, rows, columns] += (1.0 - after) * noise[members]
+            P[:, rows, columns] += Q[members]
             info = info[part[:, :, None], part[:, None, :]]
             if info.any():
                 # (P^-1 + M)^-1 without the inverse of P, which may be ill-conditioned: P (I + M P)^-1
                 P = np.linalg.solve(identity + P @ info, P)
                 P = (P + np.swapaxes(P, -1, -2)) / 2
-            P[:, rows, columns] += after * noise[members]
-            k, parts = ticks.start + first, np.linspace(0.0, 1.0, last - first + 1)[1:, None, None, None, None]
-            poses = P[:, rows, columns][..., :6, :6]
-            blocks[k : ticks.start + last] = blocks[k - 1] + parts * (poses - blocks[k - 1])
+            blocks[k] = P[:, rows, columns][..., :6, :6]
     return blocks
 
 
-def _together(E: Array, M: Array, Q: Array) -> tuple[Array, Array, Array]:
-    """Return motion, noise (N, w, w) and information (wN, wN) of some ticks as one, over the errors at the last one.
-
-    All of them measure what that in their middle does: each by itself, carried on without the noise in between, would
-    count a parallax that the noise hides.
-    """
-    on = np.broadcast_to(np.eye(Q.shape[-1]), Q.shape)  # from a tick to the last one
-    noise, info, middle = np.zeros_like(Q), M[0], len(E) // 2
-    for k in reversed(range(len(E))):
-        if k == middle:
-            info = len(E) * _moved(M[k][None], np.swapaxes(np.linalg.inv(on), -1, -2)[None])[0]
-        noise += on @ Q @ np.swapaxes(on, -1, -2)
-        on = on @ E[k]
-    return on, noise, info
-
-
-def _stretches(recording: Recording, multiple: int, width: int) -> Iterator[range]:
-    """Yield the ticks after the start in stretches, each of which needs little memory, of a multiple of so many."""
-    most = multiple * max(1, BLOCK // (width * len(recording.setups)) ** 2 // multiple)
+def _stretches(recording: Recording, width: int) -> Iterator[range]:
+    """Yield the ticks after the start in stretches, each of which needs little memory."""
+    most = max(1, BLOCK // (width * len(recording.setups)) ** 2)
     for first in range(1, recording.ticks, most):
         yield range(first, min(first + most, recording.ticks))
 

@@ -193,13 +193,15 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
 
 
 def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> SensorNoise:
-    """Return the noise of one vehicle from its entries of the model."""
+    """Return the noise of one vehicle from its entries of the model; pixels that are rounded add to that of bearings."""
     bearing, axis = float(noise["bearing"]), None
     if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)
         along = camera["rotation"].astype(float) @ np.array(scenario.noises[vehicle].bearing.axis, float)
         x, y, z = (along / np.linalg.norm(along)).tolist()
         axis = x, y, z
+    if camera["quantise"]:
+        bearing = math.hypot(bearing, 1.0 / (math.sqrt(12.0) * float(camera["focal_length"].min())))
     rate, duration, size, angle = (float(noise[f"slip_{name}"]) for name in ("rate", "duration", "size", "angle"))
     return SensorNoise(
         velocity=float(noise["velocity"]),

@@ -11,7 +11,6 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise
-from coopenv.observers import bound as bound_module
 from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors, error_states, information, steps
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.runs.recorder import record
@@ -110,6 +109,12 @@ def test_ancestors_know_what_reaches_them() -> None:
     assert (family.position[1:] >= alone.position[1:] * (1 - 1e-9)).all()
 
 
+def test_more_data_never_raise_the_bound() -> None:
+    """Whatever the number of vehicles, and with odometry that tells nothing from one frame to the next."""
+    made = record(load_scenario("lane:14", {"horizon": 1.0, "noise.velocity": 2.0}), 0)
+    assert (cramer_rao(made).position <= cramer_rao_ancestors(made).position * (1 + 1e-9)).all()
+
+
 def test_ancestors_bound_is_that_of_a_smaller_world() -> None:
     """Blind the others: the bound joint over all is then the one over the family."""
     made = small_record(3)
@@ -141,19 +146,6 @@ def test_the_papers_noise_counts_with_its_covariance():
 def test_no_noise_no_bound():
     made = record(load_scenario("busy_intersection", {"horizon": 0.2, "noise.enabled": False}), 0)
     assert np.isnan(cramer_rao(made).position).all()
-
-
-@pytest.mark.parametrize("name", ["lane:6", "random:6,seed=3", "roots:6"])
-def test_ticks_that_count_as_one_hardly_change_the_bound(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So the bounds of more than a dozen vehicles are worked out: less than 1 % off in every window of a run."""
-    made = record(load_scenario(name, {"horizon": 8.0}), 0)
-    exact = cramer_rao_ancestors(made)
-    monkeypatch.setattr(bound_module, "EXACT", 0)
-    coarse = cramer_rao_ancestors(made)
-    for start, end in ((1.0, 2.0), (2.0, 5.0), (5.0, 8.0)):
-        within = (made.t > start) & (made.t <= end)
-        ratio = np.mean(coarse.position[within] ** 2, axis=0) / np.mean(exact.position[within] ** 2, axis=0)
-        assert np.abs(np.sqrt(ratio) - 1.0).max() < 0.015 and not np.array_equal(coarse.position, exact.position)
 
 
 # Errors that last

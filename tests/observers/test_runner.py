@@ -91,6 +91,17 @@ def test_bearings_are_in_the_body_frame_and_point_to_the_target() -> None:
             assert_allclose(tick.bearings[n], line / np.linalg.norm(line), atol=1e-12)
 
 
+def test_rounded_pixels_are_in_the_declared_noise() -> None:
+    """Of a single car that drives by five landmarks, so that pixels change."""
+    made = record(load_scenario("crossing_path", {"horizon": 20.0}), 0)
+    R, p = made.truth.rotation[:, 0], made.truth.position[:, 0]
+    lines = (made.landmarks - p[:, None]) @ R - made.setups[0].lever_arm
+    true = lines / np.linalg.norm(lines, axis=-1, keepdims=True)
+    errors = (made.bearings[:, 0, :5] - true)[made.visible[:, 0, :5]]
+    per_axis = np.sqrt(np.mean(np.sum(errors**2, axis=-1)) / 2)
+    assert_allclose(per_axis, made.setups[0].noise.bearing, rtol=0.1)
+
+
 def test_odometry_without_noise_is_the_true_motion() -> None:
     scenario = small_errors({"horizon": 0.5, "noise.enabled": False})
     made = record(scenario, 0)

@@ -31,16 +31,20 @@ from coopenv.world.warp_internals import device_function, subroutine
 HALF_ACCELERATION = 0.5 * constants.MAX_ACCELERATION
 UNIFORM_VARIANCE = THIRD
 """Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
+ROUNDING_VARIANCE = 1.0 / 12.0  # of a number that is rounded to integers
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # purpose of a frame
 
 
 @device_function
 def bearing_variance(model: Any, i: int):
-    """Return the variance of a bearing of vehicle i per tangent axis."""
+    """Return the variance of a bearing of vehicle i per tangent axis, with that of pixels which are rounded."""
     std = wp.float64(model.noise[i].bearing)
     variance = std * std
     if model.noise[i].bearing_paper == 1:
         variance = variance * wp.float64(UNIFORM_VARIANCE)
+    if model.camera[i].quantise == 1:
+        focal = wp.float64(wp.min(model.camera[i].focal_length))
+        variance += wp.float64(ROUNDING_VARIANCE) / (focal * focal)
     return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
 
