@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv, dpotrf
 from scipy.spatial.transform import Rotation
 
-from coopenv.base.errors import explained
+from coopenv.base.errors import CoopenvError, explained
 from coopenv.base.format import LARGEST
 
 Array = NDArray[np.float64]
@@ -257,7 +257,13 @@ def position_covariance(rotation: Array, position: Array, covariance: Array) -> 
         rotation: Rhat (..., 3, 3), body to map.
         position: phat (..., 3), map frame, m.
         covariance: P (..., 6, 6) in the paper's coordinates.
+
+    Raises:
+        CoopenvError: another shape.
     """
+    shapes = [np.shape(values) for values in (rotation, position, covariance)]
+    if (shapes[0][-2:], shapes[1][-1:], shapes[2][-2:]) != ((3, 3), (3,), (6, 6)):
+        raise CoopenvError(f"position_covariance: expected (..., 3, 3), (..., 3) and (..., 6, 6), got {shapes}")
     return covariance_in_map(Coordinates.RICCATI, rotation, position, covariance)[..., :3, :3]
 
 

@@ -254,7 +254,7 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         targets = tick.targets[mask] - self.landmarks
         rows = np.flatnonzero(targets >= 0)
         j = targets[rows]
-        of = linear.H.reshape(*linear.H.shape[:2], -1, 6)  # a view
+        of = linear.H.reshape(*linear.H.shape[:2], linear.H.shape[2] // 6, 6)  # a view
         H = np.concatenate([of[rows, :, i], of[rows, :, j]], axis=-1)
         H -= H @ self.projection[i, j]
         of[rows, :, i], of[rows, :, j] = H[..., :6], H[..., 6:]

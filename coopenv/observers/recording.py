@@ -141,8 +141,10 @@ class Recording(Measurements):
     interference: "Interference | None" = None  # of the world's faults with messages and observers; None: there is none
 
     def __post_init__(self) -> None:
-        for values in vars(self).values():
+        for name, values in [*vars(self).items()]:
             if isinstance(values, np.ndarray):
+                if values.dtype.kind == "f" and values.dtype != np.float64:
+                    object.__setattr__(self, name, values := values.astype(np.float64))
                 values.setflags(write=False)
 
     @property
@@ -430,11 +432,17 @@ def _check_radio(r: Recording) -> None:
     _require(r.staleness > 0.0, f"staleness: {r.staleness} is not positive")
 
 
-def _check_arrays(r: Recording) -> None:
+def recorded_arrays(r: Recording) -> dict[str, Any]:
+    """Return the arrays of a recording by name. Raises DataError: one has another shape or type than it should."""
     names = [name for name, spec in ARRAYS.items() if spec.recorded and (name != "pan" or r.pan is not None)]
     values = {name: attrgetter(name)(r) for name in names}
     for problem in _misshapen(values, {"K": r.ticks, **sizes_of(r.setups)}, {kind: kind for kind in "fib"}):
         raise DataError(problem)
+    return values
+
+
+def _check_arrays(r: Recording) -> None:
+    values = recorded_arrays(r)
     about = {"now": np.arange(r.ticks)[:, None, None], "period": r.period}
     for name, valid, problem in _invalid(values, about, ticks=True):
         _require_all(r, name, valid, problem)

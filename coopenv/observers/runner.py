@@ -18,7 +18,7 @@ from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.estimation.poses import Array, Coordinates, orientation_error_deg
 from coopenv.observers.contract import Factory, Gains, ObserverInit, SensorNoise, Setup
 from coopenv.observers.group import ObserverError, ObserverGroup, Tamper, TimedEstimate
-from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording import Recording, Truth, recorded_arrays
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
 from coopenv.scenario.schema import neighbour_sets
@@ -54,12 +54,16 @@ class Run:
         return np.sqrt(self.mean(self.position_error**2, self.t >= after))
 
     def anees(self, after: float = 0.0) -> Array:
-        """Return (N,) the mean NEES from a time on divided by its dimension; 1 for a consistent covariance.
+        """Return (N,) the mean NEES from a time on divided by its dimension, see `anees_in`."""
+        return self.anees_in(self.t >= after)
+
+    def anees_in(self, when: NDArray[np.bool_]) -> Array:
+        """Return (N,) the mean NEES over ticks (K,), divided by its dimension; 1 for a consistent covariance.
 
         Ticks at which the observer states no covariance, such as the start, do not count; NaN where it never does.
         """
         silent = np.isnan(self.covariance).any(axis=(-1, -2)) & np.isfinite(self.position).all(axis=-1)
-        return self.mean(self.nees, (self.t >= after)[:, None] & ~silent) / self.nees_dof
+        return self.mean(self.nees, when[:, None] & ~silent) / self.nees_dof
 
     def mean(self, values: Array, when: NDArray[np.bool_]) -> Array:
         """Return (N,) the mean of values (K, N) over some ticks (K,) or (K, N), those without a known truth left out.
@@ -83,9 +87,10 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         tamper: changes the broadcasts of some vehicle.
 
     Raises:
-        CoopenvError: unknown name.
+        CoopenvError: unknown name, or arrays of the recording that do not belong together.
     """
     factory = find(observer)
+    recorded_arrays(recording)
     r, failure = recording, ""
     group, shape = ObserverGroup(factory, r.observer_init, tamper), (r.ticks, len(r.setups))
     R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
@@ -193,7 +198,7 @@ def observer_init_of(scenario: Scenario, model: Any) -> ObserverInit:
 
 
 def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> SensorNoise:
-    """Return the noise of one vehicle from its entries of the model; pixels that are rounded add to that of bearings."""
+    """Return the noise of one vehicle from its entries of the model; rounded pixels add to that of bearings."""
     bearing, axis = float(noise["bearing"]), None
     if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)

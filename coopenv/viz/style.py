@@ -243,7 +243,7 @@ def canvas(width: float | None, height: float, note: str = "") -> tuple[Figure, 
 
 def fitting(width: float, each: float, most: int) -> int:
     """Return how many panels of a width stand side by side."""
-    return max(1, min(most, int(width / each)))
+    return int(min(most, width / each)) if width >= each else 1
 
 
 def marks(*entries: tuple[object, str, Mapping[str, Any]]) -> list[Line2D | Patch]:

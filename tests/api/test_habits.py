@@ -238,6 +238,12 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "an agent's number": (lambda: coopenv.parallel_env(ENV).observation_space(0), "^unknown agent 0; known"),  # type: ignore[arg-type]
     "an observer": (lambda: coopenv.run(ENV, observer="Robst"), r"did you mean 'robust'\?"),
     "a policy": (lambda: coopenv.run(ENV, policy="PEEK"), r"^unknown policy 'PEEK' \(did you mean 'peek'\?\)"),
+    "covariance of another shape": (
+        lambda: coopenv.position_covariance(np.eye(3), np.zeros(3), np.eye(5)),
+        r"got \[\(3, 3\), \(3,\), \(5, 5\)\]",
+    ),
+    "no variant": (lambda: coopenv.compare("mekf", "lane:3", 1, variants=[]), "variants: expected at least one"),
+    "a fault that is a number": (lambda: coopenv.compare("mekf", "lane:3", 1, faults=[3]), "expected a text, got 3"),
     "an observer's number": (lambda: coopenv.compare(3, ENV), r"^expected a name, a class or a list"),  # type: ignore[arg-type]
     "worlds": (lambda: coopenv.make_vec(ENV, num_worlds=2.0), "^num_worlds must be at least 1, whole"),  # type: ignore[arg-type]
     **{

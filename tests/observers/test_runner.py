@@ -34,6 +34,8 @@ from coopenv.scenario import load_scenario
 from tests.helpers.recordings import simulated as recording
 from tests.oracles.batch import small_errors
 
+NAMES = sorted({*registry.ZOO} & {*registry.available_names(planar=False)})
+
 
 class Probe:
     """Stands still and notes what it is given; its message says when it was made."""
@@ -102,6 +104,22 @@ def test_rounded_pixels_are_in_the_declared_noise() -> None:
     assert_allclose(per_axis, made.setups[0].noise.bearing, rtol=0.1)
 
 
+def test_arrays_of_another_length_or_precision() -> None:
+    made = recording(horizon=0.2)
+    assert replace(made, rotation=made.rotation.astype(np.float32)).rotation.dtype == np.float64
+    with pytest.raises(CoopenvError, match=r"^translation: expected an array of shape"):
+        run("robust", replace(made, translation=made.translation[:-1]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_bearing_need_fit(name: str) -> None:
+    """Not even one of a frame, for any observer."""
+    made = record(load_scenario("lane:3", {"horizon": 1.0}), 0)
+    drawn = np.random.default_rng(0).standard_normal(made.bearings.shape)
+    random = np.where(made.visible[..., None], drawn / np.linalg.norm(drawn, axis=-1, keepdims=True), made.bearings)
+    assert not run(name, replace(made, bearings=random)).failure
+
+
 def test_odometry_without_noise_is_the_true_motion() -> None:
     scenario = small_errors({"horizon": 0.5, "noise.enabled": False})
     made = record(scenario, 0)
@@ -110,9 +128,6 @@ def test_odometry_without_noise_is_the_true_motion() -> None:
     )
     assert result.position_error.max() < 1e-10
     assert result.orientation_error.max() < 1e-8
-
-
-NAMES = sorted({*registry.ZOO} & {*registry.available_names(planar=False)})
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.base.fault_text import Fault, FaultError, FaultKind, parse_fault
 from coopenv.bench.observers.changes import (
     NO_FOLLOWERS,
@@ -63,7 +63,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
     "v2x_delay": RecordFault("SECONDS", "by which messages arrive later", 0.2, change=with_delay),
     "wrong_association": RecordFault(
         "SHARE",
-        "of the bearings that carries the identity of another target in view",
+        "of the bearings that is swapped with another one of its frame, some of them twice",
         0.05,
         high=1.0,
         change=with_wrong_association,
@@ -75,6 +75,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "RATE",
         "by which gyros are biased about the vertical from START on, rad/s; undeclared",
         0.02,
+        low=-math.inf,
         start=True,
         vehicles=True,
         change=with_gyro_step,
@@ -93,6 +94,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         "SHARE",
         "to which the scale error of odometries grows from START to the end; undeclared",
         0.1,
+        low=-1.0,
         start=True,
         vehicles=True,
         change=with_scale_drift,
@@ -112,6 +114,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         free_word=True,
         start=True,
         options=("angle", "spread"),
+        signed=("angle",),
         vehicles=True,
         change=with_map_error,
     ),
@@ -132,6 +135,7 @@ FAULTS: dict[str, RecordFault | WorldFault] = {
         words={"jump": 5.0, "drift": 0.05, "replay": 1.0, "collude": 5.0},
         start=True,
         options=("std", "turn", "angle", "honest_odometry"),
+        signed=("turn", "angle"),
         vehicles=True,
         change=with_lie,
     ),
@@ -212,10 +216,12 @@ def variant_of(text: str, name: str = "") -> FaultVariant:
     Raises:
         FaultError: one is not valid.
     """
+    if not isinstance(text, str):
+        raise FaultError(f"fault: expected a text, got {shown(text)}")
     text = text.strip()
     faults = tuple(parse_fault(word, FAULTS) for word in text.split("/")) if text or not name else ()
     for fault in faults:
-        if fault.word == "collude" and len(fault.vehicles) < 2:
+        if fault.word == "collude" and len(set(fault.vehicles)) < 2:
             raise FaultError(f"fault {fault.text}: two vehicles collude, such as vehicle_2,vehicle_3:lie=collude:5")
         if fault.word == "replay" and fault.value > LONGEST_REPLAY:
             raise FaultError(f"fault {fault.text}: expected an age up to {LONGEST_REPLAY:g} s")

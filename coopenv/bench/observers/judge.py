@@ -321,7 +321,7 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
     figures = {
         "position_mse": np.array([result.mean(errors[0] ** 2, ticks) for ticks in windows]).T,
         "orientation_mse": result.mean(errors[1] ** 2, windows[-1]),
-        "anees": np.array([result.mean(result.nees, ticks) for ticks in windows]).T / result.nees_dof,
+        "anees": np.array([result.anees_in(ticks) for ticks in windows]).T,
         "nis": np.where(dof > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": dof.sum(axis=0).astype(float),
         "diverged": diverged(*map(_last, errors)),

@@ -279,6 +279,8 @@ def variants_of(source: RecordSource, asked: str | Iterable[str] | None) -> tupl
     """
     given = source.usual if asked is None else asked.split(",") if isinstance(asked, str) else asked
     names = [name.strip() for name in given]
+    if not names:
+        raise CoopenvError(f"variants: expected at least one; known: {', '.join((*source.variants, ALL))}")
     if names == [ALL]:
         return tuple(name for name in source.variants if not source.obstacle(name))
     names = list(dict.fromkeys([*names, *(variant.name for variant in source.added)]))
