@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import tomllib
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, reduce
@@ -124,6 +125,23 @@ def read_toml(path: Path, error: type[CoopenvError] = CoopenvError, where: str |
         raise
     except ValueError as problem:  # of tomllib itself, or of numbers with thousands of digits
         raise error(f"{where}: not valid TOML: {problem}") from None
+
+
+def with_tables(
+    raw: Mapping[str, Any], more: Mapping[str, Any], keys: Sequence[str], where: str, error: type[CoopenvError]
+) -> dict[str, Any]:
+    """Return plain data with the entries of tables of another file added, `where` both are named.
+
+    Raises:
+        CoopenvError: of class `error`; one of them is no table.
+    """
+    joined = dict(raw)
+    for key in keys:
+        own, other = raw.get(key, {}), more.get(key, {})
+        if not (isinstance(own, Mapping) and isinstance(other, Mapping)):
+            raise error(f"{where}: {key}: expected a table")
+        joined[key] = {**own, **other}
+    return joined
 
 
 def validated(model: type[Model], raw: Any, where: str, error: type[CoopenvError] = CoopenvError) -> Model:

@@ -1,5 +1,6 @@
 """The deployment file: which cars there are, how they are reached, and what they may do."""
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, check_one_of, listed, shown
-from coopenv.base.sections import Section, read_toml, validated
+from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.fake.faults import USUAL as DEFAULT_FAKE
 from coopenv.cars.fake.faults import FakeSettings
 from coopenv.cars.profile import (
@@ -314,6 +315,8 @@ class Deployment(Section):
             value, most = getattr(self.safety, key), getattr(self.profile.hardest, key.removeprefix("max_"))
             if value > most:
                 raise ValueError(f"safety.{key}: {value:g} is over {most:.4g}, the largest of this make")
+        if self.safety.reverse and not self.profile.hardest.reverse:
+            raise ValueError("safety.reverse: true, but this make does not reverse")
         refuse_foreign(self.network.kind, self.gate_connect, "gate.connect")
         if self.profile.sees_frames and (self.sensors.detections, self.sensors.distorted) != ("bearings", False):
             raise ValueError(
@@ -379,7 +382,7 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
         raw["network"] = {**network, "connect": [connect]}
     if isinstance(name := raw.get("identified"), str):
         found = read_toml(path.parent / name, DeploymentError)
-        raw |= {key: {**raw.get(key, {}), **found.get(key, {})} for key in ("overrides", "fake")}
+        raw = with_tables(raw, found, ("overrides", "fake"), f"{path.name} and {name}", DeploymentError)
     return parse_deployment(raw, path)
 
 
@@ -388,8 +391,8 @@ def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
     given = raw.get("profile")
     if isinstance(given, str) or (isinstance(given, dict) and "base" in given):
         try:
-            raw = {**raw, "profile": load_profile(given, path.parent)}
+            raw = {**raw, "profile": load_profile(given, path.parent).model_dump(mode="json")}
         except CoopenvError as error:
             raise DeploymentError(f"{path.name}: profile: {error}") from None
-    made = validated(Deployment, raw, path.name, DeploymentError)
+    made = validated(Deployment, json.dumps(raw, default=str), path.name, DeploymentError)
     return made.model_copy(update={"file": path})

@@ -1,5 +1,6 @@
 """The profile of a make of cars (topics, command message, limits, conditions), and the polygon of a geofence."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -42,7 +43,10 @@ class Limits:
         """Return these limits. Raises CoopenvError: one of them is not above zero, or beyond the hardest."""
         for field in fields(self):
             value, most = getattr(self, field.name), getattr(hardest, field.name)
-            if field.name != "reverse" and not 0.0 < value <= most:
+            if field.name == "reverse":
+                if value and not most:
+                    raise CoopenvError("limit reverse: this make does not reverse")
+            elif not 0.0 < value <= most:
                 raise CoopenvError(f"limit of {field.name.replace('_', ' ')}: must be above 0, at most {most:.4g}")
         return self
 
@@ -162,9 +166,14 @@ class MotionCommand:
 
 NEUTRAL = MotionCommand()
 
+MAX_COMMAND_AGE = 0.15
+"""s, above which a gate refuses a command; no profile permits older ones."""
+
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
-TopicPattern = Annotated[str, Field(max_length=256, pattern=r"^([A-Za-z0-9_/~]|\{car\}|\{body\})+$")]
+TopicPattern = Annotated[
+    str, Field(max_length=256, pattern=r"^([A-Za-z0-9_~]|\{car\}|\{body\})([A-Za-z0-9_/~]|\{car\}|\{body\})*$")
+]
 
 
 class Topic(Section):
@@ -213,6 +222,15 @@ class Brake(Section):
 FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
 
 
+def _holds(kind: FieldType, value: float) -> bool:
+    """Return whether a field can have a value."""
+    if kind.startswith("float"):
+        return True
+    bits = 1 if kind == "bool" else int(kind.lstrip("uint"))
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("i") else (0, 2**bits - 1)
+    return value.is_integer() and low <= value <= high
+
+
 class CommandMessage(Section):
     """Message from the gate to the car, a stamped one: a header, then numbers."""
 
@@ -239,9 +257,14 @@ class CommandMessage(Section):
                 raise ValueError(f"{name}.field: {shown(channel.field)} is no float32 or float64 of neutral")
             if channel.change == 0.0:
                 raise ValueError(f"{name}.change: must not be 0")
-        for field in self.brake.fields if self.brake else ():
+        braking = self.brake.fields if self.brake else {}
+        for field in braking:
             if field not in self.neutral:
                 raise ValueError(f"brake.fields: {shown(field)} is no field of neutral")
+        for name, (kind, value) in self.neutral.items():
+            for where, number in (("neutral", value), ("brake.fields", braking.get(name, value))):
+                if not _holds(kind, number):
+                    raise ValueError(f"{where}.{name}: a field of type {kind} cannot be {number:g}")
         return self
 
     def share(self, channel: Channel, value: float) -> float:
@@ -356,6 +379,8 @@ class CarProfile(Section):
         names = [self.topic_of("NAME", role) for role in Role]
         if repeated := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(f"topics: two roles have the name {repeated}")
+        if not 0.0 < (self.topics[Role.COMMAND].max_age or 0.0) <= MAX_COMMAND_AGE:
+            raise ValueError(f"topics.command.max_age: needed, above 0 and at most {MAX_COMMAND_AGE:g} s")
         for role, kind in GATE_TYPES.items():
             if self.topics[role].type != kind:
                 raise ValueError(f"topics.{role.value}.type: the gate has {kind}")
@@ -387,7 +412,7 @@ def load_profile(given: str | Mapping[str, Any], folder: Path = FOLDER) -> CarPr
         for key, value in _read(base, folder)[0].items():
             own = raw.get(key, value)
             raw[key] = {**value, **own} if isinstance(value, dict) and isinstance(own, dict) else own
-    return validated(CarProfile, raw, where)
+    return validated(CarProfile, json.dumps(raw, default=str), where)
 
 
 def _read(name: str, folder: Path) -> tuple[dict[str, Any], str]:

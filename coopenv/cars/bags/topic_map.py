@@ -1,5 +1,6 @@
 """The map of a bag: the environment of its cars, their topics, and the treatment of its clocks."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
-from coopenv.base.sections import Section, read_toml, validated
+from coopenv.base.sections import Section, read_toml, validated, with_tables
 from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
 from coopenv.cars.profile import (
     AUTHORS,
@@ -199,14 +200,15 @@ def load_map(path: str | Path) -> TopicMap:
     data = read_toml(path, TopicMapError)
     if isinstance(name := data.get("calibration"), str):
         found = read_toml(path.parent / name, TopicMapError)
-        data["overrides"] = {**data.get("overrides", {}), **found.get("overrides", {})}
-        clocks = data.setdefault("clocks", {})
-        clocks["offsets"] = {**clocks.get("offsets", {}), **found.get("clocks", {}).get("offsets", {})}
-    made = validated(TopicMap, data, path.name, TopicMapError)
+        both = f"{path.name} and {name}"
+        own, more = (with_tables({}, file, ("clocks",), both, TopicMapError)["clocks"] for file in (data, found))
+        data = with_tables(data, found, ("overrides",), both, TopicMapError)
+        data["clocks"] = with_tables(own, more, ("offsets",), f"{both}: clocks", TopicMapError)
+    made = validated(TopicMap, json.dumps(data, default=str), path.name, TopicMapError)
     try:
         make = SVEA if made.names in PATTERNS else load_profile(made.names, path.parent)
     except CoopenvError as error:
-        raise TopicMapError(f"{path.name}: names: {error}, authors, none") from None
+        raise TopicMapError(f"{path.name}: names: {error}; also: authors, none") from None
     vision = made.vision if "vision" in made.model_fields_set else make.vision
     return made.model_copy(update={"path": path, "make": make, "vision": vision})
 

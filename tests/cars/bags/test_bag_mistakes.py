@@ -198,7 +198,7 @@ MISTAKES: list[tuple[Callable[[str], str], str]] = [
      "objectsInfo of svea1 holds pixy_camera/msg/ObjectInfoArrayStamped, point is one of geometry_msgs/msg/Point"),
     (lambda t: t.replace('"authors"', '"none"'), r"cars\.svea3\.topics: names no topic of its odometry"),
     (lambda t: t.replace('"authors"', '"author"'),
-     "names: unknown profile 'author'; known: diffdrive, svea, or a TOML file, authors, none"),
+     "names: unknown profile 'author'; known: diffdrive, svea, or a TOML file; also: authors, none"),
     (lambda t: t.replace('"crossing_path"', '"crossing_pth"'), "did you mean 'crossing_path'"),
     (lambda t: t.replace('"crossing_path"', '"there.toml"'), "there.toml"),
     (lambda t: t + "[clocks]\noffsets = { svea2 = 1.0 }\n", "clocks.offsets: 'svea2' is none of svea1, svea3, truth"),

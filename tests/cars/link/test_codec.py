@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -218,3 +219,5 @@ def test_limits_beyond_the_hardest_are_refused(limits: Limits) -> None:
     assert SVEA.hardest.check(SVEA.hardest) is SVEA.hardest
     with pytest.raises(CoopenvError, match="must be above 0, at most"):
         limits.check(SVEA.hardest)
+    with pytest.raises(CoopenvError, match="does not reverse"):
+        replace(SVEA.hardest, reverse=True).check(replace(SVEA.hardest, reverse=False))

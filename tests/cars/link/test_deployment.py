@@ -16,7 +16,7 @@ from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.codec import decode
 from coopenv.cars.deployment import DeploymentError, Remote, load_deployment
-from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive
+from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive, write_drive
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
 from coopenv.cars.transport.base import Arrival
@@ -115,7 +115,14 @@ BAD = {
     "no such channel": ("[remote]\nsteering = 0", "remote.steering: Input should be greater than or equal to 1"),
     **{f"a fence of {n}": (f"[safety]\ngeofence = {fence}", CORNERS) for n, fence in enumerate(FENCES)},
     "not a number": ("[safety]\nmax_speed = nan", "safety.max_speed: "),
-    "text for a number": ('[safety]\nmax_speed = "fast"', "safety.max_speed: Input should be a valid number"),
+    **{
+        f"{value} for a number": (f"[safety]\nmax_speed = {value}", "safety.max_speed: Input should be a valid number")
+        for value in ('"fast"', '"0.5"', "true")
+    },
+    "a make that does not reverse": (
+        '[profile]\nbase = "svea"\nhardest.reverse = false\n[safety]\nreverse = true',
+        "safety.reverse: true, but this make does not reverse",
+    ),
     "no TOML": ("[network", "not valid TOML: "),
     "too deep": (f"overrides = {'[' * 5000}", "not valid TOML|too deep"),
 }
@@ -300,7 +307,33 @@ BAD_PROFILES = {
     "a scale of zero": ("change = 1.0", "change = 0.0", "command.speed.change: must not be 0"),
     "no TOML": ("[topics]", "[topics", "not valid TOML"),
     "a text for a number": ("steering = 0.4", 'steering = "a"', "hardest.steering: Input should be a valid number"),
+    "old commands": ("max_age = 0.15, urgent", "max_age = 0.2, urgent", "topics.command.max_age: needed, above 0 and"),
+    "commands of any age": ("max_age = 0.15, urgent", "urgent", "topics.command.max_age: needed, above 0 and at most"),
+    "a slash in front": ('"robots/{car}/imu', '"/robots/{car}/imu', "topics.imu.name: String should match"),
+    "a number for a truth value": ("reverse = true", "reverse = 1", "hardest.reverse: Input should be a valid boolean"),
 }
+
+
+HELD = {"uint16": (0, 65535), "int8": (-128, 127), "bool": (0, 1), "float32": (-0.5,)}
+NOT_HELD = {"uint16": (65536, -1, 0.5), "int8": (128, -129), "bool": (2,)}
+
+
+@pytest.mark.parametrize("kind", HELD)
+def test_fields_hold_what_is_written_to_them(kind: str) -> None:
+    """Also when a gate stops its car: an error there would leave it without a command."""
+
+    def braking(value: float, neutral: float) -> CarProfile:
+        fields = {**SVEA.command.neutral, "lamp": (kind, neutral)}
+        brake = {"fields": {"lamp": value}, "deceleration": 3.0}
+        return load_profile({"base": "svea", "command": {"neutral": fields, "brake": brake}})
+
+    for value in HELD[kind]:
+        message = braking(value, 0).command
+        assert read_drive(write_drive(0, message, MotionCommand(brake=True)), message).brake
+    for value in NOT_HELD.get(kind, ()):
+        for values in ((value, 0), (0, value)):
+            with pytest.raises(CoopenvError, match=rf"\.lamp: a field of type {kind} cannot be {value:g}"):
+                braking(*values)
 
 
 @pytest.mark.parametrize("case", BAD_PROFILES)
