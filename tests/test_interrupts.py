@@ -17,14 +17,14 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks at proces
 RUN = (*COOPENV, "run", "busy_intersection", "--out", "result")
 BENCH = (*COOPENV, "bench", "observers", "busy_intersection", "--observers", "riccati,mekf", "--seeds", "8")
 BENCH += ("--jobs", "2", "--out", "result")
-STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
+STATUS = {signal.SIGHUP: 129, signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
 def begun(folder: Path) -> bool:
     return any(path.suffix == ".part" for path in folder.iterdir())
 
 
-@pytest.mark.parametrize(("number", "earlier"), [(signal.SIGINT, False), (signal.SIGTERM, True)])
+@pytest.mark.parametrize(("number", "earlier"), [(signal.SIGHUP, False), (signal.SIGTERM, True)])
 def test_a_run_ends_with_one_line(number: signal.Signals, earlier: bool, tmp_path: Path) -> None:
     if earlier:
         (tmp_path / "result").mkdir()

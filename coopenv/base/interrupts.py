@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end a command within two seconds, with one line on the results that were written or kept."""
+"""SIGINT, SIGTERM and SIGHUP end a command in two seconds, with one line on the results that were written or kept."""
 
 import atexit
 import os
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import NoReturn
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 PATIENCE = 1.0
 """s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
 REMINDERS = 10  # signals that are sent again to the main thread meanwhile
@@ -34,13 +34,15 @@ def install() -> None:
     """Catch the signals of this process, a command that ends with its work: they raise `Interrupted`.
 
     They are not ignored in the background of a shell script, unlike what the shell asks for: `kill -INT` works there.
+    After `nohup`, SIGHUP is: a command that is to outlive its terminal does.
     """
     signals, waker = socket.socketpair()
     waker.setblocking(False)
     signal.set_wakeup_fd(waker.detach(), warn_on_full_buffer=False)
     threading.Thread(target=_watch, args=(signals,), daemon=True).start()
     for number in SIGNALS:
-        signal.signal(number, _handle)
+        if number in SIGNALS[:2] or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _handle)
 
 
 def received() -> bool:
@@ -77,7 +79,7 @@ def before_a_hard_end(step: Callable[[], None]) -> None:
 
 
 def report() -> int:
-    """Print the line on the results and return the exit status, 130 or 143."""
+    """Print the line on the results and return the exit status, 128 and the number of the signal."""
     _ended.set()
     if sys.stderr is not None:
         with suppress(OSError):
