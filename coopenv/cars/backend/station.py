@@ -342,8 +342,8 @@ class Gates:
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
 
 
-FOREIGN = "foreign"
-"""Under which a gate counts commands to the wheels that it has not sent."""
+FOREIGN, LIMITS = "foreign", "limits"
+"""Under which a gate counts commands to the wheels that it has not sent, and those beyond its limits."""
 BYPASSED = (
     "commands get to its wheels without its gate: give its bridge docker/car-zenoh.json5 "
     "(docs/cars_safety.md#ways-around-the-gate)"

@@ -13,7 +13,7 @@ import numpy as np
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.station import BYPASSED, FOREIGN, OLD, OPEN, Gates, Station
+from coopenv.cars.backend.station import BYPASSED, FOREIGN, LIMITS, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
@@ -306,6 +306,8 @@ class Watchdog:
                 yield car, f"its gate is {gate.state}" + (f": {foreign} {BYPASSED}" if foreign else "")
             elif gate.session != self._gates.session:
                 yield car, "another station has armed its gate"
+            elif beyond := self._gates.refused(car).get(LIMITS):
+                yield car, f"its gate has refused {beyond} commands: its limits are lower than those of the file here"
         missed, beat = self._safety.missed_deadlines, self._beat
         if self._missed >= missed:
             yield "", f"{self._missed} decisions in a row came too late"
@@ -333,7 +335,8 @@ class Watchdog:
         watched = [*cars, *self._others] if apart else [*cars] if safety.geofence else []
         for car in watched:
             never = car not in monitor.places
-            if monitor.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
+            allowed = max(safety.truth_age, UNSETTLED) if never else safety.truth_age
+            if monitor.lost(car) > allowed or (never and safety.judge == "truth"):
                 unknown = "is not known" if never else f"has not been known for {monitor.lost(car):.2f} s"
                 rules = {"fence": safety.geofence and car in cars, "separation": apart}
                 by = " and ".join(name for name, judged in rules.items() if judged)

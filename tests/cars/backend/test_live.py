@@ -330,6 +330,17 @@ def test_who_takes_the_remote_control_or_stops_a_car_ends_the_episode(
     assert not env.agents and infos["vehicle_1"]["car"]["stopped"] == why
 
 
+def test_a_gate_with_lower_limits_ends_the_episode(lab: Any, tmp_path: Path) -> None:
+    """As with `coopenv svea gate --max-speed`: otherwise its car would stand, and nothing would tell why."""
+    faster = 'overrides = { "dynamics.max_speed" = 1.0 }\n' + OVERTAKING
+    path = write_fleet(tmp_path, faster, PATIENT + "max_speed = 1.0\n")
+    with closing(env_of(cars(path, lab[1]))) as env:
+        env.reset(seed=0, options={"arm": True})
+        infos = drive(env, 60, np.array([1.0, 0.0]))
+        stopped = infos["vehicle_1"]["car"]["stopped"]
+        assert not env.agents and "its gate has refused" in stopped and "its limits are lower" in stopped, stopped
+
+
 def test_an_error_between_steps_stops_the_cars(lab: Any) -> None:
     path, hub, _ = lab
     backend = cars(path, hub)

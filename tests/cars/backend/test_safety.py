@@ -145,6 +145,8 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     watchdog.close()
     assert [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()] == found
     monitor.looked = BEGIN + 700 * MS
+    assert "a" in places or judge == "truth" or not [car for car, _ in watchdog.misplaced() if car == "a"], "settles"
+    monitor.looked = BEGIN + 2100 * MS
     lost = [wrong for _, wrong in watchdog.misplaced()]
     assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
 
