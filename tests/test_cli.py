@@ -21,6 +21,7 @@ from coopenv.estimation.observability import Trajectory
 from coopenv.observers.recording import Truth
 from coopenv.observers.registry import list_observers
 from coopenv.runs import console
+from coopenv.runs.command import Results
 from coopenv.runs.recorder import record
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz", "record.zip"}
@@ -222,9 +223,34 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
     assert all(np.isfinite(vehicle["steady_position_rmse_m"]) for vehicle in metrics["vehicles"])
     assert metrics["simulated_time_s"] == 2.0
     assert len(Trajectory.load(Path("out/part/trajectory.npz")).t) == 121
-    assert main(["run", "blind.mcap"]) == 2
-    assert "no true poses are known" in capsys.readouterr().err
-    assert not Path("out/blind").exists()
+    capsys.readouterr()
+    assert main(["run", "blind.mcap", "--observer", "mekf"]) == 0
+    assert "No true poses, and so no errors" in capsys.readouterr().out
+    metrics = json.loads(Path("out/blind/metrics.json").read_text())
+    assert metrics["vehicles"] == [] and len(metrics["without_truth"]) == 2
+    whole = Trajectory.load(Path("out/blind/trajectory.npz"))
+    for row, end in zip(metrics["without_truth"], whole.position_estimate[-1], strict=True):
+        assert 0.0 < row["position_std_m"] < 1.0 and 0.0 < row["orientation_std_deg"] < 10.0
+        np.testing.assert_allclose(row["final_position_estimate_m"], end)
+    assert Path("out/blind/replay.html").exists() and "No true poses" in str(Results.read("out/blind"))
+    assert main(["figures", "out/blind"]) == 2
+    assert "no true poses are known, which figures need" in capsys.readouterr().err
+
+
+def test_vehicles_without_true_poses_do_not_hide_the_errors_of_others() -> None:
+    recording = record(coopenv.load_scenario("overtaking", {"horizon": 2.0}))
+    position = recording.truth.position.copy()
+    position[:, -1] = np.nan  # of the last vehicle
+    write_recording(replace(recording, truth=replace(recording.truth, position=position)), Path("half.mcap"))
+    results = coopenv.run("half.mcap", steady_from=1.0)
+    whole = coopenv.run("overtaking", overrides={"horizon": 2.0}, steady_from=1.0)
+    rows, all_rows = results.metrics["vehicles"], whole.metrics["vehicles"]
+    assert [row["vehicle"] for row in rows] == [row["vehicle"] for row in all_rows[:-1]]
+    assert [row["steady_position_rmse_m"] for row in rows] == pytest.approx(
+        [row["steady_position_rmse_m"] for row in all_rows[:-1]]
+    )
+    (other,) = results.metrics["without_truth"]
+    assert other["vehicle"] == "vehicle_2" and np.isnan(other["position_std_m"])  # P of this observer is a gain
 
 
 @pytest.mark.parametrize("name", [*sorted(FILES), "replay.html", *sorted(FIGURES), "video.gif"])

@@ -417,7 +417,7 @@ def run(given: SveaRunOptions) -> None:
     """
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.backend import open_svea
-    from coopenv.runs.command import NoTruthError, execute, report
+    from coopenv.runs.command import execute, report
     from coopenv.runs.demo import kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout
 
@@ -433,12 +433,11 @@ def run(given: SveaRunOptions) -> None:
         rollout = Rollout(
             backend.scenario, given.seed, given.steps, policy=given.policy, backend=backend, options=wishes
         )
-        try:
-            result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched)
-        except NoTruthError:
-            if not given.as_json:
-                links_report(backend, options.console())  # with the reason of a stop
-            raise CoopenvError(truth_report(backend)) from None
+        result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched)
+    if not backend.health.received:
+        raise CoopenvError(truth_report(backend))
+    if result.metrics["without_truth"]:
+        print(f"warning: {truth_report(backend)}", file=sys.stderr)
     if given.as_json:
         options.print_json({**result.metrics, "files": result.files})
     else:

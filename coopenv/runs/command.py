@@ -25,9 +25,9 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import states_covariance, with_observer
 from coopenv.policies import Policy
 from coopenv.runs.bundle import RECORD_FILE, RunRecord
-from coopenv.runs.console import Progress, compile_notice, legend, metrics_table, rates, remarks
+from coopenv.runs.console import Progress, compile_notice, estimates_table, legend, metrics_table, rates, remarks
 from coopenv.runs.films import VIDEO_FILES, top_view_film, video_path, write_film
-from coopenv.runs.rollouts import Rollout, run_metrics, theory_rates, vehicle_metrics
+from coopenv.runs.rollouts import Rollout, estimates, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.scenes import Keeper, frame_stride, source_of, write_page
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario, scenario_name
 from coopenv.viz import FIGURE_NAMES, FORMATS
@@ -43,10 +43,6 @@ def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
     return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, RECORD_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
-
-
-class NoTruthError(CoopenvError):
-    """At no two ticks of a run are the true poses of all vehicles known."""
 
 
 def execute(
@@ -68,7 +64,6 @@ def execute(
     of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar.
 
     Raises:
-        NoTruthError: no true poses are known.
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     scenario = run.scenario
@@ -91,13 +86,17 @@ def execute(
                     record.tick(tick)
                 if keeper.tick(tick):
                     progress.update(tick, describe() if describe is not None else None)
-        trajectory, endings = run.trajectory(), run.endings()
-        judged = trajectory.of_vehicles(run.vehicles).where_truth_is_known()
-        if len(judged.t) < 2:
-            raise NoTruthError(f"{name}: no true poses are known, so there are no errors to show")
-        observability = analyse_observability(judged)
-        vehicles = vehicle_metrics(judged, observability, endings, steady, theory_rates(run, judged))
-        results = Results(run_metrics(name, overrides, run, vehicles, steady), judged, scenario)
+        trajectory, judged = run.trajectory(), run.judged()
+        known, others = trajectory.of_vehicles(judged).where_truth_is_known(), sorted({*run.vehicles} - {*judged})
+        observability = analyse_observability(known) if judged else None
+        vehicles = []
+        if observability is not None:
+            rates_of_theory = theory_rates(run, known)
+            vehicles = vehicle_metrics(known, observability, run.endings(judged), steady, rates_of_theory)
+        covariance = states_covariance(scenario.observer.name)
+        without = estimates(trajectory.of_vehicles(others), steady, covariance) if others else []
+        metrics = run_metrics(name, overrides, run, vehicles, steady, without)
+        results = Results(metrics, known if judged else trajectory.of_vehicles(others), scenario)
         if folder is None or out is None:
             return results
         scene = keeper.record()
@@ -108,9 +107,10 @@ def execute(
         if record is not None:
             paths.append(folder / RECORD_FILE)
             record.save(paths[-1], name)
-        if figures is not None:
+        if figures is not None and observability is not None:
             with Progress(log, "drawing figures"):
                 paths += results.save_figures(folder, figures, width, observability)
+        if figures is not None:
             page = write_page(scene, folder / REPLAY_FILE, log)
             paths += [] if page is None else [page]
         if video:
@@ -222,7 +222,10 @@ class Results(Tabular):
     metrics: dict[str, Any]
     """Contents of `metrics.json`."""
     trajectory: Trajectory
-    """Of the vehicles that were estimated, at the ticks at which their truth is known."""
+    """Of the vehicles that were estimated and whose truth is known, at these ticks.
+
+    Where nothing is known, as without motion capture: of all that were estimated, at all ticks, errors being NaN.
+    """
     scenario: Scenario | None = None
     """The world of the run; None where only its file could tell, such as of a recording."""
     files: tuple[Path, ...] = ()
@@ -251,19 +254,21 @@ class Results(Tabular):
         whole = Trajectory.load(folder / TRAJECTORY_FILE)
         names = whole.vehicles.tolist()
         try:
-            judged = [names.index(row["vehicle"]) for row in metrics["vehicles"]]
+            others = metrics.setdefault("without_truth", [])  # not of a run before 1.0
+            judged = [names.index(row["vehicle"]) for row in metrics["vehicles"] or others]
             metrics.setdefault("observer", "unknown observer")  # of a run before 0.2
             ends = [row["ended_at_s"] for row in metrics["vehicles"]]
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: vehicles are not those of {TRAJECTORY_FILE} ({error})") from None
         if not all(end is None or isinstance(end, float | int) for end in ends):
             raise DataError(f"{path}: ended_at_s: expected numbers")
-        metrics["vehicles"] = _with_nan(metrics["vehicles"])
+        metrics |= {key: _with_nan(metrics[key]) for key in ("vehicles", "without_truth")}
         try:
             scenario = load_scenario(metrics["environment"], metrics["overrides"])
         except CoopenvError:
             scenario = None
-        return cls(metrics, whole.of_vehicles(judged).where_truth_is_known(), scenario)
+        chosen = whole.of_vehicles(judged)
+        return cls(metrics, chosen.where_truth_is_known() if metrics["vehicles"] else chosen, scenario)
 
     def __getitem__(self, vehicle: str) -> Trajectory:
         """Return the trajectory of one vehicle."""
@@ -278,12 +283,20 @@ class Results(Tabular):
         return one_line(self, self.metrics["environment"], facts)
 
     def _repr_html_(self) -> str:
-        return terminal_html(self) + picture_html(self.figure("trajectories_2d"))
+        table = terminal_html(self)
+        return table + picture_html(self.figure("trajectories_2d")) if self.metrics["vehicles"] else table
 
     def __str__(self) -> str:
         return text_of(self, WIDTH)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        if others := self.metrics["without_truth"]:
+            yield estimates_table(others)
+            yield f"No true poses, and so no errors. Standard deviations: mean after {self.steady_from:g} s."
+        if not self.metrics["vehicles"]:
+            return
+        if others:
+            yield ""
         shown, end = shown_vehicles(self.trajectory, self.steady_from, self.ends), float(self.trajectory.t[-1])
         vehicles = [self.metrics["vehicles"][i] for i in shown]
         yield metrics_table(vehicles)
@@ -312,7 +325,9 @@ class Results(Tabular):
 
     @property
     def _drawn(self) -> dict[str, Any]:
-        """Options of all figures."""
+        """Options of all figures. Raises CoopenvError: no true poses are known."""
+        if not self.metrics["vehicles"]:
+            raise CoopenvError(f"{self.metrics['environment']}: no true poses are known, which figures need")
         gain = not states_covariance(self.metrics["observer"])
         return {"scenario": self.scenario, "ends": self.ends, "steady_from": self.steady_from, "gain": gain}
 

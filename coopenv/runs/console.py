@@ -9,6 +9,7 @@ from math import inf, isnan, nan
 from time import monotonic
 from typing import Any, Self, TypeVar
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -195,6 +196,18 @@ def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
     """Return one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
     table = number_table(["\nvehicle"], [heading for _, heading, _ in COLUMNS])
     cells = [write([vehicle[key] for vehicle in vehicles]) for key, _, write in COLUMNS]
+    for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
+        table.add_row(vehicle["vehicle"], *row)
+    return table
+
+
+def estimates_table(vehicles: list[dict[str, Any]]) -> Table:
+    """Return one row per vehicle without true poses: last estimate, standard deviations, targets."""
+    headings = ("ends at x\n[m]", "y\n[m]", "yaw\n[deg]", "std\n[m]", "\n[deg]", "targets\nseen")
+    table = number_table(["\nvehicle"], headings)
+    ends = np.array([[*row["final_position_estimate_m"][:2], row["final_yaw_estimate_deg"]] for row in vehicles])
+    keys = ("position_std_m", "orientation_std_deg", "mean_targets_in_view")
+    cells = [*map(column, ends.T), *(column([row[key] for row in vehicles]) for key in keys)]
     for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
         table.add_row(vehicle["vehicle"], *row)
     return table

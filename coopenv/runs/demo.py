@@ -22,7 +22,7 @@ from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.profile import Role
 from coopenv.cars.transport.zenoh import library
 from coopenv.estimation.metrics import live_ticks, summarise
-from coopenv.runs.command import NoTruthError, execute, report
+from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice, number_table
 from coopenv.runs.rollouts import Rollout
 from coopenv.scenario import Scenario
@@ -77,8 +77,8 @@ def links_report(backend: Svea, out: Console) -> None:
 
 
 def truth_report(backend: Svea) -> str:
-    """Return why no tick has true poses: no car sends, or by topic of motion capture what came."""
-    names, lead = list(backend.binding.cars), "no true poses are known, so there are no errors to show: "
+    """Return why true poses are missing: no car sends, or by topic of motion capture what came."""
+    names, lead = list(backend.binding.cars), "without true poses there are no errors to show: "
     if not backend.health.received:
         where = ", ".join(backend.deployment.network.connect)
         return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
@@ -97,9 +97,10 @@ Rows = list[dict[str, Any]]
 
 
 def judged(run: Rollout) -> Rows:
-    """Return the figures of an episode that is over."""
-    trajectory = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known()
-    ends = [ending.time for ending in run.endings()]
+    """Return the figures of an episode that is over, of vehicles whose true poses are known."""
+    vehicles = run.judged()
+    trajectory = run.trajectory().of_vehicles(vehicles).where_truth_is_known()
+    ends = [ending.time for ending in run.endings(vehicles)]
     rows = summarise(trajectory, STEADY_FROM, ends)
     static = ~trajectory.target_moving[: len(run.scenario.landmarks)]
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(rows), ends)):
@@ -192,9 +193,8 @@ class Demo:
             backend = open_svea(fleet, environment, self.overrides, record=record, connect=router)
             stack.callback(backend.close)
             try:
-                self._drive(backend, driven, log, out)
-            except NoTruthError:
-                no_truth = CoopenvError(f"{self.environment}: {truth_report(backend)}")
+                if not self._drive(backend, driven, log, out) and backend.capabilities.truth:
+                    no_truth = CoopenvError(f"{self.environment}: {truth_report(backend)}")
             except KeyboardInterrupt:
                 if drive.exists() or backend.recorder is None or not backend.recorder.begun:
                     raise
@@ -221,23 +221,24 @@ class Demo:
             raise no_truth
         return backend.watchdog.trip is None
 
-    def _drive(self, backend: Svea, driven: list[Rows], log: Console, out: Console) -> None:
-        """Drive seed after seed, and append the figures of each; the first one is reported as a run."""
+    def _drive(self, backend: Svea, driven: list[Rows], log: Console, out: Console) -> bool:
+        """Drive seed after seed, and append the figures of each; the first one is reported as a run.
+
+        Return whether true poses of all vehicles came.
+        """
         run = Rollout(backend.scenario, self.seed, policy=self.policy, backend=backend, options={"arm": True})
         watched, changes = partial(links_line, backend), dict(self.overrides)
-        try:
-            result = execute(self.environment, run, self.out, log, changes, STEADY_FROM, "png", False, watched)
-        except NoTruthError:
-            self._count(backend, run, known=False)
-            links_report(backend, out)
-            raise
+        result = execute(self.environment, run, self.out, log, changes, STEADY_FROM, "png", False, watched)
         self._count(backend, run)
         report(run, result, self.out, out)
         links_report(backend, out)
+        if result.metrics["without_truth"]:
+            return False
         while backend.watchdog.trip is None:
-            driven.append(judged(run))
+            figures = judged(run)
+            driven += [figures] if len(figures) == len(run.vehicles) else []
             if self.time >= self.seconds:
-                return
+                break
             run.seed += 1
             with Progress(log, f"seed {run.seed}") as progress:
                 for tick in run.play():
@@ -247,13 +248,13 @@ class Demo:
             out.print(f"seed {run.seed}: {ends}", soft_wrap=True)
             if backend.watchdog.trip is not None:
                 out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+        return True
 
-    def _count(self, backend: Svea, run: Rollout, known: bool = True) -> None:
-        """Add the time of an episode; all its deadlines are missed where no true pose is known in time."""
+    def _count(self, backend: Svea, run: Rollout) -> None:
+        """Add the time of an episode."""
         self.time += run.ticks_recorded / run.scenario.rates.camera
-        decisions = -(-run.ticks_recorded // run.scenario.ticks_per_decision)
-        self.decisions += decisions
-        self.missed += backend.pacer.missed if known else decisions
+        self.decisions += -(-run.ticks_recorded // run.scenario.ticks_per_decision)
+        self.missed += backend.pacer.missed
         self.delays.extend(backend.pacer.lateness)
 
     def _simulate(self, scenario: Scenario, episodes: int, log: Console) -> list[Rows]:

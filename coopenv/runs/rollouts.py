@@ -1,7 +1,7 @@
 """Episodes with a driver: stepping, what is kept of them, and their metrics."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from platform import python_version
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -14,9 +14,10 @@ from coopenv.api.engine import Engine
 from coopenv.backends.base import EPISODE_OVER, Backend
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import version
-from coopenv.estimation.metrics import CONVERGED, observability_of, summarise
+from coopenv.estimation.metrics import CONVERGED, mean_targets_in_view, observability_of, steady_mean, summarise
 from coopenv.estimation.observability import ConvergenceRates, Observability, Trajectory, convergence_rates, least_mean
 from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.poses import position_covariance, roll_pitch_yaw_deg
 from coopenv.evaluation.episodes import Views, estimated_here, play
 from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario, ScenarioLike, load_scenario
@@ -123,9 +124,18 @@ class Rollout:
             **{name: recorded(name)[:, L:] for name in ("position", "rotation", "velocity", "angular_velocity")},
         )
 
-    def endings(self) -> list[Ending]:
-        """Return how the run of each vehicle that is estimated here has ended so far."""
-        ended = self._recorded("ended")[:, [*self.vehicles]]
+    def judged(self) -> tuple[int, ...]:
+        """Return the vehicles that are estimated here and whose true poses are known, at two ticks or more.
+
+        Of cars without motion capture nothing is known; if so of some, the others have errors all the same.
+        """
+        record = self.trajectory()
+        known = [i for i in self.vehicles if len(record.of_vehicles([i]).where_truth_is_known().t) > 1]
+        return tuple(known) if len(record.of_vehicles(known).where_truth_is_known().t) > 1 else ()
+
+    def endings(self, vehicles: Sequence[int] | None = None) -> list[Ending]:
+        """Return how the run of each vehicle (None: of those that are estimated here) has ended so far."""
+        ended = self._recorded("ended")[:, [*(self.vehicles if vehicles is None else vehicles)]]
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
         return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]
@@ -201,11 +211,38 @@ def vehicle_metrics(
     ]
 
 
+def estimates(trajectory: Trajectory, steady_from: float, covariance: bool) -> list[dict[str, Any]]:
+    """Return one dict per vehicle without true poses: what its observer says, units in the keys.
+
+    `covariance` is whether P is one; standard deviations are NaN otherwise. Those of the position are
+    the roots of the trace, as are those of the orientation; means over the ticks after `steady_from`, s.
+    """
+    P = position_covariance(trajectory.rotation_estimate, trajectory.position_estimate, trajectory.covariance)
+    turn = np.degrees(np.degrees(trajectory.covariance[..., :3, :3]))
+    position, orientation = (
+        steady_mean(trajectory.t, np.sqrt(np.trace(part, axis1=-2, axis2=-1)), steady_from)
+        for part in ((P, turn) if covariance else (np.nan * P, np.nan * turn))
+    )
+    yaw = roll_pitch_yaw_deg(trajectory.rotation_estimate[-1])[:, 2]
+    return [
+        {
+            "vehicle": name,
+            "position_std_m": float(position[i]),
+            "orientation_std_deg": float(orientation[i]),
+            "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:, i])),
+            "final_position_estimate_m": trajectory.position_estimate[-1, i].tolist(),
+            "final_yaw_estimate_deg": float(yaw[i]),
+        }
+        for i, name in enumerate(trajectory.vehicles.tolist())
+    ]
+
+
 def theory_rates(run: Rollout, trajectory: Trajectory) -> ConvergenceRates | None:
     """Return the rates of the paper's observer along the record of a run; None where another one runs."""
     if run.scenario.observer.name != "riccati":
         return None
-    setups = [run.engine.world.observer_init.setups[i] for i in run.vehicles]
+    names = run.scenario.vehicle_names
+    setups = [run.engine.world.observer_init.setups[names.index(name)] for name in trajectory.vehicles.tolist()]
     gains = setups[0].gains
     return convergence_rates(trajectory, [setup.gains.k for setup in setups], gains.q, gains.V, gains.P0)
 
@@ -276,9 +313,14 @@ def outcome_line(run: Rollout) -> str:
 
 
 def run_metrics(
-    name: str, overrides: Mapping[str, Any], run: Rollout, vehicles: list[dict[str, Any]], steady_from: float
+    name: str,
+    overrides: Mapping[str, Any],
+    run: Rollout,
+    vehicles: list[dict[str, Any]],
+    steady_from: float,
+    without_truth: Sequence[dict[str, Any]] = (),
 ) -> dict[str, Any]:
-    """Return the contents of `metrics.json`."""
+    """Return the contents of `metrics.json`: `vehicles` are rows of `vehicle_metrics`, the others of `estimates`."""
     simulated = run.ticks_recorded / run.scenario.rates.camera
     return {
         "environment": name,
@@ -296,4 +338,5 @@ def run_metrics(
         "real_time_factor": simulated / run.wall_time,
         "steady_from_s": steady_from,
         "vehicles": vehicles,
+        "without_truth": [*without_truth],
     }
