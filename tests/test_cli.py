@@ -235,6 +235,8 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
     assert Path("out/blind/replay.html").exists() and "No true poses" in str(Results.read("out/blind"))
     assert main(["figures", "out/blind"]) == 2
     assert "no true poses are known, which figures need" in capsys.readouterr().err
+    assert main(["bench", "observers", "blind.mcap", "--observers", "mekf"]) == 2
+    assert "blind: no true poses are known, which a comparison needs" in capsys.readouterr().err
 
 
 def test_vehicles_without_true_poses_do_not_hide_the_errors_of_others() -> None:

@@ -91,6 +91,11 @@ class RecordSource(ABC):
     def check(self) -> None:
         """Look at recorded data, so that errors and warnings come before the work."""
         world = self.world()
+        if isinstance(world, Recording):
+            check_truth(self.name, bool(world.truth.known.any()))
+        self._check_faults(world)
+
+    def _check_faults(self, world: Recording | Scenario) -> None:
         if isinstance(world, Scenario):
             vehicles, targets = world.vehicle_names, world.target_names
         else:
@@ -201,6 +206,12 @@ class Bags(RecordSource):
     overrides: Mapping[str, Any]
     seeded: ClassVar[bool] = True
 
+    def check(self) -> None:
+        """Look for motion capture, and whether the faults fit."""
+        backend = self._backend()
+        check_truth(self.name, backend.capabilities.truth)
+        self._check_faults(backend.scenario)
+
     def world(self) -> Scenario:
         """Return the scenario that the bag is read into."""
         return self._backend().scenario
@@ -212,6 +223,12 @@ class Bags(RecordSource):
 
     def _backend(self) -> Backend:
         return open_backend(self.path, None, self.overrides, topics=self.topics)
+
+
+def check_truth(name: str, known: bool) -> None:
+    """Raise CoopenvError where no true pose is known."""
+    if not known:
+        raise CoopenvError(f"{name}: no true poses are known, which a comparison needs; coopenv run gives estimates")
 
 
 ALL = "all"  # asks for every variant that the source can have
