@@ -91,7 +91,7 @@ LINES_AND_FILES = {
     "base": (1790, 10),
     "bench": (5375, 19),
     "cars": (10685, 47),
-    "cli": (2607, 8),
+    "cli": (2620, 8),
     "estimation": (1850, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),

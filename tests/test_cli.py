@@ -239,6 +239,21 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
     assert "blind: no true poses are known, which a comparison needs" in capsys.readouterr().err
 
 
+def test_a_named_observer_that_always_fails_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = [
+        "from coopenv.observers.contract import Observer",
+        "class Bad(Observer):",
+        "    def __init__(self, setup):",
+    ]
+    lines += ["        pass", "    def reset(self, pose, covariance):", "        raise ValueError('no')"]
+    lines += ["    def step(self, tick, messages):", "        raise ValueError('no')"]
+    Path("bad.py").write_text("\n".join(lines))
+    given = ["bench", "observers", "svea_overtaking", "--set", "horizon=1.0", "--observers", "bad.py:Bad,mekf"]
+    assert main([*given, "--seeds", "1"]) == 2
+    printed = capsys.readouterr()
+    assert "failed in every variant: Bad" in printed.err and "mekf" in printed.out
+
+
 def test_vehicles_without_true_poses_do_not_hide_the_errors_of_others() -> None:
     recording = record(coopenv.load_scenario("overtaking", {"horizon": 2.0}))
     position = recording.truth.position.copy()

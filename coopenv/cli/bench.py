@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, listed
 from coopenv.base.installation import install_command
 from coopenv.cli import options
 
@@ -157,7 +157,7 @@ def bench_observers(given: ObserverOptions) -> None:
     if given.basin:
         check_source(plan.source)
     plan.source.check()
-    perform(
+    board = perform(
         plan,
         given.command_of(plan),
         find_executor(given.engine, given.jobs, given.address, given.seconds, given.memory),
@@ -171,6 +171,9 @@ def bench_observers(given: ObserverOptions) -> None:
     )
     if given.open_report and given.out is not None:
         options.show(given.out / REPORT_FILE)
+    whole = {row.observer for row in board.rows if not row.failure}
+    if lost := given.names and sorted({*board.ranked} - whole):
+        raise CoopenvError(f"failed in every variant: {listed(lost)}")
 
 
 @bench.command("v1")

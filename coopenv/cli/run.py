@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -124,7 +125,9 @@ def bundle(
     file = out or run.with_name(f"{run.name}{BUNDLE}")
     with replacing_file(file) as new:
         copyfile(found.path, new)
-    options.console().print(f"{file}: {found.title}. It runs again with: coopenv run {file}", soft_wrap=True)
+    options.console().print(
+        f"{file}: {found.title}. It runs again with: coopenv run {quote(str(file))}", soft_wrap=True
+    )
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import typer
@@ -129,7 +130,9 @@ def train(given: TrainOptions) -> None:
     if given.as_json:
         options.print_json({"agent": str(folder), "results": [asdict(result) for result in results]})
         return
-    options.console().print(f"Agent in {folder}: coopenv run {given.environment} --policy {folder}", soft_wrap=True)
+    options.console().print(
+        f"Agent in {folder}: coopenv run {given.environment} --policy {quote(str(folder))}", soft_wrap=True
+    )
 
 
 def _figures(results: list[Any]) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -133,7 +134,7 @@ def _kept_if_failed(record: RunRecord | None, out: Path | None, name: str, log: 
             folder = out.with_name(f"{out.name}_failed")
             with new_folder(folder):
                 record.save(folder / RECORD_FILE, name, error)
-            log.print(f"kept for a report: coopenv bundle {folder}", soft_wrap=True)
+            log.print(f"kept for a report: coopenv bundle {quote(str(folder))}", soft_wrap=True)
         raise
 
 

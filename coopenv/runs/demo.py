@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import isfinite
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ def kept_drive(path: Path | None, backend: Svea) -> str:
     """Return a line on the record of an interrupted drive; empty if there is nothing to replay."""
     if path is None or backend.recorder is None or not backend.recorder.begun:
         return ""
-    return f"kept: {path}, the drive up to here: coopenv run {path}"
+    return f"kept: {path}, the drive up to here: coopenv run {quote(str(path))}"
 
 
 def links_report(backend: Svea, out: Console) -> None:
@@ -198,7 +199,7 @@ class Demo:
             except KeyboardInterrupt:
                 if drive.exists() or backend.recorder is None or not backend.recorder.begun:
                     raise
-                also_kept(lambda: f"the drive up to here: coopenv run {drive}" if drive.exists() else "")
+                also_kept(lambda: f"the drive up to here: coopenv run {quote(str(drive))}" if drive.exists() else "")
                 interrupted = True
         if interrupted:
             raise KeyboardInterrupt
@@ -216,7 +217,9 @@ class Demo:
             f"wake-up lateness p99 {late:.2f} ms over {len(self.delays)} ticks",
             soft_wrap=True,
         )
-        out.print(f"The drive, bit for bit: coopenv run {drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
+        out.print(
+            f"The drive, bit for bit: coopenv run {quote(str(drive))} --steady-from {STEADY_FROM:g}", soft_wrap=True
+        )
         if no_truth is not None:
             raise no_truth
         return backend.watchdog.trip is None

@@ -53,8 +53,8 @@ def perform(
     figures: str | None = None,
     width: str | None = None,
     as_json: bool = False,
-) -> None:
-    """Compare, print the tables (or JSON) and write the files.
+) -> Leaderboard:
+    """Compare, print the tables (or JSON), write the files, and return what was found.
 
     Args:
         plan: what is compared.
@@ -97,6 +97,7 @@ def perform(
             printed.print(found)
     if out is not None and not as_json:
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
+    return found
 
 
 def document(board: Leaderboard, command: str) -> dict[str, Any]:

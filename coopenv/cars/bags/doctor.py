@@ -67,7 +67,8 @@ def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
         "markers = {} # numbers by name of the landmark: { SL1 = 1 }",
     ]
     for car, topics in cars.items():
-        lines += ["", "[[cars]]", f'name = "{car}"', "# marker = 7 # its own, seen by other cars", "[cars.topics]"]
+        lines += ["", "[[cars]]", f'name = "{car}"', "# marker = 7 # its own, seen by other cars"]
+        lines += ['# vehicle = "vehicle_1" # of the environment (default: in the order of this file)', "[cars.topics]"]
         lines += [f'{role.value} = "{name}"' for role, name in topics.items()]
     kinds = [row for row in rows if row.topic not in used]
     lines += ["", "# Not used:", *(f"#   {row.topic} ({row.type})" for row in kinds)] if kinds else []

@@ -258,7 +258,7 @@ def test_one_job_takes_an_observer_that_no_process_can_be_sent(monkeypatch: pyte
     monkeypatch.setattr(registry, "_registered", {})
     words = ["bench", "observers", "crossing_path", "--observers", f"{registry.named(Here)},dead_reckoning"]
     words += ["--set", "horizon=0.3", "--seeds", "1", "--jobs"]
-    assert main([*words, "1"]) == 0
+    assert main([*words, "1"]) == 2
     assert "cannot be sent to another process" in refused(*words, "2")
 
 
