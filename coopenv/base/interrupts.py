@@ -15,6 +15,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "
 PATIENCE = 1.0
 """s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
 REMINDERS = 10  # signals that are sent again to the main thread meanwhile
+WITH_INPUT = "COOPENV_END_WITH_INPUT"
+"""Environment variable of a process that ends as soon as its standard input does."""
 HIDDEN_CURSOR_BACK = "\x1b[?25h"
 
 _received = 0
@@ -43,6 +45,15 @@ def install() -> None:
     for number in SIGNALS:
         if number in SIGNALS[:2] or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
+    if os.environ.pop(WITH_INPUT, ""):
+        threading.Thread(target=_end_with_input, daemon=True).start()
+
+
+def _end_with_input() -> None:
+    """End this process as SIGTERM does once its standard input is closed: its parent has ended, in any way."""
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def received() -> bool:

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from coopenv.base.errors import CoopenvError
-from coopenv.base.interrupts import before_a_hard_end, held
+from coopenv.base.interrupts import WITH_INPUT, before_a_hard_end, held
 from coopenv.cars.backend.backend import scenario_of
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.deployment import load_deployment
@@ -50,7 +50,8 @@ class Process(subprocess.Popen[bytes]):
         with held(), self._logs[0].open("w") as out, self._logs[1].open("w") as errors:
             super().__init__(
                 [sys.executable, "-m", "coopenv", *command],
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,  # which is closed when this process ends, also by force
+                env={**os.environ, WITH_INPUT: "1"},
                 stdout=out,
                 stderr=errors,
                 start_new_session=True,  # Ctrl-C is for who started it: cars are brought to a stand first
@@ -88,6 +89,8 @@ class Process(subprocess.Popen[bytes]):
             self.wait(max(until - time.monotonic(), 0.0))
         self.kill()
         self.wait()
+        assert self.stdin is not None
+        self.stdin.close()
         _running.remove(self)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
@@ -29,7 +30,7 @@ from coopenv.cli import app
 from coopenv.cli.svea import next_message
 from tests.helpers.cars import OVERTAKING, fakes, open_fake, write_fleet
 from tests.helpers.hub import Hub
-from tests.helpers.processes import ROOT, mentioning, wait_until
+from tests.helpers.processes import ROOT, mentioning, start, wait_until
 from tests.helpers.wire import free_endpoint, seen_by
 
 LIMITS = Limits(speed=0.5, steering=0.5, acceleration=1.0, steering_rate=2.0)
@@ -117,6 +118,20 @@ def test_cars_come_and_go() -> None:
             assert told[2].startswith("svea7: not tried from outside: tcp/127.0.0.1:7447: no Zenoh there")
         raise ZeroDivisionError
     assert not mentioning(endpoint)
+
+
+def test_they_end_with_whoever_started_them(tmp_path: Path) -> None:
+    """Also where it is ended by force."""
+    port = free_port()
+    code = "import time; from coopenv.cars.fake.fleet import fakes\n"
+    code += f"with fakes({str(SHIPPED)!r}, {port}):\n time.sleep(300)"
+    parent = start((sys.executable, "-c", code), tmp_path)
+    try:
+        wait_until(lambda: len(mentioning(f"--connect tcp/127.0.0.1:{port}")) == 2 or parent.poll() is not None)
+    finally:
+        parent.kill()
+        parent.communicate()
+    wait_until(lambda: not mentioning(f"tcp/127.0.0.1:{port}"))
 
 
 def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Path) -> None:
