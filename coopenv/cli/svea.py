@@ -418,7 +418,7 @@ def run(given: SveaRunOptions) -> None:
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.backend import open_svea
     from coopenv.runs.command import execute, report
-    from coopenv.runs.demo import kept_drive, links_line, links_report, truth_report
+    from coopenv.runs.demo import check_alive, kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(given.overrides), options.console(stderr=True)
@@ -433,9 +433,8 @@ def run(given: SveaRunOptions) -> None:
         rollout = Rollout(
             backend.scenario, given.seed, given.steps, policy=given.policy, backend=backend, options=wishes
         )
-        result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched)
-    if not backend.health.received:
-        raise CoopenvError(truth_report(backend))
+        alive = partial(check_alive, backend)
+        result = execute(name, rollout, folder, log, changes, given.steady_from, figures, False, watched, check=alive)
     if result.metrics["without_truth"]:
         print(f"warning: {truth_report(backend)}", file=sys.stderr)
     if given.as_json:

@@ -57,12 +57,14 @@ def execute(
     video: bool = False,
     describe: Callable[[], str] | None = None,
     width: str | None = None,
+    check: Callable[[], None] | None = None,
 ) -> "Results":
     """Run, write to the folder `out` (None: no files), and return what came of it.
 
     A run that does not reach its end writes nothing to `out`; that of an error leaves its record in the folder
     `OUT_failed`, see `coopenv.runs.bundle`. `figures` is their format; None: no figures. `width` is a column
-    of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar.
+    of `coopenv.viz.figures`; None: a page's. `describe` returns the text beside the bar. `check` is called when the
+    run is over, and raises CoopenvError if it is not worth its files.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -87,17 +89,9 @@ def execute(
                     record.tick(tick)
                 if keeper.tick(tick):
                     progress.update(tick, describe() if describe is not None else None)
-        trajectory, judged = run.trajectory(), run.judged()
-        known, others = trajectory.of_vehicles(judged).where_truth_is_known(), sorted({*run.vehicles} - {*judged})
-        observability = analyse_observability(known) if judged else None
-        vehicles = []
-        if observability is not None:
-            rates_of_theory = theory_rates(run, known)
-            vehicles = vehicle_metrics(known, observability, run.endings(judged), steady, rates_of_theory)
-        covariance = states_covariance(scenario.observer.name)
-        without = estimates(trajectory.of_vehicles(others), steady, covariance) if others else []
-        metrics = run_metrics(name, overrides, run, vehicles, steady, without)
-        results = Results(metrics, known if judged else trajectory.of_vehicles(others), scenario)
+        if check is not None:
+            check()
+        trajectory, (results, observability) = run.trajectory(), _judged(name, overrides, run, steady)
         if folder is None or out is None:
             return results
         scene = keeper.record()
@@ -122,6 +116,23 @@ def execute(
             if paths[-1].suffix == ".gif":
                 log.print(f"video: written as GIF; for MP4: {install_command('video')}", soft_wrap=True)
     return replace(results, files=tuple(out / path.name for path in paths))
+
+
+def _judged(
+    name: str, overrides: Mapping[str, Any], run: Rollout, steady: float
+) -> tuple["Results", Observability | None]:
+    """Return the figures of a run that is over, and the observability of vehicles whose truth is known, if any is."""
+    trajectory, judged = run.trajectory(), run.judged()
+    known, others = trajectory.of_vehicles(judged).where_truth_is_known(), sorted({*run.vehicles} - {*judged})
+    observability = analyse_observability(known) if judged else None
+    vehicles = []
+    if observability is not None:
+        rates_of_theory = theory_rates(run, known)
+        vehicles = vehicle_metrics(known, observability, run.endings(judged), steady, rates_of_theory)
+    covariance = states_covariance(run.scenario.observer.name)
+    without = estimates(trajectory.of_vehicles(others), steady, covariance) if others else []
+    metrics = run_metrics(name, overrides, run, vehicles, steady, without)
+    return Results(metrics, known if judged else trajectory.of_vehicles(others), run.scenario), observability
 
 
 @contextmanager
@@ -255,7 +266,7 @@ class Results(Tabular):
         whole = Trajectory.load(folder / TRAJECTORY_FILE)
         names = whole.vehicles.tolist()
         try:
-            others = metrics.setdefault("without_truth", [])  # not of a run before 1.0
+            others = metrics.setdefault("without_truth", [])  # of a run before 0.9
             judged = [names.index(row["vehicle"]) for row in metrics["vehicles"] or others]
             metrics.setdefault("observer", "unknown observer")  # of a run before 0.2
             ends = [row["ended_at_s"] for row in metrics["vehicles"]]
@@ -291,7 +302,7 @@ class Results(Tabular):
         return text_of(self, WIDTH)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        if others := self.metrics["without_truth"]:
+        if others := self.metrics.get("without_truth"):
             yield estimates_table(others)
             yield f"No true poses, and so no errors. Standard deviations: mean after {self.steady_from:g} s."
         if not self.metrics["vehicles"]:

@@ -77,12 +77,18 @@ def links_report(backend: Svea, out: Console) -> None:
         out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
 
 
-def truth_report(backend: Svea) -> str:
-    """Return why true poses are missing: no car sends, or by topic of motion capture what came."""
-    names, lead = list(backend.binding.cars), "without true poses there are no errors to show: "
+def check_alive(backend: Svea) -> None:
+    """Raise CoopenvError: nothing has come from any car."""
     if not backend.health.received:
-        where = ", ".join(backend.deployment.network.connect)
-        return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
+        names, where = listed(list(backend.binding.cars)), ", ".join(backend.deployment.network.connect)
+        raise CoopenvError(
+            f"nothing has come from {names} by {where}: are they on, and are their names fleet/NAME/...?"
+        )
+
+
+def truth_report(backend: Svea) -> str:
+    """Return why true poses are missing, by topic of motion capture what came."""
+    names, lead = list(backend.binding.cars), "without true poses there are no errors to show: "
     if not backend.capabilities.truth:
         return f"{lead}sensors.truth = false"
     topics = [backend.binding.profile.topic_of(name, Role.TRUTH) for name in names]

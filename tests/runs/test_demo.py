@@ -233,6 +233,7 @@ def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     with closing(open_zenoh("router", listen=[endpoint])):
         command = ["svea", "run", str(SHIPPED), "--connect", endpoint, "--steps", "3", "--no-figures"]
         result = CliRunner().invoke(app, [*command, "--steady-from", "0"])
+        assert not any(Path("out").glob("*/*"))  # earlier results stay
         too_short = CliRunner().invoke(app, command)
     assert isinstance(result.exception, CoopenvError)
     assert str(result.exception).startswith(f"nothing has come from svea7, svea1 by {endpoint}")
