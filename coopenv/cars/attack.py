@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError, listed
-from coopenv.cars.backend.station import FOREIGN, OLD, OPEN, PATIENCE, Gates
+from coopenv.cars.backend.station import OLD, OPEN, PATIENCE, Gates
 from coopenv.cars.codec import decode, encode, header, make, ros2
 from coopenv.cars.deployment import Deployment
-from coopenv.cars.gate.core import ENCAPSULATION, write_drive
+from coopenv.cars.gate.core import ENCAPSULATION, Reason, write_drive
 from coopenv.cars.keys import Signer, library, load_verifier
 from coopenv.cars.profile import GATE_TYPES, VELOCITY, MotionCommand, Role
 from coopenv.cars.readings import Twist, read
@@ -332,7 +332,7 @@ def _look(intruder: Intruder, found: Outcome, before: Mapping[str, Any]) -> Outc
     found.refused, found.through = 0, intruder.answered
     for car, gate in intruder.gates.states.items():
         new = {reason: count - before[car].rejections.get(reason, 0) for reason, count in gate.rejections.items()}
-        passed = new.pop(FOREIGN, 0) + gate.accepted - before[car].accepted + (gate.state in OPEN)
+        passed = new.pop(Reason.FOREIGN, 0) + gate.accepted - before[car].accepted + (gate.state in OPEN)
         found.refused += sum(new.values())
         found.through += passed
         found.speed = float(np.fmax(found.speed, intruder.speeds[car]))

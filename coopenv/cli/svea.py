@@ -176,8 +176,9 @@ def health(
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
     --connect ROUTER --off-board.
     """
-    from coopenv.cars.backend.station import BYPASSED, FOREIGN, UNTRIED, neutral_command
+    from coopenv.cars.backend.station import BYPASSED, UNTRIED, neutral_command
     from coopenv.cars.deployment import load_deployment
+    from coopenv.cars.gate.core import Reason
     from coopenv.cars.gate.process import gate_deployment
     from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import UNIX, LinkError
@@ -199,7 +200,7 @@ def health(
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return
-        foreign = _count(status, FOREIGN)
+        foreign = _count(status, Reason.FOREIGN)
         try:
             lab = load_deployment(deployment, connect if off_board else None)
             with closing(open_transport(lab, timeout=1.0)) as outside:
@@ -209,7 +210,7 @@ def health(
         except LinkError as error:
             print(f"{car}: not tried from outside: {error}")
             return
-    if _count(status, FOREIGN) > foreign:
+    if _count(status, Reason.FOREIGN) > foreign:
         raise CoopenvError(f"{car}: {BYPASSED}")
     print(f"{car}: a command to its wheels from outside does not get through")
 

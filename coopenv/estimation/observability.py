@@ -134,8 +134,22 @@ class Trajectory(RecordedGeometry, Tabular):
 
     def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
-        known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
+        known = self._truth_known.all(axis=1)
         return self if known.all() else self._along("K", known)
+
+    @property
+    def _truth_known(self) -> np.ndarray:
+        """(K, N) whether the true pose is known."""
+        return np.asarray(np.isfinite(self.position).all(axis=-1) & np.isfinite(self.rotation).all(axis=(-2, -1)))
+
+    def with_truth(self, vehicles: Sequence[int]) -> list[int]:
+        """Return those of some vehicles whose true poses are known, at two ticks or more; none without common ticks.
+
+        Of cars without motion capture nothing is known; if so of some, the others have errors all the same.
+        """
+        known = self._truth_known
+        chosen = [i for i in vehicles if known[:, i].sum() > 1]
+        return chosen if known[:, chosen].all(axis=1).sum() > 1 else []
 
     def of_vehicles(self, indices: Sequence[int]) -> Self:
         """Return the record of some vehicles alone; the others stay among the targets."""

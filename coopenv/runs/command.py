@@ -91,7 +91,8 @@ def execute(
                     progress.update(tick, describe() if describe is not None else None)
         if check is not None:
             check()
-        trajectory, (results, observability) = run.trajectory(), _judged(name, overrides, run, steady)
+        trajectory = run.trajectory()
+        results, observability = _figures_of(name, overrides, run, trajectory, steady)
         if folder is None or out is None:
             return results
         scene = keeper.record()
@@ -118,21 +119,21 @@ def execute(
     return replace(results, files=tuple(out / path.name for path in paths))
 
 
-def _judged(
-    name: str, overrides: Mapping[str, Any], run: Rollout, steady: float
+def _figures_of(
+    name: str, overrides: Mapping[str, Any], run: Rollout, whole: Trajectory, steady: float
 ) -> tuple["Results", Observability | None]:
-    """Return the figures of a run that is over, and the observability of vehicles whose truth is known, if any is."""
-    trajectory, judged = run.trajectory(), run.judged()
-    known, others = trajectory.of_vehicles(judged).where_truth_is_known(), sorted({*run.vehicles} - {*judged})
-    observability = analyse_observability(known) if judged else None
-    vehicles = []
+    """Return what a run with the record `whole` has come to, and its observability where any truth is known."""
+    chosen = whole.with_truth(run.vehicles)
+    known, unknown = whole.of_vehicles(chosen).where_truth_is_known(), [i for i in run.vehicles if i not in chosen]
+    observability = analyse_observability(known) if chosen else None
+    rows, without = [], []
     if observability is not None:
-        rates_of_theory = theory_rates(run, known)
-        vehicles = vehicle_metrics(known, observability, run.endings(judged), steady, rates_of_theory)
-    covariance = states_covariance(run.scenario.observer.name)
-    without = estimates(trajectory.of_vehicles(others), steady, covariance) if others else []
-    metrics = run_metrics(name, overrides, run, vehicles, steady, without)
-    return Results(metrics, known if judged else trajectory.of_vehicles(others), run.scenario), observability
+        rows = vehicle_metrics(known, observability, run.endings(chosen), steady, theory_rates(run, known))
+    if unknown:
+        covariance = states_covariance(run.scenario.observer.name)
+        without = estimates(whole.of_vehicles(unknown), steady, covariance)
+    metrics = run_metrics(name, overrides, run, rows, steady, without)
+    return Results(metrics, known if chosen else whole.of_vehicles(unknown), run.scenario), observability
 
 
 @contextmanager

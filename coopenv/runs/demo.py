@@ -105,8 +105,9 @@ Rows = list[dict[str, Any]]
 
 def judged(run: Rollout) -> Rows:
     """Return the figures of an episode that is over, of vehicles whose true poses are known."""
-    vehicles = run.judged()
-    trajectory = run.trajectory().of_vehicles(vehicles).where_truth_is_known()
+    whole = run.trajectory()
+    vehicles = whole.with_truth(run.vehicles)
+    trajectory = whole.of_vehicles(vehicles).where_truth_is_known()
     ends = [ending.time for ending in run.endings(vehicles)]
     rows = summarise(trajectory, STEADY_FROM, ends)
     static = ~trajectory.target_moving[: len(run.scenario.landmarks)]

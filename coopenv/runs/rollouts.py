@@ -124,15 +124,6 @@ class Rollout:
             **{name: recorded(name)[:, L:] for name in ("position", "rotation", "velocity", "angular_velocity")},
         )
 
-    def judged(self) -> tuple[int, ...]:
-        """Return the vehicles that are estimated here and whose true poses are known, at two ticks or more.
-
-        Of cars without motion capture nothing is known; if so of some, the others have errors all the same.
-        """
-        record = self.trajectory()
-        known = [i for i in self.vehicles if len(record.of_vehicles([i]).where_truth_is_known().t) > 1]
-        return tuple(known) if len(record.of_vehicles(known).where_truth_is_known().t) > 1 else ()
-
     def endings(self, vehicles: Sequence[int] | None = None) -> list[Ending]:
         """Return how the run of each vehicle (None: of those that are estimated here) has ended so far."""
         ended = self._recorded("ended")[:, [*(self.vehicles if vehicles is None else vehicles)]]
@@ -214,21 +205,19 @@ def vehicle_metrics(
 def estimates(trajectory: Trajectory, steady_from: float, covariance: bool) -> list[dict[str, Any]]:
     """Return one dict per vehicle without true poses: what its observer says, units in the keys.
 
-    `covariance` is whether P is one; standard deviations are NaN otherwise. Those of the position are
-    the roots of the trace, as are those of the orientation; means over the ticks after `steady_from`, s.
+    Standard deviations are roots of traces, of the position in the map frame and of the small rotation 2 lambda, and
+    means over the ticks after `steady_from`, s. They are NaN where P is a matrix of gains, and so no `covariance`.
     """
     P = position_covariance(trajectory.rotation_estimate, trajectory.position_estimate, trajectory.covariance)
-    turn = np.degrees(np.degrees(trajectory.covariance[..., :3, :3]))
-    position, orientation = (
-        steady_mean(trajectory.t, np.sqrt(np.trace(part, axis1=-2, axis2=-1)), steady_from)
-        for part in ((P, turn) if covariance else (np.nan * P, np.nan * turn))
-    )
+    traces = (np.trace(part, axis1=-2, axis2=-1) for part in (P, trajectory.covariance[..., :3, :3]))
+    stds = [steady_mean(trajectory.t, np.sqrt(trace), steady_from) for trace in traces]
+    position, orientation = (std if covariance else np.full(std.shape, np.nan) for std in stds)
     yaw = roll_pitch_yaw_deg(trajectory.rotation_estimate[-1])[:, 2]
     return [
         {
             "vehicle": name,
             "position_std_m": float(position[i]),
-            "orientation_std_deg": float(orientation[i]),
+            "orientation_std_deg": math.degrees(orientation[i]),
             "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:, i])),
             "final_position_estimate_m": trajectory.position_estimate[-1, i].tolist(),
             "final_yaw_estimate_deg": float(yaw[i]),

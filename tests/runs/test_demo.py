@@ -30,6 +30,7 @@ from coopenv.cars.profile import SVEA, USUAL, Role
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from coopenv.cli.svea import STOPPED
+from coopenv.estimation.observability import Trajectory
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import FLEETS, Demo, links_line, links_report
 from coopenv.runs.rollouts import Rollout
@@ -152,12 +153,15 @@ def test_cars_that_are_stopped_end_the_demo_with_a_status_of_its_own(
 def test_without_true_poses_the_drive_is_kept_and_the_topics_are_told(
     fleet_of_my_own: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Rollout, "judged", lambda run: ())
+    monkeypatch.setattr(Trajectory, "with_truth", lambda trajectory, vehicles: [])
     result = CliRunner().invoke(app, fleet_of_my_own(""))
     assert isinstance(result.exception, CoopenvError)
     told = str(result.exception)
     assert told.startswith("mine: without true poses") and "svea7" in told and "too late for the ticks" in told
     assert "No true poses, and so no errors" in result.output
+    (line,) = (line for line in result.output.splitlines() if "s driven" in line)
+    missed, _, decisions = line.split(" s driven, ")[1].split()[:3]
+    assert 0 <= int(missed) <= int(decisions) == 60
     assert Path("out/mine.mcap").exists() and "The drive, bit for bit: coopenv run out/mine.mcap" in result.output
 
 

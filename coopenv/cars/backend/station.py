@@ -12,7 +12,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
-from coopenv.cars.gate.core import write_drive
+from coopenv.cars.gate.core import Reason, write_drive
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import GATE_TYPES, NEUTRAL, SVEA, CarProfile, Limits, Role
 from coopenv.cars.transport.base import Arrival, Transport
@@ -266,7 +266,7 @@ class Gates:
                 if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
                     self.end()
                     self.stopped_by_others.add(car)
-                    if states[car].rejections.get(FOREIGN, 0) > before[car].rejections.get(FOREIGN, 0):
+                    if states[car].rejections.get(Reason.FOREIGN, 0) > before[car].rejections.get(Reason.FOREIGN, 0):
                         raise CoopenvError(f"not armed: {car}: {BYPASSED}")
                     raise CoopenvError(f"{car}: was stopped while it was being armed")
             if time.monotonic() > until:
@@ -342,8 +342,6 @@ class Gates:
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
 
 
-FOREIGN, LIMITS = "foreign", "limits"
-"""Under which a gate counts commands to the wheels that it has not sent, and those beyond its limits."""
 BYPASSED = (
     "commands get to its wheels without its gate: give its bridge docker/car-zenoh.json5 "
     "(docs/cars_safety.md#ways-around-the-gate)"

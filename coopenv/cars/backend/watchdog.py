@@ -13,8 +13,9 @@ import numpy as np
 
 from coopenv.backends.base import VehicleBroadcast
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.station import BYPASSED, FOREIGN, LIMITS, OLD, OPEN, Gates, Station
+from coopenv.cars.backend.station import BYPASSED, OLD, OPEN, Gates, Station
 from coopenv.cars.deployment import Safety
+from coopenv.cars.gate.core import Reason
 from coopenv.cars.profile import Role, inside, presence_of
 from coopenv.cars.readings import CarPose, Sample
 from coopenv.estimation.poses import Array, skew
@@ -302,11 +303,11 @@ class Watchdog:
             if gate.age > OLD:
                 yield car, f"its gate is silent for {gate.age:.2f} s"
             elif gate.state not in OPEN:
-                foreign = self._gates.refused(car).get(FOREIGN)
+                foreign = self._gates.refused(car).get(Reason.FOREIGN)
                 yield car, f"its gate is {gate.state}" + (f": {foreign} {BYPASSED}" if foreign else "")
             elif gate.session != self._gates.session:
                 yield car, "another station has armed its gate"
-            elif beyond := self._gates.refused(car).get(LIMITS):
+            elif beyond := self._gates.refused(car).get(Reason.LIMITS):
                 yield car, f"its gate has refused {beyond} commands: its limits are lower than those of the file here"
         missed, beat = self._safety.missed_deadlines, self._beat
         if self._missed >= missed:

@@ -102,11 +102,11 @@ def test_the_first_seconds_are_off_by_what_their_covariances_say(name: str) -> N
             assert (abs(mean - 3.0) < 4.5 * np.sqrt(variance / count)).all(), mean
     degrees = 6 * engine.world.worlds
     low, high = chi2.ppf([1e-6, 1.0 - 1e-6], degrees) / degrees  # of few worlds
-    for _ in range(12):
+    for k in range(12):
+        least = 0.5 if k else 0.45  # of svea_crossing 0.50(1) in the first frame, of 1,024 worlds
         engine.step(np.zeros(engine.view("actions").shape), ticks=1)
         anees = np.nanmean(nees_of(engine.world)[0], axis=0)
-        # Starts are bounded, so that the first figures are low.
-        assert (anees > min(0.45, low)).all() and (anees < max(2.0, high)).all(), anees
+        assert (anees > min(least, low)).all() and (anees < max(2.0, high)).all(), anees
     engine.close()
 
 
