@@ -65,6 +65,7 @@ class RecordProperties:
     """Properties of the record, the same for all observers; NaN where unknown."""
 
     vehicles: tuple[str, ...]
+    """N of which any true pose is known; the others are not judged."""
     windows: tuple[TimeWindow, ...]
     """W stretches that are judged one by one, the steady state last."""
     bounds: Array
@@ -80,6 +81,8 @@ class RecordProperties:
     figures: tuple[float, ...] = ()
     """Figures in which another record differs: bearings, deliveries, and the root mean squares of bearings along x, of
     measured velocities, m/s, and of the last true positions, m."""
+    without_truth: tuple[str, ...] = ()
+    """Vehicles that are not judged."""
 
     @property
     def steady_from(self) -> float:
@@ -147,9 +150,15 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
         seen = analyse_observability(_geometry(recording))
         gramians = np.array([v.min(axis=0, initial=np.inf) for v in (seen.min_eigenvalue, seen.local_eigenvalue)])
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    return RecordProperties(
-        names, windows, within, gramians, recording.t[kept], bound, paper_noise, figures_of(recording)
-    )
+    judged = judged_vehicles(recording)
+    arrays = within[:, judged], gramians[:, judged], recording.t[kept], bound[:, judged]
+    own, others = (tuple(name for i, name in enumerate(names) if (i in judged) is part) for part in (True, False))
+    return RecordProperties(own, windows, *arrays, paper_noise, figures_of(recording), others)
+
+
+def judged_vehicles(recording: Recording) -> NDArray[np.intp]:
+    """Return the numbers of the vehicles of which any true pose is known."""
+    return np.flatnonzero(recording.truth.known.any(axis=0))
 
 
 def figures_of(recording: Recording) -> tuple[float, ...]:
@@ -271,13 +280,14 @@ def failed_run(
 
 def sample_of(variant: str, observer: str, scene: RecordProperties, recording: Recording, result: Run) -> JudgedRun:
     """Judge one run."""
-    costs = {"bytes_per_s": result.bytes_per_second, "us_per_update": result.microseconds_per_update}
+    judged = judged_vehicles(recording)
+    costs = {"bytes_per_s": result.bytes_per_second[judged], "us_per_update": result.microseconds_per_update[judged]}
     if result.failure:
         return failed_run(variant, observer, scene, result.nees_dof, result.failure, costs)
     kept = kept_ticks(recording)
     std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
-    measures = costs | _measures(scene, recording, result)
-    series = Series(result.position_error[kept], std, result.nees[kept])
+    measures = costs | {name: values[judged] for name, values in _measures(scene, recording, result).items()}
+    series = Series(*(values[:, judged] for values in (result.position_error[kept], std, result.nees[kept])))
     error, level = horizontal_error(recording, result), result.protection_level[..., 0]
     counted = result.judged & np.isfinite(level)
     error, level = (np.clip(values[counted], LEVEL_BINS[0], LEVEL_BINS[-1]) for values in (error, level))
@@ -327,7 +337,7 @@ def _measures(scene: RecordProperties, recording: Recording, result: Run) -> dic
         "diverged": diverged(*map(_last, errors)),
         **level_measures(horizontal_error(recording, result), result),
     }
-    single = [_vehicle_measures(recording, result, i) for i in range(len(scene.vehicles))]
+    single = [_vehicle_measures(recording, result, i) for i in range(len(recording.setups))]
     return figures | {name: np.array([found[name] for found in single]) for name in single[0]}
 
 

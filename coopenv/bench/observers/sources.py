@@ -4,6 +4,7 @@ A source is small and picklable, so that a worker process makes the record itsel
 """
 
 import math
+import pickle
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -208,6 +209,7 @@ class Bags(RecordSource):
 
     def check(self) -> None:
         """Look for motion capture, and whether the faults fit."""
+        _opened.clear()
         backend = self._backend()
         check_truth(self.name, backend.capabilities.truth)
         self._check_faults(backend.scenario)
@@ -222,7 +224,16 @@ class Bags(RecordSource):
             return self.fault(variant).applied(record(self._backend(), seed), seed)
 
     def _backend(self) -> Backend:
-        return open_backend(self.path, None, self.overrides, topics=self.topics)
+        times = [path.stat().st_mtime_ns for path in (self.path, self.topics) if path is not None and path.exists()]
+        key = pickle.dumps((self.path, self.topics, self.overrides, times))
+        if key not in _opened:
+            _opened.clear()
+            _opened[key] = open_backend(self.path, None, self.overrides, topics=self.topics)
+        return _opened[key]
+
+
+_opened: dict[bytes, Backend] = {}
+"""The last bag: reading it takes seconds, and every seed and fault needs the same."""
 
 
 def check_truth(name: str, known: bool) -> None:

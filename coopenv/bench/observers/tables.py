@@ -135,6 +135,8 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
         if NOMINAL in variants:
             yield ""
             yield variant_table(board, "RMSE / nominal", "degradation", [v for v in variants if v != NOMINAL])
+    if unknown := board.samples[0].scene.without_truth:
+        yield f"\nNot judged, as no true poses are known: {', '.join(unknown)}."
     yield from failures(board.rows)
     if board.basins:
         yield ""
@@ -166,8 +168,9 @@ def _cells(rows: Sequence[Row], column: str, few: bool) -> list[str]:
 
 
 def _headings(board: Leaderboard) -> list[str]:
-    """Return one heading per vehicle."""
-    return [f"f{i + 1}" for i in range(len(board.vehicles))]
+    """Return one heading per vehicle, the paper's where names are as there."""
+    numbers = [re.fullmatch(r"vehicle_(\d+)", name) for name in board.vehicles]
+    return [f"f{number[1] if number else i + 1}" for i, number in enumerate(numbers)]
 
 
 def _few(board: Leaderboard) -> bool:

@@ -23,9 +23,10 @@ from coopenv.bench.observers import compare, find_source
 from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.comparison import Plan
 from coopenv.bench.observers.faults import VARIANTS
-from coopenv.bench.observers.rows import Row
+from coopenv.bench.observers.judge import sample_of, scene_of
+from coopenv.bench.observers.rows import Leaderboard, Row
 from coopenv.bench.observers.sources import variants_of
-from coopenv.bench.observers.tables import failures
+from coopenv.bench.observers.tables import everything, failures
 from coopenv.cli.bench import ObserverOptions
 from coopenv.observers import registry, run
 from coopenv.observers.contract import Estimate, Tick
@@ -51,6 +52,22 @@ def test_every_fault_has_its_rows() -> None:
         total = found.totals[name, "mekf_covariance"]
         assert total.degradation.value == pytest.approx(sum(rmse[name]) / sum(rmse["nominal"]))
     assert rmse["lying_neighbour"][:2] == pytest.approx(rmse["nominal"][:2], rel=1e-9)  # the liar and its leader
+
+
+def test_vehicles_without_any_truth_are_not_judged() -> None:
+    source = find_source("busy_intersection", {"horizon": 3.0})
+    whole = record(source.world(), 3)
+    for array in (whole.truth.position, whole.truth.rotation):
+        array[:, 1] = np.nan
+    scene, run_of = scene_of(whole, 1.0), run("mekf_covariance", whole)
+    judged = sample_of("nominal", "mekf_covariance", scene, whole, run_of)
+    board = Leaderboard("mine", ("mekf_covariance",), {"nominal": ""}, (3,), [judged])
+    assert board.vehicles == ("vehicle_1", "vehicle_3", "vehicle_4", "vehicle_5")
+    expected = run_of.position_rmse(1.001)[[0, 2, 3, 4]]
+    assert [row.position_rmse_m for row in board.rows] == pytest.approx(expected)
+    assert board.totals["nominal", "mekf_covariance"].rmse.value == pytest.approx(expected.mean())
+    text = printed(*everything(board))
+    assert re.search(r"f1 +f3 +f4 +f5 +mean", text) and "Not judged, as no true poses are known: vehicle_2." in text
 
 
 class Raises(DeadReckoning):

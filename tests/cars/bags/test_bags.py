@@ -16,8 +16,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 import coopenv
 from coopenv import CoopenvError, DataError
 from coopenv.backends.mcap import read_recording
-from coopenv.backends.sources import SourceKind, kind_of, open_recording
+from coopenv.backends.sources import SourceKind, kind_of, open_backend, open_recording
 from coopenv.base.errors import DataWarning
+from coopenv.bench.observers import sources
 from coopenv.cars import codec
 from coopenv.cars.backend.drive import DriveRecorder
 from coopenv.cars.bags import Bag
@@ -128,6 +129,20 @@ def test_commands_take_a_bag_with_its_map(folder: Path, capsys: pytest.CaptureFi
     assert "needs a map of its topics, --map topics.toml" in capsys.readouterr().err
     assert main(["run", "crossing_path", *given]) == 2
     assert "is for ROS bags" in capsys.readouterr().err
+
+
+def test_a_comparison_reads_a_bag_once_and_again_after_a_change(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, given = [], folder / "again.toml"
+    monkeypatch.setattr(sources, "open_backend", lambda *a, **k: opened.append(a) or open_backend(*a, **k))
+    given.write_text(bags.MAP, encoding="utf-8")
+    source = sources.find_source(folder / "mcap", topics=given)
+    source.check()
+    for seed in (3, 4):
+        expected = record(Bag([folder / "mcap"], given), seed)
+        assert_array_equal(source.recording("nominal", seed).start_position, expected.start_position)
+    assert len(opened) == 1
+    given.write_text(f"duration = 1.0\n{bags.MAP}", encoding="utf-8")
+    assert source.recording("nominal", 3).ticks < expected.ticks and len(opened) == 2
 
 
 def test_the_python_interface_takes_a_bag(folder: Path) -> None:
