@@ -12,6 +12,7 @@ or a topic whose delay is far from those of the other topics of its car.
   by d1 - d2. Files without anything in common with the others are merged by their stamps.
 """
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError, DataError, listed
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, listed
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.clocks import Delay, Leads, checked, jumps, leads_of, moves_of
 from coopenv.cars.bags.files import BagFile
@@ -128,8 +129,13 @@ def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: Topi
             if entry.role is not Role.CAMERA_INFO or entry.car in found:
                 continue
             for _, _, decode in file.messages([entry.topic]):
+                message = decode()
+                if not np.any(getattr(message, "k", getattr(message, "K", 1.0))):
+                    text = f"{file.path}: topic {entry.topic}: says that the camera is not calibrated (k is zero)"
+                    warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
+                    break
                 try:
-                    value = read(Role.CAMERA_INFO, decode(), vision=given.vision)
+                    value = read(Role.CAMERA_INFO, message, vision=given.vision)
                 except CoopenvError as error:
                     raise DataError(f"{file.path}: topic {entry.topic}: {error}") from None
                 if isinstance(value, Calibration):

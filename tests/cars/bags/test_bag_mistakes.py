@@ -269,6 +269,16 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
         assert_allclose(ray[1] / ray[2], (block["center_y"] - 100.0) / 410.0)
 
 
+def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_environment(tmp_path: Path) -> None:
+    fields = {"k": np.zeros(9), "d": [], "height": 208, "width": 316, "distortion_model": ""}
+    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    for name in ("with", "without"):
+        (tmp_path / name).mkdir()
+    with pytest.warns(DataWarning, match=r"camera_info: says that the camera is not calibrated \(k is zero\)"):
+        bag = opened(tmp_path / "with", MAP, [*short(), told], "mcap")
+    assert bag.log.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.lenses
+
+
 def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     turning = {"angular_velocity": (0.0, 0.0, 0.7), "linear_acceleration": (0.0, 0.0, 9.8)}
     wheels = [m for m in short() if "twist" in m.topic]
