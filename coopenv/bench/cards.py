@@ -185,8 +185,9 @@ class Evaluation(Contest, Tabular):
         check_one_of("unknown driver", driver, self.results)
         return self.results[driver]
 
+    @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """Return one flat row per driver and metric."""
+        """One flat row per driver and metric."""
         return [
             {"agent": entrant.name, "kind": entrant.kind, "environment": self.environment, **asdict(result)}
             for entrant in self.entrants
@@ -195,7 +196,7 @@ class Evaluation(Contest, Tabular):
 
     def columns(self) -> Columns:
         """Return `rows` with the unit of each metric."""
-        rows = [{**row, "unit": METRICS[row["metric"]].unit} for row in self.rows()]
+        rows = [{**row, "unit": METRICS[row["metric"]].unit} for row in self.rows]
         return Columns({name: [row[name] for row in rows] for name in rows[0]}, ("agent", "metric"))
 
     def __repr__(self) -> str:
@@ -223,8 +224,9 @@ class Evaluation(Contest, Tabular):
                 words = ", ".join(f"{own} measures {other} {share:.0%}" for own, other, share in pairs)
                 yield f"{name}, share of the time under way: {words}."
 
+    @cached_property
     def difference_rows(self) -> list[dict[str, Any]]:
-        """Return one flat row per driver that was compared with the reference, and metric."""
+        """One flat row per driver that was compared with the reference, and metric."""
         return [
             {"agent": name, "reference": self.reference, "environment": self.environment, **asdict(difference)}
             for name, differences in self.differences.items()

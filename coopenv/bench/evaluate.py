@@ -34,9 +34,9 @@ def document(evaluation: Evaluation, command: str) -> dict[str, Any]:
         "worlds": evaluation.worlds,
         "seed_block": evaluation.block,
         "metrics": {name: {"unit": metric.unit, "meaning": metric.meaning} for name, metric in METRICS.items()},
-        "rows": evaluation.rows(),
+        "rows": evaluation.rows,
         "reference": evaluation.reference,
-        "differences": evaluation.difference_rows(),
+        "differences": evaluation.difference_rows,
         "seen_share": {
             name: {
                 own: dict(zip(e.vehicles, row, strict=True))

@@ -171,7 +171,7 @@ def write_figures(
         def report(done: float, name: str, place: int = place, how: str = how, of: int = len(contest.entrants)) -> None:
             on_progress((place + done / of) / len(built), f"{how}: {name}")
 
-        found = contest.drive(report).rows()
+        found = contest.drive(report).rows
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in OVERVIEW]
     value = {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
     replace_text(folder / f"{Path(environment).stem}.json", json_text(value))

@@ -153,7 +153,7 @@ def test_an_evaluation_in_python(capsys: Any) -> None:
     assert repr(found) == "Evaluation('Facade', agents=('peek', 'route_follower'), worlds=3)"
     assert "held-out worlds" in found._repr_html_()
     data = found.to_xarray()
-    for row in found.rows():
+    for row in found.rows:
         assert float(data["mean"].sel(agent=row["agent"], metric=row["metric"])) == pytest.approx(
             row["mean"], nan_ok=True
         )
