@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,17 @@ from hypothesis import strategies as st
 
 import coopenv
 from coopenv.base.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown, training_seed, world_keys
-from coopenv.base.format import column, fixed, in_parentheses, json_text, jsonable, number, seconds, with_error
+from coopenv.base.format import (
+    column,
+    fixed,
+    in_parentheses,
+    json_text,
+    jsonable,
+    number,
+    read_npz,
+    seconds,
+    with_error,
+)
 
 
 class Unspeakable:
@@ -243,3 +254,16 @@ def test_without_a_seed_worlds_are_for_training() -> None:
 def test_wrong_worlds(single: Any, world: Any) -> None:
     with pytest.raises(CoopenvError, match="option 'world' must be a whole number"):
         single.reset(seed=0, options={"world": world})
+
+
+def test_arrays_that_python_would_unpack_without_a_limit_are_refused(tmp_path: Path) -> None:
+    path, wanted = tmp_path / "made.npz", {"nees": "f K"}
+    np.savez_compressed(path, nees=np.ones(3))
+    assert read_npz(path, "record", wanted)["nees"].tolist() == [1.0, 1.0, 1.0]
+    with zipfile.ZipFile(path) as archive:
+        content = archive.read("nees.npy")
+    for kind in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        with zipfile.ZipFile(path, "w", kind) as archive:
+            archive.writestr("nees.npy", content)
+        with pytest.raises(DataError, match=r"made\.npz: a part is in it twice, or packed by neither of: stored"):
+            read_npz(path, "record", wanted)

@@ -98,6 +98,19 @@ MOST_UNPACKED = 2**31
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
+def members_of(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """Return the parts of an untrusted archive, by name; each unpacks to no more than its stated size by `read(size)`.
+
+    Raises:
+        DataError: a part is twice in it, or packed in a way (bzip2, LZMA) that Python unpacks without a limit.
+    """
+    members = {part.filename: part for part in archive.infolist()}
+    plain = all(part.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for part in members.values())
+    if not plain or len(members) < len(archive.infolist()):
+        raise DataError(f"{archive.filename}: a part is in it twice, or packed by neither of: stored, deflated")
+    return members
+
+
 def read_npz(
     path: Path, what: str, table: Mapping[str, str], lengths: Mapping[str, Sequence[int]] | None = None
 ) -> dict[str, np.ndarray]:
@@ -117,8 +130,8 @@ def read_npz(
     possible = dict(lengths or {})
     try:
         with zipfile.ZipFile(path) as archive:
-            members = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
-            if sum(part.file_size for part in archive.infolist()) > MOST_UNPACKED:
+            members = {name.removesuffix(".npy"): part for name, part in members_of(archive).items()}
+            if sum(part.file_size for part in members.values()) > MOST_UNPACKED:
                 raise DataError(f"{path}: unpacks to more than {MOST_UNPACKED >> 30} GiB")
             if missing := [name for name, rule in table.items() if name not in members and "?" not in rule]:
                 raise DataError(f"{path}: not a {what}, missing: {', '.join(missing)}")

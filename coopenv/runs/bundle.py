@@ -18,11 +18,12 @@ import numpy as np
 
 from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed, shown
 from coopenv.base.files import replacing_file
-from coopenv.base.format import json_text
+from coopenv.base.format import json_text, members_of
 from coopenv.base.installation import is_reference, versions
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
-from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.files import load_scenario, parse_scenario
+from coopenv.scenario.own_terms import located
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
@@ -117,12 +118,12 @@ class Bundle:
         """Read a file. Raises DataError: it is cut off, changed, or not of this format."""
         try:
             with zipfile.ZipFile(path) as archive:
-                members = {part.filename: part.file_size for part in archive.infolist()}
-                wrong = [name for name, size in members.items() if size > PARTS.get(name, -1)]
-                missing = [name for name in (*PARTS,)[:3] if name not in members]
-                if wrong or missing or len(members) < len(archive.infolist()):
-                    raise DataError(f"{path}: not a run: parts {listed(missing or wrong or [*members])}")
-                parts = {name: archive.read(name) for name in members}
+                sizes = {name: part.file_size for name, part in members_of(archive).items()}
+                wrong = [name for name, size in sizes.items() if size > PARTS.get(name, -1)]
+                missing = [name for name in (*PARTS,)[:3] if name not in sizes]
+                if wrong or missing:
+                    raise DataError(f"{path}: not a run: parts {listed(missing or wrong)}")
+                parts = {name: archive.open(name).read(size) for name, size in sizes.items()}
             manifest = json.loads(parts.pop("manifest.json"))
             if manifest.get("format") != FORMAT:
                 raise DataError(f"{path}: format {shown(manifest.get('format'))}, expected '{FORMAT}'")
@@ -179,7 +180,10 @@ class Bundle:
             CoopenvError: the scenario is not valid, or its observer is not there.
         """
         about, end = self.manifest, self.manifest["end"]
-        scenario = parse_scenario(self._with_observer(), f"{self.path.name}: scenario.json")
+        raw = located(self._with_observer(), Path(), self._here)
+        scenario = parse_scenario(raw, f"{self.path.name}: scenario.json")
+        drivers = [f"vehicles.{i}.motion.driver" for i, driver in enumerate(scenario.drivers) if driver is not None]
+        scenario = load_scenario(scenario, dict.fromkeys(drivers))  # their actions are in the file
         rows = iter(self.arrays["actions"])
         run = Rollout(scenario, about["seed"], None, about["dtype"], about["device"], lambda observations: next(rows))
         expected = (len(scenario.vehicles), run.engine.world.model.action_size)
@@ -201,6 +205,14 @@ class Bundle:
             if not np.allclose(values, np.array(end["figures"][name], float), rtol=FIGURE_TOLERANCE, equal_nan=True):
                 differing.append(f"last {name.replace('_', ' ')} {', '.join(f'{value:.4g}' for value in values)}")
         return differing
+
+    def _here(self, reference: str, folder: Path) -> str:
+        """Return the user's file of a term, program or network of the scenario: code of another place does not run."""
+        place, colon, name = reference.rpartition(":")
+        file = folder.absolute() / Path(place if colon else name).name
+        if not file.is_file():
+            raise DataError(f"{self.path}: needs {file.name} here, which its scenario names: {reference}")
+        return f"{file}{colon}{name if colon else ''}"
 
     def _with_observer(self) -> dict[str, Any]:
         """Return the scenario with its observer, which is loaded from its file if it is in one."""

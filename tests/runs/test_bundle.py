@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from hashlib import sha256
@@ -14,6 +16,8 @@ import pytest
 
 from coopenv.cli import main
 from tests.helpers.commands import refused
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 OBSERVER = """
 from coopenv.observers import Estimate, Message
@@ -112,6 +116,30 @@ def test_a_run_whose_driver_fails_is_replayed_up_to_there(
     assert "actions: expected (1, 2) per decision" in refused("run", few)
 
 
+def test_code_that_a_scenario_names_runs_from_the_current_folder_only(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = folder / "own"
+    shutil.copytree(EXAMPLES / "lane_keeping", own)
+    assert main(["run", str(own / "lane_keeping.toml"), "--no-figures", "--steps", "4", "--out", "run"]) == 0
+    assert main(["bundle", "run", "--out", "own.zip"]) == 0
+    assert "own.zip: needs lane_terms.py here, which its scenario names: " in refused("run", "own.zip")
+    monkeypatch.chdir(own)
+    capsys.readouterr()
+    assert main(["run", "../own.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+
+
+def test_a_driver_that_a_scenario_names_is_replayed_without_its_code(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "mine.py").write_text(DRIVER.replace("VERDICT", "return observations[:, :2] * 0 + 0.3"))
+    assert main(run("--steps", "4", "--override", 'vehicles.0.motion.driver="mine.py:drive"')) == 0
+    (folder / "mine.py").unlink()
+    assert main(["bundle", "run"]) == 0
+    capsys.readouterr()
+    assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+
+
 def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(run("--steps", "30")) == 0 and main(["bundle", "run"]) == 0
     assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
@@ -154,3 +182,21 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
     ]
     for change, sealed, reason in cases:
         assert reason in refused("run", edited(whole, change, sealed)), reason
+
+
+def test_archives_that_unpack_to_more_than_they_state_are_refused(folder: Path) -> None:
+    assert main(run("--steps", "4")) == 0 and main(["bundle", "run"]) == 0
+    with zipfile.ZipFile("run.zip") as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    for kind in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        with zipfile.ZipFile("large.zip", "w") as archive:
+            for name, content in parts.items():
+                large = bytes(2**28 if name == "scenario.json" else 0)
+                archive.writestr(name, content + large, kind)
+                archive.getinfo(name).file_size = len(content)  # as the central directory then states
+        tracemalloc.start()
+        try:
+            assert "large.zip: " in refused("run", "large.zip")
+            assert tracemalloc.get_traced_memory()[1] < 2**27
+        finally:
+            tracemalloc.stop()
