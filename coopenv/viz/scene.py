@@ -261,4 +261,7 @@ class SceneRecord:
         for name, values in read_npz(path, "scene", FIELDS, lengths).items():
             whole = values.astype(np.int64 if name in _WHOLE else np.float64)
             fields[name] = np.broadcast_to(whole, (count, *values.shape[1:]))
+        steps, last = np.diff(fields["tick"], prepend=-1), scenario.horizon_ticks
+        if (steps <= 0).any() or fields["tick"][-1] > last:
+            raise DataError(f"{path}: tick: expected camera ticks from 0 to {last}, each later than the one before")
         return cls(scenario, source, fields)

@@ -105,6 +105,8 @@ def edited(path: Path, to: Path, **changes: Any) -> Path:
         ({"source": {"name": "x"}}, "observer"),
         ({"scenario": {"title": 3}}, "edited.npz"),
         ({"pan": np.array([["a"]])}, "pan: <U1"),
+        ({"tick": np.arange(31, dtype=np.int32)[::-1]}, "tick: expected camera ticks from 0 to"),
+        ({"tick": np.arange(31, dtype=np.int32) * 10**7}, "tick: expected camera ticks from 0 to"),
     ],
 )
 def test_a_file_that_is_no_scene_is_refused(
