@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coopenv.base import installation
-from coopenv.base.errors import CoopenvError, error_text, shown, suggest
+from coopenv.base.errors import CoopenvError, error_text, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.base.sections import one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
@@ -187,7 +187,7 @@ def find_agent(name_or_place: str | Path | Callable[..., Any]) -> Agent:
         "environments": tuple(str(folder / name) if name.endswith(".toml") else name for name in card.environments),
         "options": {**card.options, **network},
     }
-    return Agent(**{**dict(card), **absolute}, name=folder.resolve().name, folder=folder)
+    return Agent(**{**dict(card), **absolute}, name=printable(folder.resolve().name), folder=folder)
 
 
 def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> None:

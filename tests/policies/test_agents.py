@@ -123,6 +123,7 @@ def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(load_policy("own.py:Left", scenario, 0)(rows), [[0.0, 1.0]] * 3)
     np.testing.assert_array_equal(load_policy("own:right", scenario, 0)(rows), [[0.0, -1.0]] * 3)
     assert find_agent("own.py:right").name == "right"
+    assert find_agent(folder.rename(tmp_path / "le\x1b[2Jfty")).name == r"le\x1b[2Jfty"  # no terminal obeys it
 
 
 def test_whatever_is_an_agent_drives_a_run() -> None:
