@@ -1,16 +1,20 @@
 """A console for texts as they are and tables that are never cut."""
 
+import re
 from io import StringIO
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
+from rich.text import Text
+
+from coopenv.base.errors import printable
 
 PLAIN: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False}
 
 
 class Terminal(Console):
-    """Prints scenario texts as they are; lines of tables that do not fit are longer than the console."""
+    """Prints texts as they are, control characters escaped; lines of tables that do not fit are longer than it."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{**PLAIN, **options})
@@ -21,6 +25,10 @@ class Terminal(Console):
         """Print, without cutting what is longer than a line."""
         super().print(*objects, **{"crop": False, **options})
 
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text without control characters, which names in foreign files may have."""
+        return super().render_str(re.sub(r"[^\n\t]+", lambda part: printable(part[0]), text), **options)
+
 
 class NumberTable(Table):
     """A table that takes the width that it needs."""
@@ -30,8 +38,8 @@ class NumberTable(Table):
         return super().__rich_console__(console, options.update(max_width=max(options.max_width, needed)))
 
 
-def text_of(printable: Any, width: int) -> str:
+def text_of(shown: Any, width: int) -> str:
     """Return what a console of a width prints of an object."""
     text = StringIO()
-    Terminal(file=text, width=width).print(printable)
+    Terminal(file=text, width=width).print(shown)
     return text.getvalue()

@@ -19,7 +19,16 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import typer
 from typer.core import TyperGroup
 
-from coopenv.base.errors import AgentWarning, CoopenvError, DataWarning, ScenarioWarning, listed, shown, suggest
+from coopenv.base.errors import (
+    AgentWarning,
+    CoopenvError,
+    DataWarning,
+    ScenarioWarning,
+    listed,
+    printable,
+    shown,
+    suggest,
+)
 from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
 
 if TYPE_CHECKING:
@@ -451,7 +460,7 @@ def warned() -> Iterator[None]:
     def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
         if not issubclass(category, ours):
             others(message, category, *where)
-        elif (text := f"warning: {message}") not in printed:
+        elif (text := f"warning: {printable(str(message))}") not in printed:
             printed.add(text)
             print(text, file=sys.stderr)
 

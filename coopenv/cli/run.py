@@ -100,9 +100,9 @@ def replay(path: Path) -> None:
     if differing := bundle.replay():
         raise CoopenvError(f"{path}: another result than that of the file: {'; '.join(differing)}")
     printed.print(f"{path}: {bundle.title}", soft_wrap=True)
-    error = bundle.manifest["end"]["error"]
-    same = "The same figures up to the driver's error" if bundle.by_driver else "The same error"
-    printed.print(f"{same}: {error}" if error else "The same figures.", soft_wrap=True)
+    end = bundle.manifest.end
+    same = "The same figures up to the driver's error" if end.by_driver else "The same error"
+    printed.print(f"{same}: {end.error}" if end.error else "The same figures.", soft_wrap=True)
 
 
 RunFolder = Annotated[

@@ -12,14 +12,16 @@ from dataclasses import dataclass
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
-from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed, shown
+from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed
 from coopenv.base.files import replacing_file
-from coopenv.base.format import json_text, members_of
+from coopenv.base.format import json_text, jsonable, members_of
 from coopenv.base.installation import is_reference, versions
+from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
 from coopenv.scenario.files import load_scenario, parse_scenario
@@ -27,11 +29,46 @@ from coopenv.scenario.own_terms import located
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
-FORMAT = "coopenv-run 1"
 PARTS = {"manifest.json": 2**20, "scenario.json": 2**24, "arrays.npz": 2**28, "observer.py": 2**20}
 """Names of the parts with the most bytes that each may unpack to."""
 FIGURE_TOLERANCE = 1e-6
 """Relative, of figures that count as the same: other processors round differently."""
+
+
+Tick = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class RunEnd(Section):
+    """How a run ended."""
+
+    tick: Tick
+    error: str
+    """Empty: none."""
+    by_driver: bool = False
+    """Whether the error was the driver's, which is not replayed."""
+    figures: dict[Literal["position_error", "orientation_error"], list[float | None]]
+    """Last errors of the vehicles, m and deg; none: not known."""
+
+
+class Manifest(Section):
+    """What a run was."""
+
+    format: Literal["coopenv-run 1"] = "coopenv-run 1"
+    environment: str
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    policy: str
+    observer: str
+    dtype: str
+    device: str
+    ticks_planned: Tick
+    versions: dict[str, str]
+    kernels: dict[str, str]
+    """Hashes of the modules of kernels, by name."""
+    state_tick: Tick
+    """Of the state that is kept."""
+    end: RunEnd
+    parts: dict[str, str]
+    """Digests of the other parts, by name."""
 
 
 class RunRecord:
@@ -78,30 +115,29 @@ class RunRecord:
         observer, place = run.scenario.observer.name, portable(run.scenario.observer.name)
         if isinstance(place, str) and (file := Path(place.rpartition(":")[0])).suffix == ".py":
             observer, parts["observer.py"] = f"{file.name}:{place.rpartition(':')[2]}", file.read_bytes()
-        manifest = {
-            "format": FORMAT,
-            "environment": environment,
-            "seed": run.seed,
-            "policy": run.policy_name,
-            "observer": observer,
-            "dtype": world.precision.name,
-            "device": world.device,
-            "ticks_planned": self.last if by_driver else run.ticks_planned,
-            "versions": versions("coopenv", "numpy", "warp-lang"),
-            "kernels": kernel_hashes(),
-            "state_tick": before,
-            "end": {"tick": self.last, "error": str(error or ""), "by_driver": by_driver, "figures": figures_of(run)},
-            "parts": {name: sha256(content).hexdigest() for name, content in parts.items()},
-        }
+        manifest = Manifest(
+            environment=environment,
+            seed=run.seed,
+            policy=run.policy_name,
+            observer=observer,
+            dtype=world.precision.name,
+            device=world.device,
+            ticks_planned=self.last if by_driver else run.ticks_planned,
+            versions=versions("coopenv", "numpy", "warp-lang"),
+            kernels=kernel_hashes(),
+            state_tick=before,
+            end=RunEnd(tick=self.last, error=str(error or ""), by_driver=by_driver, figures=figures_of(run)),
+            parts={name: sha256(content).hexdigest() for name, content in parts.items()},
+        )
         with replacing_file(path) as new, zipfile.ZipFile(new, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in {"manifest.json": json_text(manifest).encode(), **parts}.items():
+            for name, content in {"manifest.json": json_text(manifest.model_dump()).encode(), **parts}.items():
                 archive.writestr(name, content)
 
 
-def figures_of(run: Rollout) -> dict[str, list[float]]:
-    """Return the last errors of the vehicles, m and deg."""
-    view = run.engine.view
-    return {name: view(name)[0].astype(float).tolist() for name in ("position_error", "orientation_error")}
+def figures_of(run: Rollout) -> dict[Literal["position_error", "orientation_error"], list[float | None]]:
+    """Return the last errors of the vehicles, m and deg; None: not known."""
+    position, orientation = (run.engine.view(name)[0] for name in ("position_error", "orientation_error"))
+    return {"position_error": jsonable(position), "orientation_error": jsonable(orientation)}
 
 
 @dataclass(frozen=True)
@@ -109,7 +145,7 @@ class Bundle:
     """A file of a run, checked."""
 
     path: Path
-    manifest: dict[str, Any]
+    manifest: Manifest
     scenario: dict[str, Any]
     arrays: dict[str, np.ndarray]
 
@@ -124,11 +160,9 @@ class Bundle:
                 if wrong or missing:
                     raise DataError(f"{path}: not a run: parts {listed(missing or wrong)}")
                 parts = {name: archive.open(name).read(size) for name, size in sizes.items()}
-            manifest = json.loads(parts.pop("manifest.json"))
-            if manifest.get("format") != FORMAT:
-                raise DataError(f"{path}: format {shown(manifest.get('format'))}, expected '{FORMAT}'")
+            manifest = validated(Manifest, parts.pop("manifest.json"), f"{path}: manifest.json", DataError)
             for name, content in parts.items():
-                if manifest["parts"].get(name) != sha256(content).hexdigest():
+                if manifest.parts.get(name) != sha256(content).hexdigest():
                     raise DataError(f"{path}: {name}: not the part that was written, its digest differs")
             with zipfile.ZipFile(BytesIO(parts["arrays.npz"])) as inner:
                 if any(part.compress_type != zipfile.ZIP_STORED for part in inner.infolist()):
@@ -146,12 +180,9 @@ class Bundle:
             ) from None
 
     def _check(self) -> None:
-        about, end, actions = self.manifest, self.manifest["end"], self.arrays["actions"]
-        whole = (about["seed"], about["ticks_planned"], about["state_tick"], end["tick"])
-        texts = (about["environment"], about["observer"], about["dtype"], about["device"], end["error"])
-        valid = all(type(n) is int and 0 <= n < 2**63 for n in whole) and all(isinstance(t, str) for t in texts)
-        if not valid or about["state_tick"] > end["tick"]:
-            raise DataError(f"{self.path}: manifest.json: a number or text is not what it should be")
+        actions = self.arrays["actions"]
+        if self.manifest.state_tick > self.manifest.end.tick:
+            raise DataError(f"{self.path}: manifest.json: state_tick: later than the end")
         if actions.ndim != 3 or actions.dtype.kind != "f" or not (np.abs(actions) <= 1.0).all():
             raise DataError(
                 f"{self.path}: arrays.npz: actions: expected numbers from -1 to 1, decisions x vehicles x parts"
@@ -161,16 +192,11 @@ class Bundle:
     def title(self) -> str:
         """What ran."""
         about = self.manifest
-        return f"{about['environment']}, {about['observer']}, seed {about['seed']}, {about['end']['tick']} ticks"
-
-    @property
-    def by_driver(self) -> bool:
-        """Whether the error was the driver's, which is not replayed."""
-        return bool(self.manifest["end"].get("by_driver"))
+        return f"{about.environment}, {about.observer}, seed {about.seed}, {about.end.tick} ticks"
 
     def other_versions(self) -> list[str]:
         """Return what the run was made with and what is different here."""
-        here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest["versions"]
+        here, made = versions("coopenv", "numpy", "warp-lang"), self.manifest.versions
         return [f"{name} {made.get(name)}, here {number}" for name, number in here.items() if made.get(name) != number]
 
     def replay(self) -> list[str]:
@@ -179,31 +205,32 @@ class Bundle:
         Raises:
             CoopenvError: the scenario is not valid, or its observer is not there.
         """
-        about, end = self.manifest, self.manifest["end"]
+        about, end = self.manifest, self.manifest.end
         raw = located(self._with_observer(), Path(), self._here)
         scenario = parse_scenario(raw, f"{self.path.name}: scenario.json")
         drivers = [f"vehicles.{i}.motion.driver" for i, driver in enumerate(scenario.drivers) if driver is not None]
         scenario = load_scenario(scenario, dict.fromkeys(drivers))  # their actions are in the file
         rows = iter(self.arrays["actions"])
-        run = Rollout(scenario, about["seed"], None, about["dtype"], about["device"], lambda observations: next(rows))
+        run = Rollout(scenario, about.seed, None, about.dtype, about.device, lambda observations: next(rows))
         expected = (len(scenario.vehicles), run.engine.world.model.action_size)
         actions = self.arrays["actions"]
-        if actions.shape[1:] != expected or len(actions) * scenario.ticks_per_decision < end["tick"]:
+        if actions.shape[1:] != expected or len(actions) * scenario.ticks_per_decision < end.tick:
             raise DataError(f"{self.path}: arrays.npz: actions: expected {expected} per decision")
-        run.ticks_planned, error, last, differing = about["ticks_planned"], "", 0, []
+        run.ticks_planned, error, last, differing = about.ticks_planned, "", 0, []
         try:
             for last in run.play():
-                if last == about["state_tick"]:
+                if last == about.state_tick:
                     differing += self._differing_state(run)
         except CoopenvError as failure:
             error = str(failure)
-        if kernels := [n for n, digest in kernel_hashes().items() if about["kernels"].get(n, digest) != digest]:
+        if kernels := [n for n, digest in kernel_hashes().items() if about.kernels.get(n, digest) != digest]:
             differing.append(f"kernels {listed(kernels)}")
-        if (last, error) != (end["tick"], "" if self.by_driver else end["error"]):
+        if (last, error) != (end.tick, "" if end.by_driver else end.error):
             differing.append(f"after tick {last}: {error or 'no error'}")
         for name, values in figures_of(run).items():
-            if not np.allclose(values, np.array(end["figures"][name], float), rtol=FIGURE_TOLERANCE, equal_nan=True):
-                differing.append(f"last {name.replace('_', ' ')} {', '.join(f'{value:.4g}' for value in values)}")
+            now, before = (np.array(some, float) for some in (values, end.figures.get(name)))
+            if now.shape != before.shape or not np.allclose(now, before, rtol=FIGURE_TOLERANCE, equal_nan=True):
+                differing.append(f"last {name.replace('_', ' ')} {', '.join(f'{value:.4g}' for value in now)}")
         return differing
 
     def _here(self, reference: str, folder: Path) -> str:
@@ -216,10 +243,10 @@ class Bundle:
 
     def _with_observer(self) -> dict[str, Any]:
         """Return the scenario with its observer, which is loaded from its file if it is in one."""
-        reference = self.manifest["observer"]
+        reference = self.manifest.observer
         if not is_reference(reference):
             return self.scenario
-        file, digest = Path(reference.rpartition(":")[0]), self.manifest["parts"].get("observer.py")
+        file, digest = Path(reference.rpartition(":")[0]), self.manifest.parts.get("observer.py")
         if len(file.parts) != 1 or not file.is_file() or sha256(file.read_bytes()).hexdigest() != digest:
             raise DataError(f"{self.path}: needs its observer.py here as {file.name}: unzip, read and rename it")
         return {**self.scenario, "observer": {**self.scenario.get("observer", {}), "name": named(reference)}}
@@ -232,5 +259,5 @@ class Bundle:
             n for n in now if n in before and (now[n].dtype, now[n].tobytes()) == (before[n].dtype, before[n].tobytes())
         ]
         changed = sorted({*now, *before}.difference(same)) if before else []
-        time = self.manifest["state_tick"] / run.scenario.rates.camera
+        time = self.manifest.state_tick / run.scenario.rates.camera
         return [f"state at {time:g} s: {listed(changed, 6)}"] if changed else []

@@ -73,6 +73,12 @@ def edited(file: Path, change: Callable[[dict[str, bytes]], None], sealed: bool 
     return "edited.zip"
 
 
+def lacking(parts: dict[str, bytes], key: str) -> None:
+    manifest = json.loads(parts["manifest.json"])
+    del manifest[key]
+    parts["manifest.json"] = json.dumps(manifest).encode()
+
+
 def arrays(parts: dict[str, bytes], pack: Callable[..., None] = np.savez, **changed: np.ndarray) -> None:
     buffer = io.BytesIO()
     pack(buffer, **{**np.load(io.BytesIO(parts["arrays.npz"])), **changed})
@@ -174,9 +180,12 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
         (lambda parts: arrays(parts, actions=np.zeros((4, 9, 2))), True, "actions: expected (1, 2) per decision"),
         (lambda parts: parts.update(more=b"x"), True, "not a run: parts more"),
         (lambda parts: parts.pop("arrays.npz") and None, True, "not a run: parts arrays.npz"),
-        (manifest("format", "coopenv-run 2"), True, "format 'coopenv-run 2', expected 'coopenv-run 1'"),
-        (manifest("seed", -1), True, "manifest.json: a number or text is not what it should be"),
-        (manifest("end", 3), True, "not a readable run"),
+        (manifest("format", "coopenv-run 2"), True, "format: Input should be 'coopenv-run 1', got 'coopenv-run 2'"),
+        (manifest("seed", -1), True, "manifest.json: seed: Input should be greater than or equal to 0"),
+        (manifest("end", 3), True, "manifest.json: end: "),
+        (manifest("kernels", 5), True, "manifest.json: kernels: "),
+        (lambda parts: lacking(parts, "versions"), True, "manifest.json: versions: Field required"),
+        (manifest("state_tick", 10**6), True, "manifest.json: state_tick: later than the end"),
         (lambda parts: parts.update({"scenario.json": b'{"horizon": -1}'}), True, "scenario.json: "),
         (lambda parts: parts.update({"manifest.json": bytes(2**20 + 1)}), False, "not a run: parts manifest.json"),
     ]

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
 from coopenv.cars.backend.assembler import Assembler
@@ -19,6 +21,8 @@ from coopenv.scenario import Scenario, load_scenario
 
 AHEAD = 100_000_000
 """ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""
+
+LONGEST_GAP = 600.0  # s without any message that is needed
 
 OFF = 0.1
 """Share by which the rate of a camera may differ from the environment's without a warning."""
@@ -78,6 +82,12 @@ class Bag(TickGenerator):
         end = needed[-1].stamp
         if self.map.duration is not None:
             end = min(end, begin + round(self.map.duration * NS))
+        stamps = np.array([begin, *(s.stamp for s in needed if begin < s.stamp < end), end])
+        gaps = np.diff(stamps)
+        if gaps.max() > LONGEST_GAP * NS:
+            after, silent = (stamps[np.argmax(gaps)] - begin) / NS, gaps.max() / NS
+            text = f"{self.where}: nothing for {silent:.4g} s after {after:.4g} s, as of a clock that was set"
+            raise DataError(f"{text}; start and duration in {self.map.path.name} choose a part")
         ticks = int((end - begin) * self._rate / NS + 0.5 + 1e-6) + 1  # the last one is half a period after its frame
         if end < begin or ticks < 2:
             span = max(0.0, (end - begin) / NS)

@@ -87,7 +87,7 @@ def delay_of(stamps: Times, received: Times) -> Delay:
     parts = np.array_split(np.arange(len(delays)), max(1, min(WINDOWS, len(delays) // LEAST)))
     low = np.array([np.sort(delays[part])[len(part) // 20] for part in parts])
     at = np.array([float(np.median(received[part] - middle)) for part in parts])
-    if len(parts) < LEAST:
+    if len(parts) < LEAST or np.ptp(at) == 0.0:
         return Delay(int(low.min()), 0.0, middle)
     level = (low - low[0]).astype(np.float64)
     slope, _, least, most = theilslopes(level, at)

@@ -7,12 +7,12 @@ from contextlib import suppress
 
 import numpy as np
 
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, printable
 from coopenv.cars.backend.assembler import BROADCAST
 from coopenv.cars.bags.clocks import checked
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import NS, TopicRow, regularity
-from coopenv.cars.bags.topic_map import READ
+from coopenv.cars.bags.topic_map import READ, TOPIC
 from coopenv.cars.profile import IMAGES, VELOCITY, Role
 from coopenv.cars.readings import POSES, READERS, read
 from coopenv.cars.vision import Calibration
@@ -71,7 +71,7 @@ def proposed(files: Sequence[BagFile], rows: Sequence[TopicRow]) -> str:
         lines += ['# vehicle = "vehicle_1" # of the environment (default: in the order of this file)', "[cars.topics]"]
         lines += [f'{role.value} = "{name}"' for role, name in topics.items()]
     kinds = [row for row in rows if row.topic not in used]
-    lines += ["", "# Not used:", *(f"#   {row.topic} ({row.type})" for row in kinds)] if kinds else []
+    lines += ["", "# Not used:", *(printable(f"#   {row.topic} ({row.type})") for row in kinds)] if kinds else []
     return "\n".join(lines) + "\n"
 
 
@@ -111,7 +111,7 @@ def _name(part: str) -> str:
 
 def role_of(row: TopicRow) -> Role | None:
     """Return the role of a topic by its type, and by its name where that leaves several."""
-    if COMMANDED.search(row.topic):
+    if COMMANDED.search(row.topic) or not re.match(TOPIC, row.topic):
         return None
     if row.type in POSES and CAPTURE.search(row.topic):
         return Role.TRUTH

@@ -24,6 +24,8 @@ METADATA, PACKED = "metadata.yaml", ".zstd"
 REPAIRS = {".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover", ".mcap": REPAIR}
 """By the suffix of bags that are files, the tool that mends one whose recording was cut off."""
 
+LATEST = 4 * 10**18  # ns, in 2096: sums of two such times fit into 64 bits
+
 
 class BagFile:
     """One bag, open; a context manager."""
@@ -134,7 +136,12 @@ class BagFile:
 
     def _raw(self, topics: Collection[str]) -> Iterator[tuple[Any, int, bytes]]:
         connections = [c for c in self._reader.connections if c.topic in topics]
-        return iter(self._reader.messages(connections) if connections else ())
+        for connection, received, data in self._reader.messages(connections) if connections else ():
+            if isinstance(data, bytes) and isinstance(received, int) and 0 <= received < LATEST:
+                yield connection, received, data
+            else:
+                text = f"topic {connection.topic}: messages are left out that are no bytes or were received after 2096"
+                warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
 
     def _warn_damaged(self) -> None:
         for part in self._parts:

@@ -44,7 +44,8 @@ def patterns_of(names: str, make: CarProfile) -> dict[Role, tuple[str, ...]]:
     return found
 
 
-TopicName = Annotated[str, Field(max_length=256, pattern=r"^/[A-Za-z0-9_/~]+$")]
+TOPIC = r"^/[A-Za-z0-9_/~]{1,255}$"
+TopicName = Annotated[str, Field(pattern=TOPIC)]
 
 
 class TopicMapError(CoopenvError):

@@ -279,6 +279,26 @@ def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_envi
     assert bag.log.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.lenses
 
 
+def test_a_clock_that_was_set_leaves_a_gap_that_is_named(tmp_path: Path) -> None:
+    day, drive = 86_400 * 10**9, sorted(short(), key=lambda message: message.received)
+    half = drive[len(drive) // 2].received
+    later = [
+        m if m.received < half else replace(m, received=m.received + day, stamp=m.stamp + day if m.stamp else 0)
+        for m in drive
+    ]
+    with pytest.raises(DataError, match=r"drive: nothing for 8\.64e\+04 s after .* start and duration in topics\.toml"):
+        opened(tmp_path, MAP, later, "mcap")
+    (tmp_path / "part").mkdir()
+    part = opened(tmp_path / "part", f"duration = 0.1\n{MAP}", later, "mcap")
+    assert part.capabilities.ticks == 7
+
+
+def test_messages_at_impossible_times_are_left_out(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / "late", [*short()[:-1], replace(short()[-1], received=2**62)], "sqlite3")
+    with BagFile(path) as bag, pytest.warns(DataWarning, match="that are no bytes or were received after 2096"):
+        assert sum(len(received) for _, received in bag.times().values()) == len(short()) - 1
+
+
 def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     turning = {"angular_velocity": (0.0, 0.0, 0.7), "linear_acceleration": (0.0, 0.0, 9.8)}
     wheels = [m for m in short() if "twist" in m.topic]
