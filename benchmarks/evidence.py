@@ -105,7 +105,7 @@ def changed(recording: Recording, fault: str, seed: int) -> Recording:
 
 
 def scenes(seeds: Sequence[int], jobs: int) -> str:
-    """Return the table of the parametric scenes: ratio of the RMSE to the ancestors' bound, and ANEES/6."""
+    """Return the table of the parametric scenes: ratio of the RMSE to the ancestors' bound, and ANEES."""
     rows = []
     for scene in SCENES:
         found = coopenv.compare(OBSERVERS, scene, seeds, overrides={"horizon": HORIZON}, windows=WINDOWS, jobs=jobs)
@@ -120,7 +120,7 @@ def scenes(seeds: Sequence[int], jobs: int) -> str:
             cells += [in_parentheses(row.anees, row.anees_se) for row in (own[0], own[-1])]
             rows.append([f"`{scene}`", f"`{observer}`", *cells])
             print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
-    heads = ["scene", "observer", "5-10 s: median", "worst", "after 35 s: median", "worst", "ANEES/6: least", "largest"]
+    heads = ["scene", "observer", "5-10 s: median", "worst", "after 35 s: median", "worst", "ANEES: least", "largest"]
     return table(heads, rows)
 
 

@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("error: expected an even number of seeds, 4 at least, and 5 s at least", file=sys.stderr)
         return 2
     cases = [(scene, point, variance) for variance in (False, True) for scene in SCENES for point in POINTS]
-    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES/3\n"])
+    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
     results = {}
     with Progress(Console(stderr=True), "simulating", total=len(cases)) as progress:
         for done, (scene, point, variance) in enumerate(cases):

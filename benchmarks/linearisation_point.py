@@ -54,7 +54,7 @@ def patch(share: float, time: float) -> None:
 
 
 def measure(point: str, time: float, worlds: int) -> dict[str, list[float]]:
-    """Return per scene the range bias, m, its standard error, ANEES/6 of the second vehicle and its standard error."""
+    """Return per scene the range bias, m, its standard error, ANEES of the second vehicle and its standard error."""
     patch(POINTS[point], time)
     from coopenv.backends.simulated import Simulated
     from coopenv.estimation.metrics import nees
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(measure(asked.variant[0], float(asked.variant[1]), asked.worlds)))
         return 0
     cases = [(point, time) for time in TIMES for point in POINTS]
-    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES/6\n"])
+    table = number_table(["\nscene", "\nlinearised at", "\nvariance"], ["range bias\n[cm]", "ANEES\n"])
     with Progress(Console(stderr=True), "simulating", total=len(cases)) as progress:
         for done, (point, time) in enumerate(cases):
             progress.update(done)

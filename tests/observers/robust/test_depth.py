@@ -34,7 +34,7 @@ SCENES: dict[str, tuple[str, dict[str, Any]]] = {
     ),
 }
 EXPECTED = {"a turned camera": (0.7, 1.2)}
-"""Least and most of ANEES / 6 where the errors that are estimated with the pose are not small."""
+"""Least and most of ANEES where the errors that are estimated with the pose are not small."""
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -135,7 +135,7 @@ def test_how_sure_it_is_in_other_worlds(title: str) -> None:
         f"{100 * errors[k].max():.1f}"
         for k, n in enumerate(worst)
     ]
-    print(f"\n{title}: ANEES/6 least .. worst, error median and largest, cm: " + " | ".join(parts))
+    print(f"\n{title}: ANEES least .. worst, error median and largest, cm: " + " | ".join(parts))
     assert (mean > 0.3).all() and (mean < 3.0).all()
 
 
@@ -174,7 +174,7 @@ def test_nobody_in_a_lane_is_met_again() -> None:
 
 
 def meeting(worlds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ANEES/6 (W,), the position error (W,) in m and how often a member in view is marked, sixteen cars."""
+    """Return ANEES (W,), the position error (W,) in m and how often a member in view is marked, sixteen cars."""
     found, marked = [], []
     for engine in steps_of("route_follower", load_scenario("large_crossing", ROBUST), worlds, 3):
         found.append(nees_of(engine.world))
@@ -186,11 +186,11 @@ def meeting(worlds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 def test_cars_that_meet_again_and_again_know_how_well_they_stand() -> None:
-    """Their ANEES/6 grew up to 3 and more while strangers' errors counted as independent."""
+    """Their ANEES grew up to 3 and more while strangers' errors counted as independent."""
     nees, errors, marked = meeting(16)
     mean, std = nees.mean(), nees.std() / np.sqrt(len(nees))
     print(
-        f"\nlarge_crossing: ANEES/6 {mean:.2f} +- {std:.2f}, {100 * errors.mean():.0f} cm, marked {marked.mean():.3f}"
+        f"\nlarge_crossing: ANEES {mean:.2f} +- {std:.2f}, {100 * errors.mean():.0f} cm, marked {marked.mean():.3f}"
     )
     assert marked.max() > 0.0
     assert mean - 2.0 * std < 1.3
@@ -285,7 +285,7 @@ def consistency(drawn: Drawn) -> np.ndarray:
 
 
 def test_noise_of_odometry_is_no_error_of_its_scale() -> None:
-    """Four vehicles, a third as much noise as speed: the scale seemed to be off by a sixth, ANEES/6 was 3.4."""
+    """Four vehicles, a third as much noise as speed: the scale seemed to be off by a sixth, ANEES was 3.4."""
     anees = np.nanmean(consistency(draw(557)), axis=1)
     assert (anees > 0.4).all() and (anees < 1.6).all(), anees
 
@@ -299,7 +299,7 @@ def test_it_is_consistent_in_scenes_that_nobody_chose() -> None:
         anees = np.nanmean(consistency(drawn), axis=1)
         typical.append(np.nanmedian(anees, axis=1))
         worst.append(np.nanmax(anees, axis=1))
-        print(f"\n{number} {drawn.name}: largest ANEES/6 {worst[-1].round(2)}, median {typical[-1].round(2)}", end="")
+        print(f"\n{number} {drawn.name}: largest ANEES {worst[-1].round(2)}, median {typical[-1].round(2)}", end="")
     print(f"\nmedian over scenes of the median {np.median(typical, axis=0).round(2)}", end="")
     print(f", of the largest {np.median(worst, axis=0).round(2)}; above 2: {(np.array(worst) > 2.0).mean(axis=0)}")
     assert (np.abs(np.median(typical, axis=0) - 1.0) < 0.2).all()

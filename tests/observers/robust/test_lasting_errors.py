@@ -68,14 +68,14 @@ def driven(
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_hard_turns_are_in_the_covariance(dtype: str) -> None:
-    """Samples of odometry that are held lag behind: with a lag of half a period ANEES/6 would be 1.86."""
+    """Samples of odometry that are held lag behind: with a lag of half a period ANEES would be 1.86."""
     nees, errors, _ = driven(square(), turning_hard, 48, dtype, 14)
     assert 0.8 < np.nanmean(nees[30:]) < 1.2
     assert np.nanpercentile(errors[80:], 95) < 0.03
 
 
 def test_cars_that_see_little_but_each_other_are_consistent() -> None:
-    """With covariances left about poses before their correction ANEES/6 would be 1.6, at worst 80."""
+    """With covariances left about poses before their correction ANEES would be 1.6, at worst 80."""
     nees, _, _ = driven(square(), weaving, 96, "float32", 12)
     assert 0.8 < np.nanmean(nees[30:]) < 1.35
     assert np.nanmean(nees[30:] > 5.0) < 3e-3
@@ -92,10 +92,10 @@ def still(world: World, k: int, phase: np.ndarray) -> float:
 
 
 def tell(name: str, lasting: dict[str, Any], nees: np.ndarray, errors: np.ndarray) -> None:
-    """Print ANEES / 6 with its standard error over worlds and the 95th percentile of position errors (`pytest -s`)."""
+    """Print ANEES with its standard error over worlds and the 95th percentile of position errors (`pytest -s`)."""
     worlds, e95 = np.nanmean(nees, axis=(0, 2)), 100.0 * np.nanpercentile(errors, 95)
     std = np.nanstd(worlds) / np.sqrt(len(worlds))
-    print(f"\n{name}, {lasting or 'none'}: ANEES/6 {worlds.mean():.2f} +- {std:.2f}, e95 {e95:.0f} cm")
+    print(f"\n{name}, {lasting or 'none'}: ANEES {worlds.mean():.2f} +- {std:.2f}, e95 {e95:.0f} cm")
 
 
 def normalised_errors(world: World) -> np.ndarray:
@@ -195,7 +195,7 @@ def test_figures_in_other_worlds(name: str) -> None:
     seeds = range(700, 732)
     nees, error, _ = judged(name, seeds, 10, 40)
     without, good, _ = judged(name, seeds, 10, 40, **{"camera.extrinsics_error": 0.0})
-    print(f"\n{name}: ANEES/6 {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
+    print(f"\n{name}: ANEES {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
     assert (nees.mean(axis=0) < 2.5).all()
 
 

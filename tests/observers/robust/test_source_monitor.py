@@ -221,7 +221,7 @@ def test_a_step_in_an_own_sensor_of_all_vehicles_costs_little(
 
 
 def test_a_scale_that_keeps_changing_becomes_a_scale_that_walks() -> None:
-    """At 25 m/s by 10 % in 30 s, with landmarks all along; as a constant found anew every 3 s: 0.2 m, ANEES/6 14."""
+    """At 25 m/s by 10 % in 30 s, with landmarks all along; as a constant found anew every 3 s: 0.2 m, ANEES 14."""
     found = watch(changed(parametric(road), "scale_drift=0.1", 50))
     assert found.source["exclusions"][-1, 0, VELOCITY] == 2
     assert found.run.position_rmse(15.0)[0] < 0.1
