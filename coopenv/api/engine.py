@@ -99,8 +99,9 @@ class Engine:
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
         scripted = load_reference("coopenv.policies.loader:ScriptedVehicles")  # policies stand on environments
-        self.scripted: Any = scripted(scenario) if any(scenario.drivers) else None
-        """Drivers in place of actions; None without any."""
+        recorded = self.backend.capabilities.recorded
+        self.scripted: Any = scripted(scenario) if any(scenario.drivers) and not recorded else None
+        """Drivers in place of actions; None without any, and of a record, which must name no code."""
         self.begun = False
         """Whether every world has been reset, or restored from one that had."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, PositiveFloat, ValidationError
 
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, printable, shown, suggest
@@ -46,7 +46,7 @@ class NetworkColumn(BaseModel):
 class NetworkCard(BaseModel):
     """The table `network` of an `agent.toml`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     weights: str
     """File in the agent's folder."""
@@ -54,7 +54,7 @@ class NetworkCard(BaseModel):
     """Of the file."""
     layout: str
     """`layout_hash` of the three tables below."""
-    clip: float
+    clip: PositiveFloat
     """Normalised observations are clipped to it."""
     observation: dict[str, NetworkColumn]
     action: dict[str, NetworkColumn]

@@ -35,13 +35,13 @@ FIGURE_TOLERANCE = 1e-6
 """Relative, of figures that count as the same: other processors round differently."""
 
 
-Tick = Annotated[int, Field(ge=0, lt=2**31)]
+Count = Annotated[int, Field(ge=0)]
 
 
 class RunEnd(Section):
     """How a run ended."""
 
-    tick: Tick
+    tick: Count
     error: str
     """Empty: none."""
     by_driver: bool = False
@@ -55,16 +55,16 @@ class Manifest(Section):
 
     format: Literal["coopenv-run 1"] = "coopenv-run 1"
     environment: str
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    seed: Count
     policy: str
     observer: str
     dtype: str
     device: str
-    ticks_planned: Tick
+    ticks_planned: Count
     versions: dict[str, str]
     kernels: dict[str, str]
     """Hashes of the modules of kernels, by name."""
-    state_tick: Tick
+    state_tick: Count
     """Of the state that is kept."""
     end: RunEnd
     parts: dict[str, str]
@@ -207,13 +207,15 @@ class Bundle:
         """
         about, end = self.manifest, self.manifest.end
         raw = located(self._with_observer(), Path(), self._here)
+        if isinstance(raw.get("sumo"), dict) and raw["sumo"].get("options"):
+            raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
         scenario = parse_scenario(raw, f"{self.path.name}: scenario.json")
         drivers = [f"vehicles.{i}.motion.driver" for i, driver in enumerate(scenario.drivers) if driver is not None]
         scenario = load_scenario(scenario, dict.fromkeys(drivers))  # their actions are in the file
-        rows = iter(self.arrays["actions"])
-        run = Rollout(scenario, about.seed, None, about.dtype, about.device, lambda observations: next(rows))
-        expected = (len(scenario.vehicles), run.engine.world.model.action_size)
         actions = self.arrays["actions"]
+        rows, none = iter(actions), np.zeros(actions.shape[1:])
+        run = Rollout(scenario, about.seed, None, about.dtype, about.device, lambda observations: next(rows, none))
+        expected = (len(scenario.vehicles), run.engine.world.model.action_size)
         if actions.shape[1:] != expected or len(actions) * scenario.ticks_per_decision < end.tick:
             raise DataError(f"{self.path}: arrays.npz: actions: expected {expected} per decision")
         run.ticks_planned, error, last, differing = about.ticks_planned, "", 0, []
@@ -221,6 +223,8 @@ class Bundle:
             for last in run.play():
                 if last == about.state_tick:
                     differing += self._differing_state(run)
+                if last > end.tick:
+                    break
         except CoopenvError as failure:
             error = str(failure)
         if kernels := [n for n, digest in kernel_hashes().items() if about.kernels.get(n, digest) != digest]:

@@ -7,6 +7,7 @@ https://sumo.dlr.de/docs/Simulation/Shapes.html. Coordinates are SUMO's, m; heig
 import gzip
 import json
 import math
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -239,7 +240,7 @@ def _reading(path: Path, key: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise ScenarioError(f"{key}: {shown(str(path))}: {error.strerror or error}") from None
-    except (ParseError, EOFError) as error:
+    except (ParseError, EOFError, zlib.error) as error:
         raise ScenarioError(f"{key}: {path.name}: not XML: {error}") from None
     except (KeyError, ValueError, IndexError) as error:
         raise ScenarioError(f"{key}: {path.name}: an element lacks or spoils an attribute: {error}") from None

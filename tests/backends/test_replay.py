@@ -116,6 +116,15 @@ def test_observers_in_the_replay_do_as_in_the_runner(observer: str) -> None:
             assert_allclose(estimate["rotation"], result.rotation[step * k, i], atol=1e-9)
 
 
+def test_a_record_runs_no_code_of_a_driver(tmp_path: Path) -> None:
+    code = tmp_path / "mine.py"
+    code.write_text("def drive(observations):\n    return [[0.1, 0.1]] * len(observations)\n")
+    driven = {"vehicles.0.motion.driver": f"{code}:drive", "horizon": 1.0}
+    write_recording(record(coopenv.load_scenario("facade", driven)), tmp_path / "drive.mcap")
+    code.write_text("raise RuntimeError('code of a record runs')\n")
+    assert coopenv.run(tmp_path / "drive.mcap").metrics["policy"] == "recorded"
+
+
 def test_actions_and_seeds_change_nothing(data: Path) -> None:
     env = replayed(robots(data))
     for first, second in zip(play(env, 1), play(env, 2), strict=True):

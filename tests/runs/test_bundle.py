@@ -146,6 +146,12 @@ def test_a_driver_that_a_scenario_names_is_replayed_without_its_code(
     assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
 
 
+def test_large_seeds_are_replayed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(run("--steps", "4", "--seed", str(2**80))) == 0 and main(["bundle", "run"]) == 0
+    capsys.readouterr()
+    assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+
+
 def test_a_run_is_replayed_and_differences_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(run("--steps", "30")) == 0 and main(["bundle", "run"]) == 0
     assert main(["run", "run.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
@@ -185,6 +191,7 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
         (manifest("end", 3), True, "manifest.json: end: "),
         (manifest("kernels", 5), True, "manifest.json: kernels: "),
         (lambda parts: lacking(parts, "versions"), True, "manifest.json: versions: Field required"),
+        (manifest("ticks_planned", 10**12), True, "another result than that of the file: after tick 13: no error"),
         (manifest("state_tick", 10**6), True, "manifest.json: state_tick: later than the end"),
         (lambda parts: parts.update({"scenario.json": b'{"horizon": -1}'}), True, "scenario.json: "),
         (lambda parts: parts.update({"manifest.json": bytes(2**20 + 1)}), False, "not a run: parts manifest.json"),

@@ -137,10 +137,10 @@ class BagFile:
     def _raw(self, topics: Collection[str]) -> Iterator[tuple[Any, int, bytes]]:
         connections = [c for c in self._reader.connections if c.topic in topics]
         for connection, received, data in self._reader.messages(connections) if connections else ():
-            if isinstance(data, bytes) and isinstance(received, int) and 0 <= received < LATEST:
+            if 0 <= received < LATEST:
                 yield connection, received, data
             else:
-                text = f"topic {connection.topic}: messages are left out that are no bytes or were received after 2096"
+                text = f"topic {connection.topic}: messages are left out that were received after 2096"
                 warnings.warn(f"{self.path}: {text}", DataWarning, stacklevel=3)
 
     def _warn_damaged(self) -> None:

@@ -102,7 +102,7 @@ class _File(apsw.VFSFile):
         return data
 
 
-VFS = "coopenv-bags"
+VFS, TABLES = "coopenv-bags", ("topics", "messages", "message_definitions")
 
 
 class _Files(apsw.VFS):
@@ -119,6 +119,9 @@ def _of_sqlite3(path: Path, _: Allowance) -> Entries:
     database.limit(apsw.SQLITE_LIMIT_LENGTH, container.AT_ONCE)
     try:
         database.pragma("writable_schema", True)  # or it refuses files that are shorter than their header states
+        for name, kind, text in database.execute("SELECT name, type, sql FROM sqlite_schema WHERE type != 'index'"):
+            if name.lower() in TABLES and (kind != "table" or "VIRTUAL" in text.upper()):
+                raise ValueError(f"{name} is no table")  # but a query, which may have no end
         texts: dict[str, tuple[str, str]] = {}
         if database.table_exists(None, "message_definitions"):
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -127,7 +130,9 @@ def _of_sqlite3(path: Path, _: Allowance) -> Entries:
         for key, name, kind in database.execute("SELECT id, name, type FROM topics"):
             topics[key] = about = (name, kind, *texts.get(kind, ("", "")))
             yield about, 0, None
-        for topic, received, data in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+        sound = "typeof(data) = 'blob' AND typeof(timestamp) = 'integer'"  # others are damaged
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE {sound} ORDER BY id"
+        for topic, received, data in database.execute(query):
             yield topics[topic], received, data
     finally:
         database.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sqlite3
 import tracemalloc
 import warnings
 from collections.abc import Callable
@@ -295,8 +296,23 @@ def test_a_clock_that_was_set_leaves_a_gap_that_is_named(tmp_path: Path) -> None
 
 def test_messages_at_impossible_times_are_left_out(tmp_path: Path) -> None:
     path = bags.write(tmp_path / "late", [*short()[:-1], replace(short()[-1], received=2**62)], "sqlite3")
-    with BagFile(path) as bag, pytest.warns(DataWarning, match="that are no bytes or were received after 2096"):
+    with BagFile(path) as bag, pytest.warns(DataWarning, match="left out that were received after 2096"):
         assert sum(len(received) for _, received in bag.times().values()) == len(short()) - 1
+
+
+def test_a_database_whose_messages_are_a_query_or_damaged(tmp_path: Path) -> None:
+    path = next(bags.write(tmp_path / "bag", short(), "sqlite3").glob("*.db3"))
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET data = 5 WHERE id = 9")
+        database.execute("UPDATE messages SET timestamp = 1.5e300 WHERE id = 10")
+    with BagFile(path) as bag:
+        assert sum(len(received) for _, received in bag.times().values()) == len(short()) - 2
+    with sqlite3.connect(path) as database:
+        database.execute("ALTER TABLE messages RENAME TO kept")
+        endless = "WITH RECURSIVE more(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM more) SELECT n FROM more"
+        database.execute(f"CREATE VIEW Messages AS SELECT kept.* FROM kept, ({endless})")
+    with pytest.raises(DataError, match="Messages is no table"):
+        BagFile(path)
 
 
 def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:

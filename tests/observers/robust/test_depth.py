@@ -189,9 +189,7 @@ def test_cars_that_meet_again_and_again_know_how_well_they_stand() -> None:
     """Their ANEES grew up to 3 and more while strangers' errors counted as independent."""
     nees, errors, marked = meeting(16)
     mean, std = nees.mean(), nees.std() / np.sqrt(len(nees))
-    print(
-        f"\nlarge_crossing: ANEES {mean:.2f} +- {std:.2f}, {100 * errors.mean():.0f} cm, marked {marked.mean():.3f}"
-    )
+    print(f"\nlarge_crossing: ANEES {mean:.2f} +- {std:.2f}, {100 * errors.mean():.0f} cm, marked {marked.mean():.3f}")
     assert marked.max() > 0.0
     assert mean - 2.0 * std < 1.3
 
