@@ -167,7 +167,7 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _follow(self) -> None:
         """Put the vehicles of the world where the cars are."""
         origin = np.array(self._world.scenario.map.origin)
-        self._world.programs[0].present = poses_of(self._cars, self.highway.road, origin, self._most)
+        self._world.programs[0].present = poses_of(self._cars, self.highway.road, origin)
 
     def _observe(self, observe: Any) -> Any:
         """Return the observation that highway-env makes when all cars have their estimated poses."""

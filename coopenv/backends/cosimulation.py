@@ -3,7 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from dataclasses import fields as dataclass_fields
 from pkgutil import resolve_name
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from coopenv.backends.cosimulation_kernels import COSIMULATED, cosimulation_struct
 from coopenv.backends.simulated import Simulated, SimulatedWorld
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.installation import blamed, load_reference
 from coopenv.estimation.poses import Array, about_z
 from coopenv.scenario import Scenario
@@ -23,7 +24,7 @@ from coopenv.world.state import allocate, fields
 
 @dataclass(frozen=True)
 class Poses:
-    """Where N vehicles and Z other bodies are on the plane, map frame; of an absent body nothing but `half` counts."""
+    """Where N vehicles and Z other bodies, up to `most_vehicles`, are on the plane, map frame; all of it finite."""
 
     xy: Array  # (N, 2) m
     heading: Array  # (N,) rad, from x towards y
@@ -33,8 +34,16 @@ class Poses:
     left: Array  # (N,) bool, has left the road for good
     traffic_position: Array  # (Z, 3) centres of boxes, m
     traffic_heading: Array  # (Z,) rad
-    traffic_half: Array  # (Z, 3) half of their edges, m; zero: absent
+    traffic_half: Array  # (Z, 3) half of their edges, m
     driven: Array | bool = False  # (N,) bool, moved by commands and `[dynamics]`: poses count at the start only
+
+
+AXES: Mapping[str, tuple[int, ...]] = {field.name: () for field in dataclass_fields(Poses)} | {
+    "xy": (2,),
+    "traffic_position": (3,),
+    "traffic_half": (3,),
+}
+"""Axes after N or Z."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +140,7 @@ class CosimulatedWorld(SimulatedWorld):
                 key = [int(seeds[w]), (int(episodes[w]) + 1) % 2**32]
                 self.programs[w].reset(int(np.random.SeedSequence(key).generate_state(1)[0]))
             for w in chosen:
-                poses = self.programs[w].poses()
+                poses = self._poses(w)
                 self._put(w, poses, np.zeros_like(poses.xy), np.zeros_like(poses.heading))
         super().restart()
 
@@ -143,7 +152,7 @@ class CosimulatedWorld(SimulatedWorld):
             for w, now in moments.items():
                 self.programs[w].command(now)
             for w, now in moments.items():
-                self._carry(w, now, self.programs[w].poses())
+                self._carry(w, now, self._poses(w))
         return True
 
     def _blamed(self) -> Any:
@@ -165,6 +174,25 @@ class CosimulatedWorld(SimulatedWorld):
             speed=self._copy("speed", world),
             yaw_rate=self._copy("angular_velocity", world)[L:, 2],
         )
+
+    def _poses(self, world: int) -> Poses:
+        """Return what a program states, checked, with absent bodies up to the most that there can be."""
+        poses, most = self.programs[world].poses(), self.model.traffic
+        if not isinstance(poses, Poses):
+            raise CoopenvError(f"{type(self.programs[world]).__name__}.poses: expected Poses, got {shown(poses)}")
+        others, found = len(poses.traffic_half), {}
+        if others > most:
+            section = self.scenario.backend
+            raise CoopenvError(f"{section}.most_vehicles: {most} are too few, there are {others} on the road")
+        for name, axes in AXES.items():
+            value, own = np.asarray(getattr(poses, name), float), not name.startswith("traffic")
+            value = np.full(self.model.vehicles, value) if name == "driven" and not value.ndim else value
+            shape = (self.model.vehicles if own else others, *axes)
+            if value.shape != shape or not np.isfinite(value).all():
+                got = value.shape if value.shape != shape else "others"
+                raise CoopenvError(f"poses: {name}: expected finite numbers of shape {shape}, got {got}")
+            found[name] = value if own else np.concatenate([value, np.zeros((most - others, *axes))])
+        return replace(poses, **found)
 
     def _carry(self, world: int, before: Moment, poses: Poses) -> None:
         """Put the vehicles of one world where they are at the next tick.

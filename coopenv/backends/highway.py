@@ -220,9 +220,8 @@ class Simulation(TrafficProgram):
         self._call("step", tuple(action for action, driven in zip(actions, self._driven, strict=True) if driven))
 
     def poses(self) -> Poses:
-        """Return the poses of all vehicles; errors as for `poses_of`."""
-        assert self._scenario.highway is not None
-        return poses_of(self._cars, self.environment.road, self._origin, self._scenario.highway.most_vehicles)
+        """Return the poses of all vehicles."""
+        return poses_of(self._cars, self.environment.road, self._origin)
 
     def _call(self, method: str, *arguments: Any, **options: Any) -> None:
         try:
@@ -231,20 +230,12 @@ class Simulation(TrafficProgram):
             raise CoopenvError(f"highway-env: {method}: {error_text(error)}") from error
 
 
-def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:
-    """Return where some cars of a road are, and everything else on it, in a map whose origin is at `origin` (3,).
-
-    Raises:
-        CoopenvError: there are more than `most` other things.
-    """
+def poses_of(cars: Sequence[Any], road: Any, origin: Array) -> Poses:
+    """Return where some cars of a road are, and everything else on it, in a map whose origin is at `origin` (3,)."""
     here, own = {id(car) for car in road.vehicles}, {id(car) for car in cars}
     others = [car for car in road.vehicles if id(car) not in own] + [thing for thing in road.objects if thing.solid]
-    if len(others) > most:
-        raise CoopenvError(f"highway.most_vehicles: {most} are too few, there are {len(others)} on the road")
-    position, heading, half = np.zeros((most, 3)), np.zeros(most), np.zeros((most, 3))
-    for k, car in enumerate(others):
-        position[k] = (*flipped(car.position), HEIGHT / 2)
-        heading[k], half[k] = -car.heading, (car.LENGTH / 2, car.WIDTH / 2, HEIGHT / 2)
+    position = np.array([(*flipped(car.position), HEIGHT / 2) for car in others]).reshape(-1, 3)
+    half = np.array([(car.LENGTH / 2, car.WIDTH / 2, HEIGHT / 2) for car in others]).reshape(-1, 3)
     moving = np.array([id(car) in here for car in cars])
     return Poses(
         xy=np.array([flipped(car.position) for car in cars]) - origin[:2],
@@ -254,7 +245,7 @@ def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:
         crashed=np.array([car.crashed for car in cars]),
         left=~moving,
         traffic_position=position - origin,
-        traffic_heading=heading,
+        traffic_heading=np.array([-car.heading for car in others]),
         traffic_half=half,
     )
 

@@ -163,16 +163,9 @@ class Sumo(TrafficProgram):
         own, others = self._answer()
         left = np.isnan(own[:, 0])
         self._last = own
-        most = self._section.most_vehicles
-        if len(others) > most:
-            raise CoopenvError(f"sumo.most_vehicles: {most} are too few, there are {len(others)} on the road")
-        heading, traffic_heading = np.radians(90.0 - own[:, 2]), np.zeros(most)
-        position, half = np.zeros((most, 3)), np.zeros((most, 3))
-        traffic_heading[: len(others)] = np.radians(90.0 - others[:, 2])
-        half[: len(others)] = others[:, 3:] / 2
-        back = half[: len(others), :1] * _direction(traffic_heading[: len(others)])
-        position[: len(others), :2] = others[:, :2] - back - self._origin
-        position[:, 2] = half[:, 2]
+        heading, traffic_heading = (np.radians(90.0 - some[:, 2]) for some in (own, others))
+        half = others[:, 3:] / 2
+        position = others[:, :2] - half[:, :1] * _direction(traffic_heading) - self._origin
         xy = own[:, :2] - self._front[:, None] * _direction(heading) - self._origin
         return Poses(
             xy=np.where(left[:, None], 0.0, xy),
@@ -181,7 +174,7 @@ class Sumo(TrafficProgram):
             steering=np.zeros(len(own)),
             crashed=np.zeros(len(own), bool),
             left=left & ~self._taken,
-            traffic_position=position,
+            traffic_position=np.column_stack([position, half[:, 2]]),
             traffic_heading=traffic_heading,
             traffic_half=half,
             driven=self._taken,

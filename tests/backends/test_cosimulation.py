@@ -92,6 +92,40 @@ def test_programs_that_cannot_be_are_one_line(own: dict[str, Any]) -> None:
             coopenv.parallel_env(coopenv.scenario.parse_scenario({**own, "program": {**own["program"], **change}}, "c"))
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("poses.xy[0] = np.nan", r"poses: xy: expected finite numbers of shape \(2, 2\), got others"),
+        ("poses = replace(poses, xy=poses.xy[:1])", r"poses: xy: expected .* shape \(2, 2\), got \(1, 2\)"),
+        ("poses = replace(poses, speed=np.zeros((2, 1)))", r"poses: speed: expected .* \(2,\), got \(2, 1\)"),
+        ("poses = replace(poses, traffic_half=np.ones((2, 3)))", r"program\.most_vehicles: 1 are too few, there are 2"),
+        ("poses = None", r"Changed\.poses: expected Poses, got None"),
+    ],
+)
+def test_poses_that_are_none_are_one_line(own: dict[str, Any], tmp_path: Path, change: str, why: str) -> None:
+    more = f"""
+from dataclasses import replace
+
+class Changed(Circle):
+    def poses(self):
+        poses = super().poses()
+        {change}
+        return poses
+"""
+    (tmp_path / "changed.py").write_text(CODE + more)
+    program = {**own["program"], "code": f"{tmp_path}/changed.py:Changed"}
+    env = coopenv.parallel_env(coopenv.scenario.parse_scenario({**own, "program": program}, "circle"))
+    with pytest.raises(CoopenvError, match=why):
+        env.reset(seed=0)
+
+
+def test_other_bodies_may_be_fewer_than_there_can_be(own: dict[str, Any]) -> None:
+    program = {**own["program"], "most_vehicles": 3}
+    env = coopenv.parallel_env(coopenv.scenario.parse_scenario({**own, "program": program}, "circle"))
+    env.reset(seed=0)
+    assert env.engine.view("traffic_half")[0].tolist() == [[1.0] * 3, [0.0] * 3, [0.0] * 3]
+
+
 def test_a_recording_names_no_code_and_reads_no_files(own: dict[str, Any]) -> None:
     from coopenv.scenario.own_terms import without_own_terms
 

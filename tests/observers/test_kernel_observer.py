@@ -239,6 +239,9 @@ def test_it_is_compared_with_others() -> None:
         leaders = [(setup.targets >= 3).sum() for setup in recording.setups]
         assert_allclose(counted[1:, :, 1], np.arange(1, recording.ticks)[:, None] * leaders)
         assert (result.bytes_per_second > 0).all()
+    own = Embedded("mine_alone", estimate, start, send_nothing, Counter)
+    rows = coopenv.compare([own, "dead_reckoning"], "overtaking", 1, overrides={"horizon": 0.5}).rows
+    assert {row.observer for row in rows} == {"mine_alone", "dead_reckoning"} and not any(row.failure for row in rows)
 
 
 def test_a_saved_plug_in_goes_on() -> None:

@@ -280,6 +280,6 @@ def _observers(observers: Iterable[str | Factory] | None, source: RecordSource) 
         raise CoopenvError("observers: expected at least one name or class")
     names = [named(observer) for observer in given]
     for observer, name in zip(given, names, strict=True):
-        if find(observer) is not find(name):
+        if find(observer) != find(name):  # factories of kernels are made anew
             raise CoopenvError(f"two observers are named '{name}': register them under names of their own")
     return tuple(dict.fromkeys(names))
