@@ -1,6 +1,6 @@
 """Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -35,6 +35,22 @@ def ros1() -> Any:
 def _store(name: str) -> Any:
     with needing(f"messages of cars need an extra: {install_command('svea')}"):
         return message_types(name)
+
+
+def numbers_after_header(kind: str) -> list[str]:
+    """Return the types of the numbers of a stamped message in their order; none: it is unknown, or holds others."""
+
+    def numbers(of: str) -> Iterator[str]:
+        for _, (node, part) in ros2().fielddefs[of][1]:
+            if node.name == "NAME":
+                yield from numbers(part)
+            else:
+                yield part[0] if node.name == "BASE" else node.name
+
+    fields = ros2().fielddefs.get(kind, ("", []))[1]
+    if not fields or fields[0][1][1] != "std_msgs/msg/Header":
+        return []
+    return [*numbers(kind)][len([*numbers("std_msgs/msg/Header")]) :]
 
 
 def make(kind: str, **fields: Any) -> Any:

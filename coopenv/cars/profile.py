@@ -257,7 +257,11 @@ class CommandMessage(Section):
                 raise ValueError(f"{name}.field: {shown(channel.field)} is no float32 or float64 of neutral")
             if channel.change == 0.0:
                 raise ValueError(f"{name}.change: must not be 0")
+        if self.steering.field == self.speed.field:
+            raise ValueError(f"speed.field: {shown(self.speed.field)} is that of the steering")
         braking = self.brake.fields if self.brake else {}
+        if braking and all(value == self.neutral.get(name, ("", None))[1] for name, value in braking.items()):
+            raise ValueError("brake.fields: are those of a standing car, so they brake nothing")
         for field in braking:
             if field not in self.neutral:
                 raise ValueError(f"brake.fields: {shown(field)} is no field of neutral")
@@ -386,6 +390,20 @@ class CarProfile(Section):
                 raise ValueError(f"topics.{role.value}.type: the gate has {kind}")
         if any(self.topic_of("NAME", role) == self.topic_of("OTHER", role) for role in Role):
             raise ValueError("topics: a name is without {car}")
+        return self
+
+    @model_validator(mode="after")
+    def _sends_what_it_permits(self) -> Self:
+        """Refuse limits of which the message would cut off a part."""
+        hardest, sent = self.hardest, self.command
+        if min(hardest.speed, hardest.steering, hardest.acceleration, hardest.steering_rate) <= 0.0:
+            raise ValueError("hardest: speed, steering, acceleration and steering_rate must be above 0")
+        turn = hardest.steering
+        if sent.wheelbase is not None:
+            turn = hardest.speed * math.tan(hardest.steering) / sent.wheelbase
+        for name, channel, most in (("steering", sent.steering, turn), ("speed", sent.speed, hardest.speed)):
+            if most > (can := channel.full * sent.most) + SLACK:
+                raise ValueError(f"hardest: needs {most:.3g} of command.{name}, which has {can:.3g}")
         return self
 
     def topic_of(self, car: str, role: Role) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, listed, shown
+from coopenv.cars.codec import numbers_after_header
 from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.profile import GATE_TYPES, CarProfile, MotionCommand, Role, VisionSettings
 from coopenv.cars.vision import BEARINGS, FINDERS, UNIT, Calibration, Tag
@@ -305,6 +306,10 @@ def check_types(profile: CarProfile, where: str) -> None:
     for role, readers in READERS.items():
         if (kind := profile.topics[role].type) not in readers:
             raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} is none of {listed(list(readers))}")
+    kind, written = profile.topics[Role.MANUAL].type, [kind for kind, _ in profile.command.neutral.values()]
+    if (numbers := numbers_after_header(kind)) != written:
+        has = f"has {listed(numbers)} after its header" if numbers else "is no stamped message of numbers"
+        raise CoopenvError(f"{where}: profile: command.neutral: {listed(written)}, but topics.manual.type {kind} {has}")
 
 
 TRACKS = (

@@ -1,5 +1,6 @@
 """What vehicles sense, tick by tick: of one tick, and of a whole record."""
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -326,6 +327,10 @@ def check_tick(tick: Sensed, index: int, observer_init: ObserverInit) -> None:
     """
     if tick.index != index:
         raise CoopenvError(f"tick {index}: index: got {tick.index!r:.40}")
+    if not math.isclose(tick.dt, observer_init.dt, rel_tol=1e-6):
+        raise CoopenvError(f"tick {index}: dt: expected {observer_init.dt:.6g} s, got {tick.dt!r:.40}")
+    if tick.time is not None and not 0.0 <= tick.time <= LARGEST:
+        raise CoopenvError(f"tick {index}: time: expected s since the reset, got {tick.time!r:.40}")
     names = [name for name, spec in ARRAYS.items() if spec.axes[0] == "K" and name != "due"]
     given = {name: attrgetter(name)(tick) for name in names if tick.truth is not None or "." not in name}
     given = {name: value for name, value in given.items() if value is not None or name in MEASURED}

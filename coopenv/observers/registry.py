@@ -142,7 +142,7 @@ def named(observer: str | Factory) -> str:
     if not (row.embedded or callable(found)) or not NAME.fullmatch(name):
         raise CoopenvError(f"observer {shown(found)}: expected a name, or a class or function that has one")
     module = Path(place.rpartition(":")[0]).stem if place else _origin(row)[0]
-    full = f"{module.rpartition('.')[2]}.{name}"
+    full = f"{module.rpartition('.')[2].strip('_')}.{name}"  # main.NAME in a notebook
     for short in (name, full):
         replaced = _registered.get(short)
         if replaced == row:

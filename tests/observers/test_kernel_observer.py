@@ -319,6 +319,13 @@ def test_a_name_that_is_taken_comes_with_the_file(folder: Path) -> None:
         named("deep/yours.py:Mine")
 
 
+def test_a_class_of_a_notebook_may_have_the_name_of_one_in_a_file(folder: Path) -> None:
+    assert named("mine.py:Mine") == "Mine"
+    here = type("Mine", (DeadReckoning,), {"__module__": "__main__"})
+    assert named(here) == "main.Mine"
+    coopenv.parallel_env("overtaking", observer=here).reset(seed=0)
+
+
 def test_a_class_that_is_defined_once_more_takes_the_place_of_the_old_one() -> None:
     def defined() -> type:
         return type("Mine", (DeadReckoning,), {"__module__": __name__})

@@ -34,7 +34,7 @@ from coopenv.cars.readings import CarPose, Detections, Sample, Twist, Value, rea
 from coopenv.cars.vision import Calibration
 from coopenv.scenario.base import rotation_of
 
-NS = 1_000_000_000
+NS, IMU = 1_000_000_000, "sensor_msgs/msg/Imu"
 
 Delays = Mapping[str, int]
 """ns by which each source of a file is behind its recorder."""
@@ -358,7 +358,11 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     behind = {track.chosen.topic: seconds for track in tracks if (seconds := track.behind(clocks)) is not None}
     moves = moves_of(leads, chosen, tolerance / NS, fixed, behind)
     samples = _samples(tracks, clocks, moves) if moves else samples
-    notes = (*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves))
+    notes = [*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves)]
+    used, turning = {e.topic for e in chosen}, {e.car for e in chosen if e.role in (Role.IMU, Role.ODOMETRY)}
+    cars = [entry.car for entry in chosen if entry.role is Role.WHEEL and entry.car not in turning]
+    if cars and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used]):
+        notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
     added: dict[tuple[str, Role], tuple[str, float]] = {}
@@ -370,7 +374,7 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
         shift, topic = clocks.shifts.get(track.source), track.chosen.topic
         moved = moves.get(topic, 0) + (shift.added if shift else 0)
         added.setdefault((track.chosen.car, track.chosen.role), (topic, moved / NS))
-    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), notes, pixels, added, sent)
+    return BagLog(samples, rows_of(files, chosen, samples, clocks, tracks, leads), tuple(notes), pixels, added, sent)
 
 
 def _check(entry: Chosen, tracks: Sequence[Track], where: str) -> None:

@@ -322,6 +322,9 @@ def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     text = MAP.replace("agent = 8", 'agent = 8\ntopics = { imu = "/imu" }')
     *_, last = opened(tmp_path, text, [*short(), *imu], "mcap").episode(None, {})
     assert_allclose(last.angular_velocity, [[0.0, 0.0, 0.7]])
+    (tmp_path / "unread").mkdir()
+    with pytest.warns(DataWarning, match=r"turn rates of svea3 are the wheels'; unread: /imu, of type sensor_msgs"):
+        opened(tmp_path / "unread", MAP, [*short(), *imu], "mcap")
 
 
 def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from coopenv.cars.deployment import DeploymentError, Remote, load_deployment
 from coopenv.cars.gate.core import PERIOD, Gate, GateClock, read_drive, write_drive
 from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
+from coopenv.cars.readings import check_types
 from coopenv.cars.transport.base import Arrival
 from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
 from tests.helpers.hub import Hub
@@ -310,6 +311,13 @@ BAD_PROFILES = {
     "old commands": ("max_age = 0.15, urgent", "max_age = 0.2, urgent", "topics.command.max_age: needed, above 0 and"),
     "commands of any age": ("max_age = 0.15, urgent", "urgent", "topics.command.max_age: needed, above 0 and at most"),
     "a slash in front": ('"robots/{car}/imu', '"/robots/{car}/imu', "topics.imu.name: String should match"),
+    "one field for both": ('field = "speed"', 'field = "steering_angle"', "speed.field: 'steering_angle' is that of"),
+    "a limit that is cut off": (
+        "hardest = { speed = 1.0",
+        "hardest = { speed = 1.2",
+        "hardest: needs 1.2 of command.speed",
+    ),
+    "a limit below 0": ("steering_rate = 4.0", "steering_rate = -4.0", "steering_rate must be above 0"),
     "a number for a truth value": ("reverse = true", "reverse = 1", "hardest.reverse: Input should be a valid boolean"),
 }
 
@@ -324,7 +332,7 @@ def test_fields_hold_what_is_written_to_them(kind: str) -> None:
 
     def braking(value: float, neutral: float) -> CarProfile:
         fields = {**SVEA.command.neutral, "lamp": (kind, neutral)}
-        brake = {"fields": {"lamp": value}, "deceleration": 3.0}
+        brake = {"fields": {"lamp": value, "x": 1.0}, "deceleration": 3.0}
         return load_profile({"base": "svea", "command": {"neutral": fields, "brake": brake}})
 
     for value in HELD[kind]:
@@ -334,6 +342,23 @@ def test_fields_hold_what_is_written_to_them(kind: str) -> None:
         for values in ((value, 0), (0, value)):
             with pytest.raises(CoopenvError, match=rf"\.lamp: a field of type {kind} cannot be {value:g}"):
                 braking(*values)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"topics": {"manual": {"name": "{car}/cmd", "type": "geometry_msgs/msg/Twist"}}}, "is no stamped message of"),
+        (
+            {"command": {"neutral": {"linear_x": ["float64", 0], "angular_z": ["float64", 0]}}},
+            "has float64, float64, fl",
+        ),
+    ],
+)
+def test_what_the_gate_writes_is_the_message_of_the_car(change: dict[str, Any], why: str) -> None:
+    with pytest.raises(CoopenvError, match=rf"fleet\.toml: profile: command\.neutral: float64.*, but .* {why}"):
+        check_types(load_profile({"base": "diffdrive", **change}), "fleet.toml")
+    for name in ("svea", "diffdrive", str(ROVER)):
+        check_types(load_profile(name), name)
 
 
 @pytest.mark.parametrize("case", BAD_PROFILES)
