@@ -96,7 +96,7 @@ LINES_AND_FILES = {
     "evaluation": (495, 3),
     "observers": (11880, 47),
     "policies": (2050, 10),
-    "runs": (3498, 13),
+    "runs": (3502, 13),
     "scenario": (3770, 13),
     "training": (1726, 7),
     "viz": (4820, 19),

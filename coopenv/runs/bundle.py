@@ -20,7 +20,7 @@ from pydantic import Field
 from coopenv.base.errors import ActionError, CoopenvError, DataError, error_text, listed
 from coopenv.base.files import replacing_file
 from coopenv.base.format import json_text, jsonable, members_of
-from coopenv.base.installation import is_reference, versions
+from coopenv.base.installation import data_directory, is_reference, versions
 from coopenv.base.sections import Section, validated
 from coopenv.observers.registry import named, portable
 from coopenv.runs.rollouts import Rollout
@@ -240,7 +240,10 @@ class Bundle:
     def _here(self, reference: str, folder: Path) -> str:
         """Return the user's file of a term, program or network of the scenario: code of another place does not run."""
         place, colon, name = reference.rpartition(":")
-        file = folder.absolute() / Path(place if colon else name).name
+        given = Path(place if colon else name)
+        if given.resolve().is_relative_to(data_directory("envs").resolve()):  # shipped
+            return reference
+        file = folder.absolute() / given.name
         if not file.is_file():
             raise DataError(f"{self.path}: needs {file.name} here, which its scenario names: {reference}")
         return f"{file}{colon}{name if colon else ''}"

@@ -129,12 +129,12 @@ def _published(files: Sequence[BagFile], chosen: Collection[Chosen], given: Topi
             if entry.role is not Role.CAMERA_INFO or entry.car in found:
                 continue
             for _, _, decode in file.messages([entry.topic]):
-                message = decode()
-                if not np.any(getattr(message, "k", getattr(message, "K", 1.0))):
-                    text = f"{file.path}: topic {entry.topic}: says that the camera is not calibrated (k is zero)"
-                    warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
-                    break
                 try:
+                    message = decode()
+                    if not np.any(getattr(message, "k", getattr(message, "K", 1.0))):
+                        text = f"{file.path}: topic {entry.topic}: says that the camera is not calibrated (k is zero)"
+                        warnings.warn(f"{text}; the environment's calibration counts", DataWarning, stacklevel=4)
+                        break
                     value = read(Role.CAMERA_INFO, message, vision=given.vision)
                 except CoopenvError as error:
                     raise DataError(f"{file.path}: topic {entry.topic}: {error}") from None
@@ -361,7 +361,11 @@ def read_log(paths: Sequence[Path], given: TopicMap, binding: Binding) -> BagLog
     notes = [*_notes(tracks, clocks, given, drifts), *_lead_notes(tracks, clocks, given, leads, moves)]
     used, turning = {e.topic for e in chosen}, {e.car for e in chosen if e.role in (Role.IMU, Role.ODOMETRY)}
     cars = [entry.car for entry in chosen if entry.role is Role.WHEEL and entry.car not in turning]
-    if cars and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used]):
+    if (
+        cars
+        and given.odometry == "auto"
+        and (unread := [name for name, kind in topics.items() if kind == IMU and name not in used])
+    ):
         notes.append(f"turn rates of {listed(cars)} are the wheels'; unread: {listed(unread)}, of type {IMU}")
     rays = {entry.car for entry in chosen if entry.role is Role.BEARINGS and not given.distorted}
     pixels = {name: lens for name, lens in lenses.items() if name not in rays}
