@@ -91,7 +91,7 @@ LINES_AND_FILES = {
     "base": (1820, 10),
     "bench": (5400, 19),
     "cars": (10765, 47),
-    "cli": (2628, 8),
+    "cli": (2630, 8),
     "estimation": (1865, 8),
     "evaluation": (495, 3),
     "observers": (11880, 47),
@@ -100,7 +100,7 @@ LINES_AND_FILES = {
     "scenario": (3770, 13),
     "training": (1726, 7),
     "viz": (4820, 19),
-    "world": (5580, 20),
+    "world": (5590, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
 

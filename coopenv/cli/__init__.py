@@ -238,6 +238,8 @@ def failure_status(error: BaseException) -> int:
     elif isinstance(error, OSError):
         message = f"{error.filename or 'standard output'}: {error.strerror or error}"
         drop_output()
+    elif type(error).__name__.startswith("WarpCodegen"):  # an own observer's
+        message = f"Warp cannot compile a kernel: {error}"
     elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("coopenv"):
         message = f"needs the module {error.name}, as in the whole of coopenv: {install_command('svea')}"
     else:

@@ -5,10 +5,12 @@ The world knows neither; `coopenv.world.step` makes kernels of them.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from inspect import signature
 from typing import Any
 
 import warp as wp
 
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.poses import Coordinates, Rule
 from coopenv.world.camera import observe
 from coopenv.world.cells import sort_into_cells
@@ -109,6 +111,14 @@ class Embedded:
     fused: bool = False
     """Whether simulated worlds run it in one kernel with the simulation. A single world is then a tenth faster, batches
     are not, and it is compiled once more."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no such function. Raises CoopenvError."""
+        given = (*(("estimate", part, 6) for part in self.parts), ("start", self.start, 5), ("send", self.send, 6))
+        for name, part, count in given:
+            if not isinstance(part, wp.Function) or len(signature(part.func).parameters) != count:
+                expected = f"expected a Warp function (@wp.func) of {count} arguments"
+                raise CoopenvError(f"observer '{self.name}': {name}: {expected}")
 
     @property
     def parts(self) -> tuple[Any, ...]:

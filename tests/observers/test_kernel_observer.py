@@ -25,6 +25,7 @@ from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.state import array
+from tests.helpers.commands import refused
 from tests.helpers.recordings import simulated
 from tests.helpers.robust_worlds import small_errors
 
@@ -193,6 +194,27 @@ def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now:
 
 COUNTER = Embedded("toy_counter", estimate, start, send_nothing, Counter)
 register(COUNTER.name, embedded=COUNTER)
+
+
+def test_what_is_no_function_of_kernels_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(CoopenvError, match=r"observer 'plain': estimate: expected a Warp function \(@wp.func\) of 6"):
+        Embedded("plain", lambda model, state, memory, world, vehicle, now: None, start, send_nothing)
+    with pytest.raises(CoopenvError, match=r"observer 'few': send: expected a Warp function \(@wp.func\) of 6 arg"):
+        Embedded("few", estimate, start, start)
+    source = """
+from typing import Any
+import warp as wp
+from coopenv.world.embedded import Embedded, send_nothing, start_nothing
+
+@wp.func
+def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+    x = state.nope[world, vehicle]
+
+WRONG = Embedded("wrong", estimate, start_nothing, send_nothing)
+"""
+    (tmp_path / "wrong.py").write_text(source)
+    out = ("--observer", f"{tmp_path}/wrong.py:WRONG", "--no-figures", "--out", str(tmp_path / "out"))
+    assert "Warp cannot compile a kernel: " in (line := refused("run", "overtaking", *out)) and "`nope` is not" in line
 
 
 @pytest.mark.parametrize("observer", ["toy_counter", COUNTER])
