@@ -207,7 +207,8 @@ def record(given: RecordOptions) -> None:
         with Progress(log, "recording", total=1.0) as progress:
             recording = recorded(backend, given.seed, given.policy, progress.update, keep)
     write_log(recording, out, log, observer, given.scene)
-    facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
+    count = len(recording.setups)
+    facts = f"{count} vehicle{'' if count == 1 else 's'}, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
     if given.no_replay or not pages_can_be_written(page, log):
         return

@@ -16,6 +16,7 @@ from coopenv.backends.sources import open_recording
 from coopenv.base.errors import DataError
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import LANDMARKS, command, pose, real_folder, write
 
 REAL = real_folder()
@@ -126,7 +127,7 @@ def test_a_robot_never_seen_is_an_error(dataset):
         recording_of(with_truth(dataset, 3, [-5.0, -4.9]), "landmarks")
 
 
-@pytest.mark.parametrize("variant", ["landmarks", "landmarks+robots", "blind"])
+@pytest.mark.parametrize("variant", rest_slow(["landmarks", "landmarks+robots", "blind"], 1, 2))
 @pytest.mark.parametrize("observer", [PlanarEkf, PlanarRobust])
 def test_observers_follow_robots_without_noise(dataset, observer, variant):
     result = run(observer, recording_of(dataset, variant))

@@ -163,7 +163,7 @@ def test_messages_of_lying_senders():
 
 
 def test_the_command_prints_a_row_per_lie_and_one_line_about_a_mistake(capsys, tmp_path):
-    assert main(["lies", "--seeds", "1", "--seconds", "20", "--only", "all see"]) == 0
+    assert main(["lies", "--seeds", "1", "--seconds", "6", "--only", "all see"]) == 0
     rows = capsys.readouterr().out.splitlines()
     assert len(rows) == 4 and all(row.startswith("seed 1, all see landmarks, 1 lies, ") for row in rows)
     assert main(["changed", "--data", str(tmp_path)]) == 2

@@ -24,6 +24,7 @@ from coopenv.estimation.observability import (
 from coopenv.estimation.outcomes import Sight
 from coopenv.runs.rollouts import rollout
 from coopenv.scenario import load_scenario
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
 from tests.oracles.continuous import skew
 
@@ -242,7 +243,7 @@ def solved(run: Trajectory, vehicle: int, until: float, k: float) -> tuple[np.nd
     return end[:36].reshape(6, 6), end[36:].reshape(6, 6)
 
 
-@pytest.mark.parametrize(("vehicle", "k"), [(0, 1.0), (3, 0.8)])
+@pytest.mark.parametrize(("vehicle", "k"), rest_slow([(0, 1.0), (3, 0.8)], 1))
 def test_rates_are_those_of_the_differential_equations(vehicle: int, k: float) -> None:
     run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)
     rates = convergence_rates(run, [k] * 5, Q, V, P0)
@@ -256,7 +257,7 @@ def test_rates_are_those_of_the_differential_equations(vehicle: int, k: float) -
         assert_allclose(rates.guaranteed[n, vehicle], eigvals(mixed).real.min(), rtol=0.02)
 
 
-@pytest.mark.parametrize(("vehicle", "k"), [(0, 1.0), (3, 0.8)])
+@pytest.mark.parametrize(("vehicle", "k"), rest_slow([(0, 1.0), (3, 0.8)], 0))
 def test_no_error_falls_more_slowly_than_guaranteed(vehicle: int, k: float) -> None:
     """In the norm of P^-1, from every direction: the worst ratio of norms is the largest singular value."""
     run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)

@@ -207,6 +207,12 @@ LARGEST = ("large_crossing", "urban_crossing")
 """Environments whose figures take longest; the quick tests do without them where others ask the same."""
 
 
+def rest_slow(values: Iterable[Any], *kept: int) -> list[Any]:
+    """Return parameters, all marked slow but those at some places: CI has half an hour on the slowest machine."""
+    rows = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [pytest.param(*row, marks=() if n in kept else pytest.mark.slow) for n, row in enumerate(rows)]
+
+
 def largest_slow(environments: Iterable[str]) -> list[Any]:
     """Return environments as parameters, the largest ones marked slow."""
     return [pytest.param(name, marks=pytest.mark.slow) if name in LARGEST else name for name in environments]

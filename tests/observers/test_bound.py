@@ -229,7 +229,14 @@ def by_differences(made: Recording, names: tuple[str, ...]) -> np.ndarray:
     return np.array([covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(N)])
 
 
-@pytest.mark.parametrize("names", [("scale", "bias"), ("mounting", "place"), ("clock",), tuple(SIZES)])
+@pytest.mark.parametrize(
+    "names",
+    [
+        *(pytest.param(names, marks=pytest.mark.slow) for names in (("scale", "bias"), ("mounting", "place"))),
+        ("clock",),
+        tuple(SIZES),
+    ],
+)
 def test_errors_that_last_count_as_unknown(names: tuple[str, ...]) -> None:
     made = told_of(small_record(TICKS), *names)
     assert_same_covariance(cramer_rao(made).covariance[-1], by_differences(made, names), atol=3e-3)

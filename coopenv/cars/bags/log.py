@@ -423,7 +423,8 @@ def _notes(tracks: Sequence[Track], clocks: Clocks, given: TopicMap, drifts: Map
         if shift.offset is None:
             yield f"clock of {source}: nothing ties its file to the first one; its stamps are used unchanged"
         elif shift.added and source not in given.clocks.offsets:
-            yield f"clock of {source}: stamps are {shift.offset / NS:+.3f} s behind, and were moved by that"
+            where = "behind" if shift.offset > 0 else "ahead"
+            yield f"clock of {source}: stamps are {abs(shift.offset) / NS:.3f} s {where}, and were moved by that"
     for topic, drift in drifts.items():
         yield f"topic {topic}: its clock drifts by {1e6 * drift:+.0f} us per s, which was removed"
     for track in tracks if given.clocks.mode != "received" else ():

@@ -18,6 +18,7 @@ from coopenv.cars.vision import Calibration, rays
 from coopenv.cli import main
 from coopenv.scenario import load_scenario
 from tests.helpers.commands import refused
+from tests.helpers.env_suite import rest_slow
 
 LENS = Calibration((316, 208), (213.161906, 213.521038), (154.841998, 114.98398), (-0.352043, 0.137879, 0.0, 0.0, 0.0))
 MOUNTING = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -115,7 +116,7 @@ ROWS = [*((*row, False) for row in (RIGHT, FOCUS, HEIGHT)), *((*row, True) for r
 """Constants, what is named, what is found, and whether there is motion capture."""
 
 
-@pytest.mark.parametrize(("given", "named", "true", "truth"), ROWS)
+@pytest.mark.parametrize(("given", "named", "true", "truth"), rest_slow(ROWS, 0, 2, 5))
 def test_the_wrong_constant_is_named_and_recovered(
     given: dict[str, Any], named: str, true: dict[str, float], truth: bool
 ) -> None:
@@ -147,7 +148,7 @@ SEVERAL: list[tuple[dict[str, Any], set[str], dict[str, float], bool]] = [
 ]
 
 
-@pytest.mark.parametrize(("given", "named", "true", "truth"), SEVERAL)
+@pytest.mark.parametrize(("given", "named", "true", "truth"), rest_slow(SEVERAL, 2))
 def test_several_wrong_constants_are_named_and_recovered(
     given: dict[str, Any], named: set[str], true: dict[str, float], truth: bool
 ) -> None:

@@ -20,6 +20,7 @@ from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers import bags
+from tests.helpers.env_suite import rest_slow
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
 
@@ -173,7 +174,7 @@ def reference(clean: list[bags.Message], tmp_path_factory: pytest.TempPathFactor
 
 @pytest.mark.parametrize(
     ("topic", "offset", "at_reception"),
-    [(TWIST, -0.45, False), (BLOCKS, 0.3, True), (TRUTH, 0.15, True), ("", 0.0, False)],
+    rest_slow([(TWIST, -0.45, False), (BLOCKS, 0.3, True), (TRUTH, 0.15, True), ("", 0.0, False)], 0, 2),
 )
 def test_a_topic_with_another_clock_and_wrong_stamps_cost_nothing(
     topic: str, offset: float, at_reception: bool, clean: list[bags.Message], reference: float, tmp_path: Path

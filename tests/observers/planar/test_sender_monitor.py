@@ -12,6 +12,7 @@ from coopenv.observers.planar.fusion import ENOUGH, LEAST_STD, MOST_SEEN, RobotM
 from coopenv.observers.planar.model import PlanarPose, misfit
 from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.runner import run
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import barrier_robots
 
 EXTRA = {
@@ -148,7 +149,7 @@ def nominal():
     return record, run(PlanarRobust, record)
 
 
-@pytest.mark.parametrize(("jump", "drift"), [(5.0, 0.0), (0.0, 0.05)])
+@pytest.mark.parametrize(("jump", "drift"), rest_slow([(5.0, 0.0), (0.0, 0.05)], 0))
 def test_a_faulty_sender_at_most_doubles_the_error_of_the_others(nominal, jump, drift):
     record, honest = nominal
     result = run(PlanarRobust, record, Drifting([0], jump, drift))

@@ -14,6 +14,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.robust_worlds import nees_of, steps_of, watched, with_small_errors
 
 SEEDS = range(5200, 5232)
@@ -37,7 +38,7 @@ EXPECTED = {"a turned camera": (0.7, 1.2)}
 """Least and most of ANEES where the errors that are estimated with the pose are not small."""
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", rest_slow(SCENES, 0, 2, 3, 5, 7, 10))
 def test_errors_are_as_large_as_their_covariances_say(scene: str) -> None:
     name, overrides = SCENES[scene]
     made = load_scenario(name, {"observer.name": "robust", "horizon": 13.0, **overrides})
@@ -96,14 +97,19 @@ def by_window(
 
 @pytest.mark.parametrize(
     ("name", "overrides", "most"),
-    [
-        ("lane:8", {}, 2.0),
-        ("random:12,seed=4", {}, 2.0),
-        ("ring:5", {}, 1.6),
-        ("roots:12", {"noise.velocity": 0.01, "noise.odometry_scale": 0.1}, 1.6),
-        ("lane:12,seen=5", {"noise.odometry_scale": 0.05}, 1.6),
-        ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}, 1.6),
-    ],
+    rest_slow(
+        [
+            ("lane:8", {}, 2.0),
+            ("random:12,seed=4", {}, 2.0),
+            ("ring:5", {}, 1.6),
+            ("roots:12", {"noise.velocity": 0.01, "noise.odometry_scale": 0.1}, 1.6),
+            ("lane:12,seen=5", {"noise.odometry_scale": 0.05}, 1.6),
+            ("lane:8", {"v2x.delay": 12, "noise.velocity": 0.15, "noise.bearing.scale": 0.0005}, 1.6),
+        ],
+        0,
+        2,
+        3,
+    ),
     ids=str,
 )
 def test_everybody_is_as_sure_as_it_may_be(name: str, overrides: dict[str, float], most: float) -> None:

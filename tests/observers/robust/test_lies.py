@@ -13,6 +13,7 @@ from coopenv.observers import Message, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import reset, simulate
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.robust_sources import scene
 from tests.helpers.robust_worlds import position_errors
 
@@ -196,7 +197,7 @@ def errors_beside(sender: int, start: float, seed: int, horizon: float, altered:
     return found.position_error[recording.t > max(start, 5.0)][:, [n for n in range(5) if n != sender]]
 
 
-@pytest.mark.parametrize("sender", [1, 3])
+@pytest.mark.parametrize("sender", rest_slow([1, 3], 0))
 def test_altered_messages_of_one_sender_lead_nobody_astray(sender: int) -> None:
     """Whether they count or not; others see two honest targets besides."""
     assert errors_beside(sender, 12.0, 2, 24.0, True).max() < 0.8

@@ -20,6 +20,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers import robust_sources as faults
 from tests.helpers import robust_ticks as by_hand
+from tests.helpers.env_suite import rest_slow
 from tests.helpers.robust_sources import Lies, Watched, busy, fast, seen, watch, wrong_landmark
 from tests.helpers.robust_ticks import PERIOD, displaced, left_error
 
@@ -52,14 +53,19 @@ def cost(watched: Watched, without: Watched, start: float) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("make", "vehicle", "target", "times"),
-    [
-        (fast, 0, 2, (2.0, 3.0, 4.0, 6.0)),
-        (fast, 0, NO_TARGET, (2.0, 3.0, 4.0, 6.0)),
-        (seen, 0, 1, (1.0, 3.0, 8.0)),
-        (seen, 0, NO_TARGET, (1.0, 3.0, 8.0)),
-        (seen, 1, FIRST, (1.0, 3.0, 8.0)),
-        (busy, 1, FIRST, (1.0, 3.0, 8.0)),
-    ],
+    rest_slow(
+        [
+            (fast, 0, 2, (2.0, 3.0, 4.0, 6.0)),
+            (fast, 0, NO_TARGET, (2.0, 3.0, 4.0, 6.0)),
+            (seen, 0, 1, (1.0, 3.0, 8.0)),
+            (seen, 0, NO_TARGET, (1.0, 3.0, 8.0)),
+            (seen, 1, FIRST, (1.0, 3.0, 8.0)),
+            (busy, 1, FIRST, (1.0, 3.0, 8.0)),
+        ],
+        0,
+        3,
+        5,
+    ),
 )
 def test_a_sensitivity_is_the_derivative_of_the_estimate(
     make: Callable[..., Recording], vehicle: int, target: int, times: tuple[float, ...]
@@ -202,10 +208,14 @@ def test_who_is_honest_is_believed(make: Callable[..., Recording], of: tuple[flo
 
 @pytest.mark.parametrize(
     ("make", "of", "fault"),
-    [
-        *((busy, (24.0, 0), fault) for fault in ("gyro_step=3@12.27", "camera_step=-3@12.27")),
-        *((parametric, (road,), fault) for fault in ("gyro_step=3@12", "camera_step=1@12")),
-    ],
+    rest_slow(
+        [
+            *((busy, (24.0, 0), fault) for fault in ("gyro_step=3@12.27", "camera_step=-3@12.27")),
+            *((parametric, (road,), fault) for fault in ("gyro_step=3@12", "camera_step=1@12")),
+        ],
+        0,
+        3,
+    ),
 )
 def test_a_step_in_an_own_sensor_of_all_vehicles_costs_little(
     make: Callable[..., Recording], of: tuple[Any, ...], fault: str
