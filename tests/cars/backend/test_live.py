@@ -199,7 +199,7 @@ def refuses(path: Path, hub: Hub, why: str, car: str | None = None) -> None:
 
 def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
     _, hub, _ = lab
-    strict = write_fleet(tmp_path, safety=PATIENT.replace("max_clock_offset = 0.5", "max_clock_offset = 0.02"))
+    strict = write_fleet(tmp_path, safety=PATIENT.replace("max_clock_offset = 0.5", "max_clock_offset = 0.1"))
     send_fault(hub, "svea1", "clock_offset=0.2")
     try:
         refuses(strict, hub, r"not armed: svea1: its clock is \d+ ms ahead of this computer's")
