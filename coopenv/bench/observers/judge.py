@@ -4,7 +4,7 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -152,13 +152,13 @@ def scene_of(recording: Recording, steady_from: float, edges: Sequence[float] = 
     paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
     judged = judged_vehicles(recording)
     arrays = within[:, judged], gramians[:, judged], recording.t[kept], bound[:, judged]
-    own, others = (tuple(name for i, name in enumerate(names) if (i in judged) is part) for part in (True, False))
+    own, others = (tuple(compress(names, part)) for part in (judged, ~judged))
     return RecordProperties(own, windows, *arrays, paper_noise, figures_of(recording), others)
 
 
-def judged_vehicles(recording: Recording) -> NDArray[np.intp]:
-    """Return the numbers of the vehicles of which any true pose is known."""
-    return np.flatnonzero(recording.truth.known.any(axis=0))
+def judged_vehicles(recording: Recording) -> NDArray[np.bool_]:
+    """Return (N,) which vehicles have any known true pose."""
+    return np.asarray(recording.truth.known.any(axis=0))
 
 
 def figures_of(recording: Recording) -> tuple[float, ...]:

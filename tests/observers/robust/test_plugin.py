@@ -53,7 +53,6 @@ def test_landmarks_that_are_lost_do_not_mislead():
     assert all((result.anees(8.0) < 6.0).all() for result in results)
 
 
-@pytest.mark.slow
 def test_wrong_associations_mislead_in_the_first_frames_only():
     """Uncertain by 1 m and 10 degrees, a follower cannot tell two vehicles apart, and one swap of theirs passes."""
     wrong = [VARIANTS["wrong_association"].applied(small_errors(12.0, seed), seed) for seed in range(3)]
