@@ -90,8 +90,9 @@ def scenario_path(name_or_path: str | Path) -> Path:
         if text in (environment_id(name), f"coopenv/{name}"):
             raise UnknownEnvironmentError(f"{text}: an id, for gymnasium.make; the environment is '{name}'")
     if not (re.search(r"[/\\]|\.\w+$", text) or os.path.exists(text)):  # noqa: PTH110 (never raises)
-        known = f"{suggest(text, names)}; known: {', '.join([*names, *(f'{kind}:N' for kind in SCENES)])}"
-        raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
+        known = [*names, *(f"{kind}:N" for kind in SCENES)]
+        near = suggest(text, known)
+        raise UnknownEnvironmentError(f"unknown environment {shown(text)}{near}; known: {', '.join(known)}")
     try:
         path = Path(text).expanduser()
         there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
