@@ -85,6 +85,9 @@ class Rollout:
         The run ends at the horizon, after `steps` decisions, or with the decision in which the last vehicle that is
         estimated here ended.
         `wall_time` (s) counts what is spent in here, not what the caller does between two ticks.
+
+        Raises:
+            CoopenvError: an estimate is not finite.
         """
         start = perf_counter()
         self._views = Views(self.engine, RECORDED)
@@ -92,11 +95,20 @@ class Rollout:
         moments = play(self.engine, [self.seed], self.ticks_planned, self.policy, False, self._options)
         for tick in moments:
             self._views.take()
+            self._check_estimates(tick)
             self.wall_time += perf_counter() - start
             yield tick
             start = perf_counter()
         if self.engine.backend.capabilities.real_time:
             self.engine.backend.stop(EPISODE_OVER)
+
+    def _check_estimates(self, tick: int) -> None:
+        R, p = (self.engine.view(name)[0] for name in ("estimate_rotation", "estimate_position"))
+        lost = [i for i in self.vehicles if not (np.isfinite(R[i]).all() and np.isfinite(p[i]).all())]
+        if lost:
+            name, vehicle = self.scenario.observer.name, self.scenario.vehicle_names[lost[0]]
+            time = tick / self.scenario.rates.camera
+            raise CoopenvError(f"observer '{name}' of {vehicle} at {time:.3f} s: its estimate is not finite")
 
     def _recorded(self, name: str) -> np.ndarray:
         """Return (K, ...) of one view."""

@@ -23,7 +23,7 @@ from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from coopenv.observers.registry import find, find_embedded, named, portable
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario.schema import neighbour_sets
-from coopenv.world.embedded import Embedded, send_nothing
+from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array
 from tests.helpers.commands import refused
 from tests.helpers.recordings import simulated
@@ -215,6 +215,19 @@ WRONG = Embedded("wrong", estimate, start_nothing, send_nothing)
     (tmp_path / "wrong.py").write_text(source)
     out = ("--observer", f"{tmp_path}/wrong.py:WRONG", "--no-figures", "--out", str(tmp_path / "out"))
     assert "Warp cannot compile a kernel: " in (line := refused("run", "overtaking", *out)) and "`nope` is not" in line
+
+
+@wp.func
+def lose(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
+    """Estimate nothing from the third tick on."""
+    if now.tick > 2:
+        state.estimate_position[world, vehicle][1] = type(model.camera_period)(wp.nan)
+
+
+def test_an_estimate_that_is_no_number_ends_a_run() -> None:
+    lost = Embedded("lost", lose, start_nothing, send_nothing)
+    with pytest.raises(CoopenvError, match=r"observer 'lost' of vehicle_1 at 0.\d+ s: its estimate is not finite"):
+        coopenv.run("overtaking", observer=lost, steps=5)
 
 
 @pytest.mark.parametrize("observer", ["toy_counter", COUNTER])
