@@ -1,11 +1,12 @@
 """A run as one checked file, which `coopenv run` replays: scenario, seed, actions, versions, and a state near its end.
 
-A ZIP archive of `manifest.json`, `scenario.json`, `arrays.npz` and, of an observer in a file, its source to read. The
-manifest holds the digest of every other part. Code in the archive is never executed: a replay needs the observer's file
-in the current folder, and the same.
+A ZIP archive of `manifest.json`, `scenario.json`, `arrays.npz` and, to read, `code/NAME.py`: the user's files of an
+observer and of terms. The manifest holds the digest of every other part. Code in the archive is never executed: a
+replay needs the same files in the current folder.
 """
 
 import json
+import re
 import zipfile
 from collections import deque
 from dataclasses import dataclass
@@ -29,8 +30,10 @@ from coopenv.scenario.own_terms import located
 from coopenv.world.warp_internals import kernel_hashes
 
 RECORD_FILE = "record.zip"
-PARTS = {"manifest.json": 2**20, "scenario.json": 2**24, "arrays.npz": 2**28, "observer.py": 2**20}
+PARTS = {"manifest.json": 2**20, "scenario.json": 2**24, "arrays.npz": 2**28}
 """Names of the parts with the most bytes that each may unpack to."""
+CODE, MOST_CODE = re.compile(r"code/[^/\\]+\.py"), 2**20
+"""Names of the parts with code, and the most bytes of one."""
 FIGURE_TOLERANCE = 1e-6
 """Relative, of figures that count as the same: other processors round differently."""
 
@@ -110,11 +113,20 @@ class RunRecord:
         arrays = {"actions": np.array(self._actions or empty), **{f"state.{name}": a for name, a in state.items()}}
         buffer = BytesIO()
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
-        scenario = run.scenario.model_dump(mode="json", exclude_unset=True)
-        parts = {"scenario.json": json_text(scenario).encode(), "arrays.npz": buffer.getvalue()}
-        observer, place = run.scenario.observer.name, portable(run.scenario.observer.name)
-        if isinstance(place, str) and (file := Path(place.rpartition(":")[0])).suffix == ".py":
-            observer, parts["observer.py"] = f"{file.name}:{place.rpartition(':')[2]}", file.read_bytes()
+        parts = {"arrays.npz": buffer.getvalue()}
+
+        def kept(reference: str, folder: Path) -> str:
+            """Keep the code that a reference names, which then needs no folder."""
+            file, name = Path(reference.rpartition(":")[0]), reference.rpartition(":")[2]
+            if file.suffix != ".py":
+                return reference
+            parts[f"code/{file.name}"] = file.read_bytes()
+            return f"{file.name}:{name}"
+
+        scenario = located(run.scenario.model_dump(mode="json", exclude_unset=True), Path(), kept)
+        parts["scenario.json"] = json_text(scenario).encode()
+        place = portable(run.scenario.observer.name)
+        observer = kept(place, Path()) if isinstance(place, str) else run.scenario.observer.name
         manifest = Manifest(
             environment=environment,
             seed=run.seed,
@@ -155,8 +167,9 @@ class Bundle:
         try:
             with zipfile.ZipFile(path) as archive:
                 sizes = {name: part.file_size for name, part in members_of(archive).items()}
-                wrong = [name for name, size in sizes.items() if size > PARTS.get(name, -1)]
-                missing = [name for name in (*PARTS,)[:3] if name not in sizes]
+                most = {name: PARTS.get(name, MOST_CODE if CODE.fullmatch(name) else -1) for name in sizes}
+                wrong = [name for name, size in sizes.items() if size > most[name]]
+                missing = [name for name in PARTS if name not in sizes]
                 if wrong or missing:
                     raise DataError(f"{path}: not a run: parts {listed(missing or wrong)}")
                 parts = {name: archive.open(name).read(size) for name, size in sizes.items()}
@@ -181,6 +194,8 @@ class Bundle:
 
     def _check(self) -> None:
         actions = self.arrays["actions"]
+        if not isinstance(self.scenario, dict) or not isinstance(self.scenario.get("observer", {}), dict):
+            raise DataError(f"{self.path}: scenario.json: not a scenario, or its observer no table")
         if self.manifest.state_tick > self.manifest.end.tick:
             raise DataError(f"{self.path}: manifest.json: state_tick: later than the end")
         if actions.ndim != 3 or actions.dtype.kind != "f" or not (np.abs(actions) <= 1.0).all():
@@ -206,7 +221,9 @@ class Bundle:
             CoopenvError: the scenario is not valid, or its observer is not there.
         """
         about, end = self.manifest, self.manifest.end
-        raw = located(self._with_observer(), Path(), self._here)
+        raw = located(self.scenario, Path(), self._here)
+        if is_reference(about.observer):
+            raw["observer"] = {**raw.get("observer", {}), "name": named(self._here(about.observer, Path()))}
         if isinstance(raw.get("sumo"), dict) and raw["sumo"].get("options"):
             raise DataError(f"{self.path}: scenario.json: sumo.options: can write files, so it is not replayed")
         scenario = parse_scenario(raw, f"{self.path.name}: scenario.json")
@@ -238,25 +255,17 @@ class Bundle:
         return differing
 
     def _here(self, reference: str, folder: Path) -> str:
-        """Return the user's file of a term, program or network of the scenario: code of another place does not run."""
+        """Return where the user's file of a reference is here: code of another place, or other code, does not run."""
         place, colon, name = reference.rpartition(":")
-        given = Path(place if colon else name)
-        if given.resolve().is_relative_to(data_directory("envs").resolve()):  # shipped
-            return reference
-        file = folder.absolute() / given.name
-        if not file.is_file():
+        file = folder.absolute() / Path(place if colon else name).name
+        shipped = data_directory("envs") / file.name  # networks, no code
+        part = f"code/{file.name}"
+        digest = self.manifest.parts.get(part)
+        if digest is not None and not (file.is_file() and sha256(file.read_bytes()).hexdigest() == digest):
+            raise DataError(f"{self.path}: needs its {part} here as {file.name}: unzip and read it")
+        if not file.is_file() and not shipped.is_file():
             raise DataError(f"{self.path}: needs {file.name} here, which its scenario names: {reference}")
-        return f"{file}{colon}{name if colon else ''}"
-
-    def _with_observer(self) -> dict[str, Any]:
-        """Return the scenario with its observer, which is loaded from its file if it is in one."""
-        reference = self.manifest.observer
-        if not is_reference(reference):
-            return self.scenario
-        file, digest = Path(reference.rpartition(":")[0]), self.manifest.parts.get("observer.py")
-        if len(file.parts) != 1 or not file.is_file() or sha256(file.read_bytes()).hexdigest() != digest:
-            raise DataError(f"{self.path}: needs its observer.py here as {file.name}: unzip, read and rename it")
-        return {**self.scenario, "observer": {**self.scenario.get("observer", {}), "name": named(reference)}}
+        return f"{file if file.is_file() else shipped}{colon}{name if colon else ''}"
 
     def _differing_state(self, run: Rollout) -> list[str]:
         before = {name.removeprefix("state."): array for name, array in self.arrays.items() if name != "actions"}

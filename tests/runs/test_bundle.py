@@ -98,13 +98,13 @@ def test_a_failed_run_is_kept_and_fails_again(
     assert main(["bundle", "run_failed", "--out", "report.zip"]) == 0
     with zipfile.ZipFile("report.zip") as archive:
         manifest = json.loads(archive.read("manifest.json"))
-        assert archive.read("observer.py") == (folder / "mine.py").read_bytes()
+        assert archive.read("code/mine.py") == (folder / "mine.py").read_bytes()
     assert manifest["state_tick"] == 30 and manifest["end"]["tick"] == 75 and str(folder) not in str(manifest)
     capsys.readouterr()
     assert main(["run", "report.zip"]) == 0
     assert "Late' of vehicle_1" in (printed := capsys.readouterr().out) and reason in printed
     (folder / "mine.py").write_text(OBSERVER.replace("VERDICT", "pass"))
-    assert "report.zip: needs its observer.py here as mine.py" in refused("run", "report.zip")
+    assert "report.zip: needs its code/mine.py here as mine.py" in refused("run", "report.zip")
 
 
 @pytest.mark.parametrize("verdict", ["raise ValueError('late')", "return observations[:, :2] + np.nan"])
@@ -129,10 +129,17 @@ def test_code_that_a_scenario_names_runs_from_the_current_folder_only(
     shutil.copytree(EXAMPLES / "lane_keeping", own)
     assert main(["run", str(own / "lane_keeping.toml"), "--no-figures", "--steps", "4", "--out", "run"]) == 0
     assert main(["bundle", "run", "--out", "own.zip"]) == 0
-    assert "own.zip: needs lane_terms.py here, which its scenario names: " in refused("run", "own.zip")
+    with zipfile.ZipFile("own.zip") as archive:
+        assert archive.read("code/lane_terms.py") == (own / "lane_terms.py").read_bytes()
+        assert str(folder).encode() not in archive.read("scenario.json")
+    needed = "own.zip: needs its code/lane_terms.py here as lane_terms.py: unzip and read it"
+    assert needed in refused("run", "own.zip")
     monkeypatch.chdir(own)
     capsys.readouterr()
     assert main(["run", "../own.zip"]) == 0 and capsys.readouterr().out.endswith("The same figures.\n")
+    with (own / "lane_terms.py").open("a") as file:
+        file.write("# changed\n")
+    assert needed in refused("run", "../own.zip")
 
 
 def test_a_driver_that_a_scenario_names_is_replayed_without_its_code(
@@ -194,6 +201,8 @@ def test_what_is_no_such_file_is_refused_in_one_line(folder: Path) -> None:
         (manifest("ticks_planned", 10**12), True, "another result than that of the file: after tick 13: no error"),
         (manifest("state_tick", 10**6), True, "manifest.json: state_tick: later than the end"),
         (lambda parts: parts.update({"scenario.json": b'{"horizon": -1}'}), True, "scenario.json: "),
+        (lambda parts: parts.update({"scenario.json": b"[1]"}), True, "scenario.json: not a scenario"),
+        (lambda parts: parts.update({"scenario.json": b'{"observer": 1}'}), True, "its observer no table"),
         (lambda parts: parts.update({"manifest.json": bytes(2**20 + 1)}), False, "not a run: parts manifest.json"),
     ]
     for change, sealed, reason in cases:
