@@ -43,14 +43,10 @@ def seeing(fleet: Path, endpoint: str, camera: Transport) -> Iterator[subprocess
     command = (*COOPENV, "svea", "see", str(fleet), "--car", "svea7", "--connect", endpoint, "--patience", "60")
     node, lines, info = start(command, ROOT), list[str](), camera_info()
 
-    def is_ready() -> bool:
-        camera.publish(CAMERA_INFO, info, reliable=True)
-        return bool(lines)
-
     try:
         assert node.stdout is not None
         threading.Thread(target=lambda out=node.stdout: lines.append(out.readline()), daemon=True).start()
-        wait_until(is_ready)
+        wait_until(lambda: lines, lambda: camera.publish(CAMERA_INFO, info, reliable=True))
         assert lines == [f"svea7: see ready at {endpoint}\n"], lines
         yield node
     finally:

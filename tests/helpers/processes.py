@@ -26,14 +26,31 @@ def start(command: Sequence[str], folder: Path, **options: Any) -> subprocess.Po
     return subprocess.Popen(command, cwd=folder, text=True, env=environment, start_new_session=True, **options)
 
 
-def wait_until(condition: Callable[[], object]) -> None:
-    """Wait for a condition to hold.
+@contextmanager
+def started(command: Sequence[str], folder: Path, line: str = "ready", **options: Any) -> Iterator[Any]:
+    """Run a command until the block is left; its first line has had a text in it."""
+    process = start(command, folder, **options)
+    try:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        assert line in first, (first, process.communicate(timeout=10))
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: None) -> None:
+    """Wait for a condition to hold; something is done before each look.
 
     Raises:
         TimeoutError: it does not come true.
     """
     give_up = time.monotonic() + DEADLOCK
-    while not condition():
+    while True:
+        meanwhile()
+        if condition():
+            return
         if time.monotonic() > give_up:
             raise TimeoutError
         time.sleep(0.01)

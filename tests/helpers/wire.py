@@ -6,13 +6,11 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 from coopenv.cars.transport.base import Arrival, Transport
-from tests.helpers.processes import start
+from tests.helpers.processes import started
 
 PING, PONG, ECHO = "fleet/ping", "fleet/pong", "fleet/alive/echo"
 
@@ -43,24 +41,9 @@ def seen_by(receiver: Transport) -> list[tuple[str, bool]]:
     return seen
 
 
-@contextmanager
-def ready(command: tuple[str, ...], **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Run a command that prints `ready` at first, until the block is left."""
-    process = start(command, Path.cwd(), **options)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n", process.communicate(timeout=10)[1]
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@contextmanager
-def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+def running(*arguments: str) -> AbstractContextManager[subprocess.Popen[str]]:
     """Run an end until the block is left; it has said that it is ready."""
-    with ready((sys.executable, "-m", "tests.helpers.wire", *arguments)) as process:
-        yield process
+    return started((sys.executable, "-m", "tests.helpers.wire", *arguments), Path.cwd())
 
 
 def listening(pid: int) -> list[str]:

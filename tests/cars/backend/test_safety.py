@@ -338,7 +338,7 @@ def test_a_network_that_fails_does_not_end_the_watchdog(
         patch.setattr(yard.gates, "stop", broken)
         dog.arm()  # nothing has ever been heard of the wheels
         wait_until(lambda: len(calls) > 2)
-    wait_until(lambda: (yard.tell(), states(yard) == ["stopped", "stopped"])[1])
+    wait_until(lambda: states(yard) == ["stopped", "stopped"], yard.tell)
     dog.forget()
     dog.arm()
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cars.link.gate.station import end
 from tests.helpers.cars import OVERTAKING, PATIENT
-from tests.helpers.processes import COOPENV, ROOT, start
+from tests.helpers.processes import COOPENV, ROOT, start, started
 from tests.helpers.wire import free_endpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="unix sockets")]
@@ -35,9 +34,7 @@ def test_nothing_moves_a_car_and_the_station_drives(tmp_path: Path) -> None:
     commands += [("gate", "fleet.toml", "--car", car) for car in CARS]
     with ExitStack() as stack:
         for command in commands:
-            process = start((*COOPENV, "svea", *command), tmp_path)
-            stack.callback(end, process)
-            assert process.stdout is not None and "ready" in process.stdout.readline()
+            stack.enter_context(started((*COOPENV, "svea", *command), tmp_path))
         drive = ("run", "fleet.toml", "--arm", "--policy", "route_follower", "--no-figures", "--steps", "60")
         for _ in range(2):
             done = run(tmp_path, *drive)

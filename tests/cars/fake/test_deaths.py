@@ -19,7 +19,7 @@ from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING
-from tests.helpers.processes import COOPENV, start, wait_until
+from tests.helpers.processes import COOPENV, started, wait_until
 from tests.helpers.wire import free_endpoint
 
 pytestmark = pytest.mark.slow
@@ -58,11 +58,7 @@ class Fleet:
 
     def launch(self, line: str, *command: str) -> Any:
         """Start a command, and wait until its first line has a word in it."""
-        process = start(command, self.folder)
-        self._stack.callback(process.wait)
-        self._stack.callback(process.kill)
-        assert process.stdout is not None and line in process.stdout.readline()
-        return process
+        return self._stack.enter_context(started(command, self.folder, line))
 
     def launch_router(self) -> Any:
         return self.launch("ready", *COOPENV, "svea", "router", "--listen", self.endpoint)

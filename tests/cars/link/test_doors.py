@@ -23,10 +23,10 @@ from coopenv.cars.profile import SVEA, USUAL, MotionCommand, Role
 from coopenv.cars.transport.base import Tls
 from coopenv.cars.transport.zenoh import Zenoh, open_zenoh
 from tests.cars.link.gate.bench import CAR
-from tests.cars.link.gate.station import Station, end, start_gate
+from tests.cars.link.gate.station import Station, running_gate
 from tests.helpers.brokers import Authority
 from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing
-from tests.helpers.processes import COOPENV, ROOT, start, wait_until
+from tests.helpers.processes import COOPENV, ROOT, started, wait_until
 from tests.helpers.wire import free_endpoint, free_port, heard_by, running
 
 zenoh = pytest.importorskip("zenoh", reason="needs the extra 'svea'")
@@ -44,9 +44,7 @@ class Doors:
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self.inside, self.outside = f"unixsock-stream/{folder}/car.sock", free_endpoint()
         listen = ("--listen", self.inside, "--listen", self.outside)
-        router = start((*COOPENV, "svea", "router", "--config", str(CAR_FILE), *listen), folder)
-        stack.callback(end, router)
-        assert router.stdout is not None and "ready" in router.stdout.readline()
+        stack.enter_context(started((*COOPENV, "svea", "router", "--config", str(CAR_FILE), *listen), folder))
         self.wheels, self.stranger = (
             stack.enter_context(closing(open_zenoh("client", [place]))) for place in (self.inside, self.outside)
         )
@@ -61,8 +59,7 @@ def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
 
 def test_the_station_drives_through_the_gate_and_a_stranger_does_not_get_past_it(doors: Doors, tmp_path: Path) -> None:
     make_keys(tmp_path / "keys", [CAR, "station"])
-    gate = start_gate(doors.inside, tmp_path, "--keys", str(tmp_path / "keys"))
-    try:
+    with running_gate(doors.inside, tmp_path, "--keys", str(tmp_path / "keys")):
         station = Station(doors.stranger, load_signer(tmp_path / "keys", "station"))
         station.arm("a")
         for _ in range(20):
@@ -76,8 +73,6 @@ def test_the_station_drives_through_the_gate_and_a_stranger_does_not_get_past_it
         doors.wheels.publish(WHEELS, DRIVE)  # as a program on the car might
         wait_until(lambda: station.status.state == "stopped")
         assert station.count("foreign") == 1
-    finally:
-        end(gate)
 
 
 def test_bearings_leave_the_car_and_frames_do_not_enter(doors: Doors) -> None:
@@ -126,38 +121,36 @@ def test_a_bridge_in_the_router_itself_is_behind_the_same_doors(tmp_path: Path) 
         ]
         state = f"fleet/{CAR}/mavros/state"
 
-        def arrive() -> bool:
+        def publish() -> None:
             gate.publish(WHEELS, b"of the gate", reliable=True)
             bridge.publish(state, b"", reliable=True)
-            return bool(wheels) and {WHEELS, state} <= set(seen)
 
-        wait_until(arrive)  # all know of each other
+        wait_until(lambda: wheels and {WHEELS, state} <= set(seen), publish)  # all know of each other
         for key in SPELLINGS:
             stranger.publish(key, DRIVE, reliable=True)
         assert not list(stranger.session.get(f"fleet/{CAR}/mavros/cmd/arming", timeout=0.3))
         seen.clear()
-        wait_until(arrive)
+        wait_until(lambda: {WHEELS, state} <= set(seen), publish)
         assert set(wheels) == {(WHEELS, b"of the gate")} and not asked and set(seen) == {WHEELS, state}
         kept.clear()
 
 
 def test_an_open_router_is_noticed_and_no_gate_behind_it_is_armed(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    with running("router", endpoint), closing(open_zenoh("client", [endpoint])) as transport:
-        gate = start_gate(endpoint, tmp_path)
-        try:
-            gates, station = Gates(transport, (CAR,), USUAL, None), Station(transport, None)
-            wait_until(lambda: gates.states[CAR].age < OLD)
-            with pytest.raises(CoopenvError, match=rf"^not armed: {CAR}: commands get to its wheels without its gate"):
-                gates.begin()
-            Gates(transport, (CAR,), USUAL, None, probed=False).begin(release=True)
-            wait_until(lambda: station.status.state == "armed")
-            begun = time.monotonic()
-            transport.publish(*neutral_command(SVEA, CAR))
-            wait_until(lambda: station.status.state == "stopped")
-            assert time.monotonic() - begun < 0.2 + 0.8  # of a busy machine
-        finally:
-            end(gate)
+    with ExitStack() as stack:
+        stack.enter_context(running("router", endpoint))
+        transport = stack.enter_context(closing(open_zenoh("client", [endpoint])))
+        stack.enter_context(running_gate(endpoint, tmp_path))
+        gates, station = Gates(transport, (CAR,), USUAL, None), Station(transport, None)
+        wait_until(lambda: gates.states[CAR].age < OLD)
+        with pytest.raises(CoopenvError, match=rf"^not armed: {CAR}: commands get to its wheels without its gate"):
+            gates.begin()
+        Gates(transport, (CAR,), USUAL, None, probed=False).begin(release=True)
+        wait_until(lambda: station.status.state == "armed")
+        begun = time.monotonic()
+        transport.publish(*neutral_command(SVEA, CAR))
+        wait_until(lambda: station.status.state == "stopped")
+        assert time.monotonic() - begun < 0.2 + 0.8  # of a busy machine
 
 
 def test_an_attack_finds_what_is_open(doors: Doors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,18 +165,15 @@ def test_an_attack_finds_what_is_open(doors: Doors, tmp_path: Path, monkeypatch:
             security = {} if open_ else {"security": {"keys": str(tmp_path / "keys")}}
             network = {"network": {"connect": [outside]}, **security}
             fleet = parse_deployment({"environment": "e", "cars": [{"name": CAR}], **network}, tmp_path / "f.toml")
-            gate = start_gate(inside, tmp_path, *(() if open_ else ("--keys", str(tmp_path / "keys"))))
-            try:
-                with closing(Intruder(fleet, [CAR], 0)) as intruder:
-                    found = {outcome.what: outcome for outcome in attack(intruder, 180)}
-                    assert [outcome.harmful for outcome in found.values()] == [open_, False, open_]
-                    assert {outcome.sent for outcome in found.values()} == ({50, 60} if open_ else {60})
-                    station = Station(intruder.observer, None if open_ else load_signer(tmp_path / "keys", "station"))
-                    station.arm("a")
-                    with pytest.raises(CoopenvError, match=f"^no attack: {CAR}: its gate is armed"):
-                        next(attack(intruder, 10))
-            finally:
-                end(gate)
+            own_keys = () if open_ else ("--keys", str(tmp_path / "keys"))
+            with running_gate(inside, tmp_path, *own_keys), closing(Intruder(fleet, [CAR], 0)) as intruder:
+                found = {outcome.what: outcome for outcome in attack(intruder, 180)}
+                assert [outcome.harmful for outcome in found.values()] == [open_, False, open_]
+                assert {outcome.sent for outcome in found.values()} == ({50, 60} if open_ else {60})
+                station = Station(intruder.observer, None if open_ else load_signer(tmp_path / "keys", "station"))
+                station.arm("a")
+                with pytest.raises(CoopenvError, match=f"^no attack: {CAR}: its gate is armed"):
+                    next(attack(intruder, 10))
 
 
 def entry(path: Path, key: str) -> Any:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import threading
 import time
 from collections import deque
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +17,11 @@ from coopenv.cars.profile import SVEA, MotionCommand, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
-from tests.helpers.processes import COOPENV, start, wait_until
+from tests.helpers.processes import COOPENV, started, wait_until
 
 
-def start_gate(endpoint: str, folder: Path, *options: str) -> subprocess.Popen[str]:
-    process = start((*COOPENV, "svea", "gate", "--car", CAR, "--connect", endpoint, *options), folder)
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    assert "ready" in line, process.communicate()
-    return process
-
-
-def end(*processes: subprocess.Popen[str]) -> None:
-    for process in processes:
-        if process.poll() is None:
-            process.send_signal(signal.SIGCONT)
-            process.kill()
-        process.communicate(timeout=10)
+def running_gate(endpoint: str, folder: Path, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    return started((*COOPENV, "svea", "gate", "--car", CAR, "--connect", endpoint, *options), folder)
 
 
 class Station:
@@ -90,14 +77,14 @@ class Station:
         self.session, self.sequence = session, 0
 
         def is_armed() -> bool:
-            if self.status is not None and (self.status.state, self.status.session) == ("armed", session):
-                return True
-            if self.status is not None:
-                self.send(Role.ARM, messages.arm(time.time_ns(), session, self.status.nonce))
-            time.sleep(0.05)
-            return False
+            return self.status is not None and (self.status.state, self.status.session) == ("armed", session)
 
-        wait_until(is_armed)
+        def ask() -> None:
+            if self.status is not None and not is_armed():
+                self.send(Role.ARM, messages.arm(time.time_ns(), session, self.status.nonce))
+                time.sleep(0.05)
+
+        wait_until(is_armed, ask)
 
     def command(self, speed: float = 0.3) -> None:
         self.sequence += 1

@@ -23,8 +23,8 @@ from coopenv.cars.transport.zenoh import LEASE, open_zenoh
 from coopenv.cli import main
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, messages_of_strangers
-from tests.cars.link.gate.station import Station, end, start_gate
-from tests.helpers.processes import start, wait_until
+from tests.cars.link.gate.station import Station, running_gate
+from tests.helpers.processes import COOPENV, started, wait_until
 from tests.helpers.wire import free_endpoint, heard_by, running
 
 pytest.importorskip("zenoh", reason="needs the extra 'svea'")
@@ -47,9 +47,8 @@ def endpoint() -> Iterator[str]:
 
 @pytest.fixture
 def gate(endpoint: str, keys: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    process = start_gate(endpoint, tmp_path, "--keys", str(keys))
-    yield process
-    end(process)
+    with running_gate(endpoint, tmp_path, "--keys", str(keys)) as process:
+        yield process
 
 
 @pytest.fixture
@@ -104,14 +103,13 @@ def test_systemd_hears_it_until_it_is_frozen(endpoint: str, tmp_path: Path, monk
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(10.0)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        process = start_gate(endpoint, tmp_path)
-        assert [systemd.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
-        process.send_signal(signal.SIGSTOP)
-        systemd.settimeout(1.0)
-        with pytest.raises(TimeoutError):
-            for _ in range(50):  # those under way
-                systemd.recv(64)
-        end(process)
+        with running_gate(endpoint, tmp_path) as process:
+            assert [systemd.recv(64) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
+            process.send_signal(signal.SIGSTOP)
+            systemd.settimeout(1.0)
+            with pytest.raises(TimeoutError):
+                for _ in range(50):  # those under way
+                    systemd.recv(64)
 
 
 @pytest.mark.parametrize("duration", [0.2, 2.0])
@@ -157,8 +155,7 @@ def test_a_router_that_comes_back_finds_the_gate(keys: Path, tmp_path: Path) -> 
     endpoint = free_endpoint()
     with ExitStack() as stack:
         with running("router", endpoint):
-            gate = start_gate(endpoint, tmp_path, "--keys", str(keys))
-            stack.callback(end, gate)
+            gate = stack.enter_context(running_gate(endpoint, tmp_path, "--keys", str(keys)))
             transport = stack.enter_context(closing(open_zenoh("client", [endpoint])))
             station = Station(transport, load_signer(keys, "station"))
             station.arm("a")
@@ -193,25 +190,21 @@ def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Pat
     ]
     lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
     (tmp_path / "fleet.toml").write_text("\n".join(lines))
-    gate = start((sys.executable, "-m", "coopenv", "svea", "gate", "fleet.toml", "--car", CAR), tmp_path)
-    try:
-        with closing(open_zenoh("client", [endpoint])) as transport:
-            station = Station(transport, load_signer(keys, "other"))
-            station.arm("a")
-            station.command(speed=0.3)
-            wait_until(lambda: station.count("limits") == 1)
-    finally:
-        end(gate)
+    command = (*COOPENV, "svea", "gate", "fleet.toml", "--car", CAR)
+    with started(command, tmp_path), closing(open_zenoh("client", [endpoint])) as transport:
+        station = Station(transport, load_signer(keys, "other"))
+        station.arm("a")
+        station.command(speed=0.3)
+        wait_until(lambda: station.count("limits") == 1)
 
 
 def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
-    gate = start_gate(endpoint, tmp_path)
-    with closing(open_zenoh("client", [endpoint])) as transport:
+    with running_gate(endpoint, tmp_path) as gate, closing(open_zenoh("client", [endpoint])) as transport:
         station = Station(transport, None)
         station.arm("a")
         station.drive()
-    gate.terminate()
-    assert gate.communicate(timeout=10)[1].startswith("warning: without --keys whoever")
+        gate.terminate()
+        assert gate.communicate(timeout=10)[1].startswith("warning: without --keys whoever")
 
 
 @pytest.mark.parametrize(

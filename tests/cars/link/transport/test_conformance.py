@@ -78,12 +78,7 @@ def connect(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Connect]
 def settle(sender: Transport, receiver: Transport) -> None:
     """Wait until what the receiver has subscribed to is known to the sender."""
     heard = heard_by(receiver, "fleet/settle")
-
-    def arrived() -> bool:
-        sender.publish("fleet/settle", b"")
-        return bool(heard)
-
-    wait_until(arrived)
+    wait_until(lambda: heard, lambda: sender.publish("fleet/settle", b""))
 
 
 def test_messages_arrive_in_order_with_what_is_beside_them(connect: Connect) -> None:

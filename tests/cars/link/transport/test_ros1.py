@@ -9,8 +9,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -27,8 +26,8 @@ from coopenv.cars.transport.base import Address, LinkError
 from coopenv.cars.transport.ros1 import ENVELOPE, open_ros1, opened, sealed
 from coopenv.cars.transport.zenoh import open_transport
 from tests.helpers.brokers import ros_master
-from tests.helpers.processes import wait_until
-from tests.helpers.wire import free_port, heard_by, listening, ready
+from tests.helpers.processes import started, wait_until
+from tests.helpers.wire import free_port, heard_by, listening
 
 TYPES = dict.fromkeys(("agent7/riccatiPoint", "agent8/riccatiPoint"), "geometry_msgs/msg/PointStamped")
 
@@ -48,11 +47,9 @@ sys.stdin.read()
 """A node with the messages that Debian has made of the definitions, without anything of ours."""
 
 
-@contextmanager
-def authors(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+def authors(endpoint: str) -> AbstractContextManager[subprocess.Popen[str]]:
     uri = endpoint.replace("tcp/", "http://")
-    with ready((sys.executable, "-c", AUTHORS, uri), stdin=subprocess.PIPE) as process:
-        yield process
+    return started((sys.executable, "-c", AUTHORS, uri), Path.cwd(), stdin=subprocess.PIPE)
 
 
 def point(x: float) -> bytes:
@@ -99,12 +96,7 @@ def test_a_node_of_the_authors_stack_understands_the_bytes() -> None:
     with ros_master() as endpoint, authors(endpoint):
         ours = open_ros1(endpoint, TYPES)
         heard = heard_by(ours, "agent8/riccatiPoint")
-
-        def answered() -> bool:
-            ours.publish("agent7/riccatiPoint", point(1.0))
-            return bool(heard)
-
-        wait_until(answered)
+        wait_until(lambda: heard, lambda: ours.publish("agent7/riccatiPoint", point(1.0)))
         ours.close()
         assert heard[0].topic == "agent8/riccatiPoint"
         assert heard[0].payload[16:] == b"map" + struct.pack("<3d", 7.0, 2.0, 1.0)
@@ -119,12 +111,7 @@ def test_a_node_goes_on_when_its_master_is_back() -> None:
         heard = heard_by(ours, "agent8/riccatiPoint")
         ours.publish("agent7/riccatiPoint", point(1.0))
     with ros_master() as endpoint, authors(endpoint):
-
-        def answered() -> bool:
-            ours.publish("agent7/riccatiPoint", point(2.0))
-            return bool(heard)
-
-        wait_until(answered)
+        wait_until(lambda: heard, lambda: ours.publish("agent7/riccatiPoint", point(2.0)))
         ours.close()
     assert heard[-1].payload[19:] == struct.pack("<3d", 7.0, 2.0, 2.0)
 
@@ -146,12 +133,7 @@ def test_a_deployment_reaches_the_authors_stack(tmp_path: Path) -> None:
         station = open_transport(fleet)
         heard = heard_by(station, SVEA.topic_of("svea8", Role.POINT))
         message = encode(make("geometry_msgs/msg/PointStamped", header=header(5, "map"), point=(1.0, 2.0, 3.0)))
-
-        def answered() -> bool:
-            station.publish(SVEA.topic_of("svea7", Role.POINT), message)
-            return bool(heard)
-
-        wait_until(answered)
+        wait_until(lambda: heard, lambda: station.publish(SVEA.topic_of("svea7", Role.POINT), message))
         station.close()
     told = decode(heard[0].payload, SVEA.topics[Role.POINT].type).point
     assert (told.x, told.y, told.z) == (3.0, 2.0, 1.0)
