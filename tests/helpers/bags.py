@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -149,36 +149,41 @@ def later(given: Iterable[Message], *, stamps: float = 0.0, received: float = 0.
     ]
 
 
-def write(path: Path, given: Iterable[Message], form: str) -> Path:
-    """Write a bag; `form` is ros1, sqlite3 or mcap, and a compression. Return its path, with the form's suffix."""
-    ordered = sorted(given, key=lambda m: m.received)
-    form, _, compression = form.partition(" ")
-    if form == "ros1":
+def writer(path: Path, form: str) -> tuple[Path, Any, Any]:
+    """Return the path of a bag with the form's suffix, what writes it, and its store of types.
+
+    `form` is ros1, sqlite3 or mcap, and a compression.
+    """
+    storage, _, compression = form.partition(" ")
+    if storage == "ros1":
         from rosbags.rosbag1 import Writer as Writer1
 
         path = path.with_suffix(".bag")
-        writer = Writer1(path)
+        bag = Writer1(path)
         if compression:
-            writer.set_compression(Writer1.CompressionFormat[compression])
-        with writer as bag:
-            _fill(bag, ordered, codec.ros1(), lambda message: codec.ros1_of(codec.encode(message), message.__msgtype__))
-        return path
+            bag.set_compression(Writer1.CompressionFormat[compression])
+        return path, bag, codec.ros1()
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    folder = Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
+    folder = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if compression:
         folder.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
-    with folder as bag:
-        _fill(bag, ordered, codec.ros2(), codec.encode)
-    return path
+    return path, folder, codec.ros2()
 
 
-def _fill(bag: Any, ordered: list[Message], store: Any, encode: Callable[[Any], bytes]) -> None:
+def write(path: Path, given: Iterable[Message], form: str) -> Path:
+    """Write a bag and return its path; `form` as for `writer`."""
+    ordered = sorted(given, key=lambda m: m.received)
+    path, opened, store = writer(path, form)
     connections: dict[str, Any] = {}
-    for m in ordered:
-        if m.topic not in connections:
-            connections[m.topic] = bag.add_connection(m.topic, m.kind, typestore=store)
-        bag.write(connections[m.topic], BEGIN + m.received, encode(made(m)))
+    with opened as bag:
+        for m in ordered:
+            if m.topic not in connections:
+                connections[m.topic] = bag.add_connection(m.topic, m.kind, typestore=store)
+            payload = codec.encode(made(m))
+            payload = payload if store is codec.ros2() else codec.ros1_of(payload, m.kind)
+            bag.write(connections[m.topic], BEGIN + m.received, payload)
+    return path
 
 
 def made(m: Message) -> Any:
@@ -188,12 +193,11 @@ def made(m: Message) -> Any:
 
 def write_raw(path: Path, given: Iterable[tuple[str, bytes, int]], kinds: dict[str, str]) -> None:
     """Write an MCAP bag of CDR payloads with their topics and times of reception, ns; `kinds` are types by topic."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+    _, opened, store = writer(path, "mcap")
+    with opened as bag:
         connections: dict[str, Any] = {}
         for topic, payload, received in given:
             if topic in kinds:
                 if topic not in connections:
-                    connections[topic] = bag.add_connection(f"/{topic}", kinds[topic], typestore=codec.ros2())
+                    connections[topic] = bag.add_connection(f"/{topic}", kinds[topic], typestore=store)
                 bag.write(connections[topic], received, payload)

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable
+from contextlib import closing
 from typing import Any
 
+import numpy as np
+
+from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
-from coopenv.cars.fake.car import Fake
+from coopenv.cars.fake.car import Fake, fault_topic
 from coopenv.cars.gate.core import GateClock, write_drive
 from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, MotionCommand, Role
 from coopenv.cars.transport.base import Arrival
@@ -19,8 +24,15 @@ MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 OVERTAKING = (Car(name="svea7", marker=7), Car(name="svea8", marker=6))
 CROSSING = (Car(name="svea7"), Car(name="svea3", marker=3, landmark="ML"))
 EXACT = {"noise.enabled": False}
+CAMERA, MARKER = np.array([0.3218, 0.0, 0.2233]), np.array([0.16, 0.0, 0.25])
+"""Of a car, in the body frame, m."""
 STEP = 1_000_000
 """ns by which the clock goes on."""
+
+
+def turned(yaw: float) -> np.ndarray:
+    """Return the rotation about the vertical axis."""
+    return np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
 
 
 class Stage:
@@ -45,7 +57,7 @@ class Stage:
         self.hub, self._said = Hub(), defaultdict[str, list[Arrival]](list)
         self.network = self.hub.connect()
         self.network.subscribe("**", lambda arrival: self._said[arrival.topic].append(arrival))
-        binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
+        self.binding = binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
         clock = GateClock(lambda: self.wall + self.now, lambda: self.now)
         self.cars = {
             car.name: Fake(binding, car.name, self.hub.connect(), differential=wheel, clock=clock, **options)
@@ -70,6 +82,21 @@ class Stage:
             self.command(car, speed, steering)
             self.run(0.05)
 
+    def pose(self, car: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return rotation and position of a car."""
+        world = self.cars[car].world
+        return world.pose(world.agent)
+
+    def put(self, car: str, x: float, y: float, yaw: float) -> None:
+        """Put a car somewhere."""
+        world = self.cars[car].world
+        world.put(world.agent, turned(yaw), np.array([x, y, 0.0]))
+
+    def ask(self, fault: str, car: str = "svea7") -> None:
+        """Give a car a fault."""
+        self.network.publish(fault_topic(car), encode(make("std_msgs/msg/String", data=fault)))
+        self.run(0.001)
+
     def reset(self, seed: int) -> None:
         """Put all fakes at the start of a seed."""
         self.network.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=seed)))
@@ -85,6 +112,13 @@ class Stage:
     def hub_arrivals(self) -> list[Arrival]:
         """All messages since `forget`."""
         return [arrival for arrivals in self._said.values() for arrival in arrivals]
+
+    def roles_read(self, arrivals: Iterable[Arrival]) -> set[Role]:
+        """Return the roles of what a station reads of messages, of which it rejects none."""
+        with closing(Svea(self.fleet, self.binding, Hub().connect())) as backend:
+            found = {sample.role for arrival in arrivals for sample in backend.intake.samples(arrival)}
+            assert not any(backend.intake.rejected.values())
+        return found
 
     def forget(self) -> None:
         """Forget what has been said."""

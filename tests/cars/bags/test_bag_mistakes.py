@@ -22,7 +22,6 @@ from coopenv.backends.mcap import container
 from coopenv.backends.mcap.format import metadata_names
 from coopenv.backends.sources import SourceKind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
-from coopenv.cars import codec
 from coopenv.cars.bags import Bag, files
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
@@ -63,6 +62,7 @@ def topics(tmp_path: Path) -> Path:
 
 
 def opened(folder: Path, text: str, drive: list[bags.Message] | None = None, form: str = "ros1") -> Bag:
+    folder.mkdir(exist_ok=True)
     (folder / "topics.toml").write_text(text, encoding="utf-8")
     return Bag([bags.write(folder / "drive", short() if drive is None else drive, form)], folder / "topics.toml")
 
@@ -273,8 +273,6 @@ def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
 def test_a_camera_that_says_it_is_not_calibrated_has_the_calibration_of_the_environment(tmp_path: Path) -> None:
     fields = {"k": np.zeros(9), "d": [], "height": 208, "width": 316, "distortion_model": ""}
     told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
-    for name in ("with", "without"):
-        (tmp_path / name).mkdir()
     with pytest.warns(DataWarning, match=r"camera_info: says that the camera is not calibrated \(k is zero\)"):
         bag = opened(tmp_path / "with", MAP, [*short(), told], "mcap")
     assert bag.log.lenses == opened(tmp_path / "without", MAP, short(), "mcap").log.lenses
@@ -289,7 +287,6 @@ def test_a_clock_that_was_set_leaves_a_gap_that_is_named(tmp_path: Path) -> None
     ]
     with pytest.raises(DataError, match=r"drive: nothing for 8\.64e\+04 s after .* start and duration in topics\.toml"):
         opened(tmp_path, MAP, later, "mcap")
-    (tmp_path / "part").mkdir()
     part = opened(tmp_path / "part", f"duration = 0.1\n{MAP}", later, "mcap")
     assert part.capabilities.ticks == 7
 
@@ -322,13 +319,11 @@ def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
     text = MAP.replace("agent = 8", 'agent = 8\ntopics = { imu = "/imu" }')
     *_, last = opened(tmp_path, text, [*short(), *imu], "mcap").episode(None, {})
     assert_allclose(last.angular_velocity, [[0.0, 0.0, 0.7]])
-    (tmp_path / "unread").mkdir()
     with pytest.warns(DataWarning, match=r"turn rates of svea3 are the wheels'; unread: /imu, of type sensor_msgs"):
         opened(tmp_path / "unread", MAP, [*short(), *imu], "mcap")
 
 
 def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> None:
-    (tmp_path / "turned").mkdir()
     frames = "[frames]\nmap = { position = [1.0, 2.0, 0.5] }\ntruth = { yaw = 1.5707963267948966 }\n"
     plain, turned = opened(tmp_path, MAP), opened(tmp_path / "turned", MAP + frames)
     for a, b in zip(plain.episode(None, {}), turned.episode(None, {}), strict=True):
@@ -356,21 +351,8 @@ LARGE = 40 * 2**20
 
 
 def bomb(path: Path, form: str, size: int = LARGE, count: int = 1) -> Path:
-    """Write a bag whose messages are zeros; `form` is the storage and what of it is compressed."""
-    storage, _, mode = form.partition(" ")
-    if storage == "ros1":
-        from rosbags.rosbag1 import Writer as Writer1
-
-        path = path.with_suffix(".bag")
-        bag: Any = Writer1(path)
-        bag.set_compression(Writer1.CompressionFormat[mode])
-        store = codec.ros1()
-    else:
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-
-        bag, store = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]), codec.ros2()
-        if mode:
-            bag.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    """Write a bag whose messages are zeros."""
+    path, bag, store = bags.writer(path, form)
     with bag:
         connection = bag.add_connection(TOPIC, KIND, typestore=store)
         for number in range(count):

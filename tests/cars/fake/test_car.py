@@ -15,15 +15,10 @@ from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
 from coopenv.cars.profile import Role
 from coopenv.scenario import load_scenario
-from tests.helpers.fakes import CROSSING, EXACT, MARKERS, OVERTAKING, Stage
+from tests.helpers.fakes import CAMERA, CROSSING, EXACT, MARKER, MARKERS, OVERTAKING, Stage, turned
 
 SEQUENCE = [(0.4, 0.3, 1.0), (0.25, -0.4, 1.5), (0.05, 0.2, 0.5), (0.5, 0.0, 1.0), (0.0, 0.5, 1.0)]
 """Speed m/s, steering rad, duration s; the third is within the dead band."""
-
-
-def pose(stage: Stage, car: str) -> tuple[np.ndarray, np.ndarray]:
-    world = stage.cars[car].world
-    return world.pose(world.agent)
 
 
 @pytest.mark.parametrize("seed", [0, 5, 2**40 + 1])
@@ -35,11 +30,11 @@ def test_it_starts_where_the_simulator_does(seed: int) -> None:
     truth = Simulated(stage.scenario).reset(seed, {}).truth
     assert truth is not None
     for i, car in enumerate(stage.cars):
-        R, p = pose(stage, car)
+        R, p = stage.pose(car)
         assert_allclose(p, truth.position[i], atol=1e-12)
         assert_allclose(R, truth.rotation[i], atol=1e-12)
     stage.run(1.0)
-    assert_allclose(pose(stage, "svea8")[1], truth.position[1], atol=1e-12)  # what was commanded before is forgotten
+    assert_allclose(stage.pose("svea8")[1], truth.position[1], atol=1e-12)  # what was commanded before is forgotten
 
 
 def test_it_moves_as_the_simulator_does() -> None:
@@ -56,7 +51,7 @@ def test_it_moves_as_the_simulator_does() -> None:
                 pass
             stage.command("svea7", speed, steering)
             stage.run(0.05)
-            R, p = pose(stage, "svea7")
+            R, p = stage.pose("svea7")
             places.append(p.copy())
             headings.append(np.arctan2(R[1, 0], R[0, 0]))
             state = simulated._world.view("position")[0, 4], simulated._world.view("rotation")[0, 4]
@@ -96,9 +91,9 @@ def test_without_noise_sensors_are_exact(odometry: Any) -> None:
 def test_the_cars_own_filter_is_where_it_went() -> None:
     stage = Stage("svea_overtaking", OVERTAKING, EXACT)
     stage.run(0.05)
-    R0, p0 = (value.copy() for value in pose(stage, "svea7"))
+    R0, p0 = (value.copy() for value in stage.pose("svea7"))
     stage.drive("svea7", 0.3, 0.3, 4.0)
-    R, p = pose(stage, "svea7")
+    R, p = stage.pose("svea7")
     said = stage.arrivals("svea7", Role.ODOMETRY)[-1]
     q = said.pose.pose.orientation
     assert_allclose([said.pose.pose.position.x, said.pose.pose.position.y], (R0.T @ (p - p0))[:2], atol=0.03)
@@ -143,7 +138,7 @@ def test_a_moving_landmark_drives_its_motion_and_says_where_it_is() -> None:
     stage = Stage("svea_crossing", CROSSING, EXACT)
     stage.reset(0)
     stage.run(6.0)
-    R, p = pose(stage, "svea3")
+    R, p = stage.pose("svea3")
     assert_allclose(p, [-1.6 + 0.26 * 4.0, 1.45, 0.0], atol=0.005)
     assert_allclose(R, np.eye(3), atol=1e-9)
     said = stage.arrivals("svea3", Role.ESTIMATE)
@@ -157,12 +152,7 @@ def test_a_moving_landmark_drives_its_motion_and_says_where_it_is() -> None:
 
 FOCAL, CENTRE, SIZE = (213.161906, 213.521038), (154.841998, 114.98398), (316, 208)
 DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
-CAMERA, MARKER = np.array([0.3218, 0.0, 0.2233]), np.array([0.16, 0.0, 0.25])
 BOX, BOX_CENTRE = np.array([0.586, 0.25, 0.25]), np.array([0.16, 0.0, 0.125])
-
-
-def turned(yaw: float) -> np.ndarray:
-    return np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
 
 
 def pixel(position: np.ndarray, yaw: float, target: np.ndarray) -> np.ndarray | None:
@@ -195,11 +185,6 @@ def places(stage: Stage) -> dict[int, np.ndarray]:
     return {MARKERS[mark.name]: np.array(mark.position) for mark in stage.scenario.landmarks if mark.name in MARKERS}
 
 
-def put(stage: Stage, car: str, x: float, y: float, yaw: float) -> None:
-    world = stage.cars[car].world
-    world.put(world.agent, turned(yaw), np.array([x, y, 0.0]))
-
-
 def frame(stage: Stage, car: str) -> tuple[Any, Any]:
     """Return the last frame as blocks and as the authors' bearings."""
     stage.forget()
@@ -212,8 +197,8 @@ def test_pixels_of_many_poses() -> None:
     seen, unseen = 0, 0
     for _ in range(60):
         x, y, yaw = rng.uniform(-1.5, 1.5), rng.uniform(-2.0, 1.5), np.pi / 2 + rng.uniform(-0.8, 0.8)
-        put(stage, "svea7", x, y, yaw)
-        put(stage, "svea8", 20.0, 20.0, 0.0)
+        stage.put("svea7", x, y, yaw)
+        stage.put("svea8", 20.0, 20.0, 0.0)
         blocks, unit = frame(stage, "svea7")
         found = {b.signature: (b.center_x, b.center_y) for b in blocks.objects}
         for number, place in places(stage).items():
@@ -238,8 +223,8 @@ def test_cars_see_each_other_and_hide_what_is_behind() -> None:
     for _ in range(60):
         x, y, yaw = rng.uniform(-0.5, 0.5), rng.uniform(-2.0, 0.0), np.pi / 2 + rng.uniform(-0.3, 0.3)
         ox, oy, oyaw = x + rng.uniform(-0.5, 0.5), y + rng.uniform(0.8, 2.0), rng.uniform(-3.0, 3.0)
-        put(stage, "svea8", x, y, yaw)
-        put(stage, "svea7", ox, oy, oyaw)
+        stage.put("svea8", x, y, yaw)
+        stage.put("svea7", ox, oy, oyaw)
         found = {b.signature for b in frame(stage, "svea8")[0].objects}
         position, other = np.array([x, y, 0.0]), np.array([ox, oy, 0.0])
         carried = other + turned(oyaw) @ MARKER
@@ -256,17 +241,17 @@ def test_cars_see_each_other_and_hide_what_is_behind() -> None:
 def test_a_leader_sees_its_follower_too() -> None:
     """A camera knows nothing of the order in which vehicles may hear each other."""
     stage = Stage("svea_overtaking", OVERTAKING, EXACT)
-    put(stage, "svea7", 0.0, -2.0, np.pi / 2)
-    put(stage, "svea8", 0.1, -1.0, np.pi / 2)
+    stage.put("svea7", 0.0, -2.0, np.pi / 2)
+    stage.put("svea8", 0.1, -1.0, np.pi / 2)
     assert 6 in {b.signature for b in frame(stage, "svea7")[0].objects}
 
 
 def test_blocks_are_as_large_as_they_are_near_and_the_largest_comes_first() -> None:
     stage = Stage("svea_overtaking", OVERTAKING, EXACT)
-    put(stage, "svea8", 20.0, 0.0, 0.0)
+    stage.put("svea8", 20.0, 0.0, 0.0)
     sizes = []
     for y in (-2.5, -1.0, 0.0):
-        put(stage, "svea7", 0.0, y, np.pi / 2)
+        stage.put("svea7", 0.0, y, np.pi / 2)
         blocks = frame(stage, "svea7")[0].objects
         areas = [b.width * b.height for b in blocks]
         assert areas == sorted(areas, reverse=True)
@@ -278,8 +263,8 @@ def test_blocks_are_as_large_as_they_are_near_and_the_largest_comes_first() -> N
 
 def test_an_empty_frame_is_a_frame() -> None:
     stage = Stage("svea_overtaking", OVERTAKING, EXACT)
-    put(stage, "svea7", 0.0, 0.0, -np.pi / 2)
-    put(stage, "svea8", 0.0, 1.5, 0.0)
+    stage.put("svea7", 0.0, 0.0, -np.pi / 2)
+    stage.put("svea8", 0.0, 1.5, 0.0)
     stage.run(0.04)
     stage.forget()
     stage.run(1.0)
@@ -292,5 +277,5 @@ def test_the_moving_landmark_is_seen_once_its_car_is_there() -> None:
     for stage, expected in ((both, True), (alone, False)):
         stage.reset(0)
         stage.run(7.0)
-        put(stage, "svea7", 0.0, -1.0, np.pi / 2)
+        stage.put("svea7", 0.0, -1.0, np.pi / 2)
         assert (3 in {b.signature for b in frame(stage, "svea7")[0].objects}) == expected

@@ -146,6 +146,6 @@ def test_a_router_that_dies_stops_all_and_arming_again_goes_on(fleet: Fleet) -> 
         env.reset(seed=0, options={"arm": True})
         infos = drive(env, 1.0)
         assert env.agents and infos["vehicle_1"]["car"]["stopped"] == ""
-        wait_until(lambda: fleet.moves("svea7"))
+        wait_until(lambda: fleet.moves("svea7"), lambda: drive(env, 0.1))
     finally:
         env.close()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.fault_text import FaultError
-from coopenv.cars.codec import encode, make, stamp_of
+from coopenv.cars.codec import stamp_of
 from coopenv.cars.fake import car
 from coopenv.cars.fake.faults import FAKE_FAULTS, CarFaults, fake_fault, fault_topic
 from coopenv.cars.profile import SVEA, Role
@@ -56,11 +56,6 @@ def test_a_fault_begins_and_ends() -> None:
     assert [faults.value("delay", int(t * 1e9)) for t in times] == [0.0, 0.2, 0.2, 0.5, 0.2, 0.2, 0.0]
 
 
-def ask(stage: Stage, text: str, name: str = "svea7") -> None:
-    stage.network.publish(fault_topic(name), encode(make("std_msgs/msg/String", data=text)))
-    stage.run(0.001)
-
-
 @pytest.fixture
 def stage() -> Stage:
     made = Stage("svea_overtaking", OVERTAKING, EXACT)
@@ -70,7 +65,7 @@ def stage() -> Stage:
 
 def test_a_frozen_car_says_nothing_and_stops_where_nobody_commands_it(stage: Stage) -> None:
     stage.drive("svea7", 0.3, 0.0, 2.0)
-    ask(stage, "freeze@0+2")
+    stage.ask("freeze@0+2")
     stage.forget()
     stage.drive("svea7", 0.3, 0.0, 1.9)
     assert not stage.arrivals("svea7", Role.WHEEL) and not stage.arrivals("svea7", Role.DETECTIONS)
@@ -84,7 +79,7 @@ def test_a_frozen_car_says_nothing_and_stops_where_nobody_commands_it(stage: Sta
 def test_kill_ends_the_process(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     died: list[bool] = []
     monkeypatch.setattr(car, "end_process", lambda: died.append(True))
-    ask(stage, "kill@0.1")
+    stage.ask("kill@0.1")
     assert not died
     stage.run(0.15)
     assert died
@@ -95,11 +90,11 @@ def test_kill_ends_the_process(stage: Stage, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_loss_and_delay(stage: Stage) -> None:
     stage.forget()
-    ask(stage, "loss=0.3@0+4")
+    stage.ask("loss=0.3@0+4")
     stage.run(4.0)
     assert 0.55 < len(stage.arrivals("svea7", Role.IMU)) / 400 < 0.85
     assert len(stage.arrivals("svea8", Role.IMU)) > 390
-    ask(stage, "delay=0.25")
+    stage.ask("delay=0.25")
     stage.run(0.5)
     stage.forget()
     stage.run(0.5)
@@ -109,8 +104,8 @@ def test_loss_and_delay(stage: Stage) -> None:
 
 
 def test_the_cars_clock_is_wrong_and_that_of_motion_capture_is_not(stage: Stage) -> None:
-    ask(stage, "clock_offset=0.5")
-    ask(stage, "clock_drift=0.01")
+    stage.ask("clock_offset=0.5")
+    stage.ask("clock_drift=0.01")
     stage.run(2.0)
     stage.forget()
     stage.run(0.1)
@@ -131,28 +126,28 @@ def test_blocks_that_are_false_doubled_or_swapped(stage: Stage) -> None:
     before = frames(stage, 0.5)[-1]
     numbers = sorted(n for n, _, _ in before)
     assert set(numbers) == {1, 2, 4, 5}
-    ask(stage, "duplicate_blocks@0+1", "svea8")
+    stage.ask("duplicate_blocks@0+1", "svea8")
     doubled = frames(stage, 0.9)[-1]
     assert sorted(n for n, _, _ in doubled) == sorted(numbers * 2)
     stage.run(0.2)
-    ask(stage, "swapped_signatures@0+1", "svea8")
+    stage.ask("swapped_signatures@0+1", "svea8")
     swapped = frames(stage, 0.9)[-1]
     assert sorted(n for n, _, _ in swapped) == numbers
     assert {(x, y) for _, x, y in swapped} == {(x, y) for _, x, y in before} and set(swapped) != set(before)
     stage.run(0.2)
-    ask(stage, "false_blocks=30@0+4", "svea8")
+    stage.ask("false_blocks=30@0+4", "svea8")
     extra = [len(frame) - len(before) for frame in frames(stage, 3.9)]
     assert sum(extra) == pytest.approx(30 * 3.9, rel=0.4)
 
 
 def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage, capsys: pytest.CaptureFixture[str]) -> None:
     for name, kind in FAKE_FAULTS.items():
-        ask(stage, f"{name}={kind.high:g}@1000")
+        stage.ask(f"{name}={kind.high:g}@1000")
     assert not capsys.readouterr().err
-    ask(stage, "melt")
+    stage.ask("melt")
     stage.network.publish(fault_topic("svea7"), b"\1\2")
     stage.network.publish(SVEA.topic_of("svea7", Role.MANUAL), b"nonsense")
     stage.run(0.01)
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 3 and told[0].startswith("svea7: unknown fault 'melt'")
-    assert np.isfinite(stage.cars["svea7"].world.pose(stage.cars["svea7"].world.agent)[1]).all()
+    assert np.isfinite(stage.pose("svea7")[1]).all()

@@ -29,7 +29,7 @@ from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cars.vision import Calibration
 from tests.helpers.cars import PATIENT
-from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
+from tests.helpers.fakes import CAMERA, EXACT, MARKER, MARKERS, OVERTAKING, Stage
 from tests.helpers.frames import BEARINGS, FLEET, FRAMES, grey_frame, seeing
 from tests.helpers.processes import COOPENV, ROOT, wait_until
 from tests.helpers.wire import free_endpoint, heard_by
@@ -40,7 +40,6 @@ KIND = "apriltag_msgs/msg/AprilTagDetection"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 SHIPPED = load_deployment(FLEET)
 LENS = dict(SHIPPED.overrides)
-CAMERA, TAG = np.array([0.3218, 0.0, 0.2233]), np.array([0.16, 0.0, 0.25])
 
 
 def profile_with(kind: str, **vision: Any) -> CarProfile:
@@ -58,9 +57,8 @@ class Eyes(Stage):
             "svea_overtaking", OVERTAKING, EXACT | LENS, sensors, profile, settings=FakeSettings(marker=0.2)
         )
         self.reader = FrameReader("svea7", profile, Calibration.of(self.scenario.cameras[0]), self.hub.connect())
-        for name, place in (("svea7", (0.0, -1.0)), ("svea8", (0.3, 0.5))):
-            world = self.cars[name].world
-            world.put(world.agent, turned(0.5 * np.pi), np.array([*place, 0.0]))
+        self.put("svea7", 0.0, -1.0, 0.5 * np.pi)
+        self.put("svea8", 0.3, 0.5, 0.5 * np.pi)
 
     def see(self) -> Any:
         """Return the bearings of the next frame."""
@@ -71,10 +69,6 @@ class Eyes(Stage):
         return self.arrivals("svea7", Role.BEARINGS)[-1]
 
 
-def turned(yaw: float) -> np.ndarray:
-    return np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
-
-
 def rays_of(message: Any) -> dict[int, np.ndarray]:
     """Return the rays (3,), camera to tag, optical frame."""
     return {b.id: -np.array([b.bearing_x, b.bearing_y, b.bearing_z]) for b in message.bearing}
@@ -82,9 +76,9 @@ def rays_of(message: Any) -> dict[int, np.ndarray]:
 
 def true_rays(eyes: Eyes) -> dict[int, np.ndarray]:
     """Return where tags are as seen by svea7, by coordinates alone."""
-    (R, p), (Q, q) = (car.world.pose(car.world.agent) for car in eyes.cars.values())
+    (R, p), (Q, q) = map(eyes.pose, eyes.cars)
     points = {MARKERS[mark.name]: np.array(mark.position) for mark in eyes.scenario.landmarks}
-    points[6] = q + Q @ TAG
+    points[6] = q + Q @ MARKER
     found = {}
     for number, point in points.items():
         forward, left, up = R.T @ (point - p) - CAMERA
@@ -122,19 +116,15 @@ def test_bearings_are_stamped_with_the_middle_of_the_exposure() -> None:
 def test_a_rolling_shutter_is_read_at_the_time_of_its_rows() -> None:
     """While the car turns, bearings hold for their stamps, exactly for their rows; without settings for neither."""
     eyes = Eyes(exposure=0.008, row_time=4e-5)
-    world, camera, vision = (
-        eyes.cars["svea7"].world,
-        Calibration.of(eyes.scenario.cameras[0]),
-        eyes.fleet.profile.vision,
-    )
-    world.put(world.agent, turned(0.7 * np.pi), np.array([-0.3, -1.2, 0.0]))
+    camera, vision = Calibration.of(eyes.scenario.cameras[0]), eyes.fleet.profile.vision
+    eyes.put("svea7", -0.3, -1.2, 0.7 * np.pi)
     eyes.drive("svea7", 0.4, -0.45, 2.0)
     poses = eyes.arrivals("svea7", Role.TRUTH)
     table = np.array([(stamp_of(m) - eyes.wall, *place_of(m)) for m in poses], dtype=np.float64)
 
     def error(ray: np.ndarray, marker: int, stamp: float) -> float:
         x, y, yaw = (np.interp(stamp - eyes.wall, table[:, 0], column) for column in table[:, 1:].T)
-        world.put(world.agent, turned(yaw), np.array([x, y, 0.0]))
+        eyes.put("svea7", x, y, yaw)
         return float(np.degrees(np.linalg.norm(ray - true_rays(eyes)[marker])))
 
     at_stamp, at_row, unset = list[float](), list[float](), list[float]()
@@ -157,17 +147,14 @@ def place_of(message: Any) -> tuple[float, float, float]:
 def test_identities_are_lost_and_wrong() -> None:
     eyes = Eyes()
     before = rays_of(eyes.see())
-    eyes.network.publish(
-        "fleet/svea7/coopenv/fault", encode(make("std_msgs/msg/String", data="swapped_signatures@0+1"))
-    )
+    eyes.ask("swapped_signatures@0+1")
     swapped = rays_of(eyes.see())
     assert swapped.keys() == before.keys()
     assert max(np.degrees(np.linalg.norm(swapped[n] - before[n])) for n in before) > 5.0
     eyes.run(1.0)
-    world = eyes.cars["svea7"].world
-    world.put(world.agent, turned(0.5 * np.pi), np.array([0.0, -9.0, 0.0]))  # tags of 7 pixels
+    eyes.put("svea7", 0.0, -9.0, 0.5 * np.pi)  # tags of 7 pixels
     assert rays_of(eyes.see()).keys() < before.keys()
-    eyes.network.publish("fleet/svea7/coopenv/fault", encode(make("std_msgs/msg/String", data="false_blocks=100")))
+    eyes.ask("false_blocks=100")
     assert any(rays_of(eyes.see()).keys() - true_rays(eyes).keys() for _ in range(10))
 
 

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.backend import Svea
-from coopenv.cars.backend.binding import bind
+from coopenv.cars.backend.assembler import Intake
 from coopenv.cars.backend.station import Gates
 from coopenv.cars.bags.topic_map import load_map, patterns_of
 from coopenv.cars.codec import decode
@@ -21,7 +20,7 @@ from coopenv.cars.gate.process import GateConnection
 from coopenv.cars.profile import FOLDER, SVEA, USUAL, CarProfile, MotionCommand, Role, load_profile
 from coopenv.cars.readings import check_types
 from coopenv.cars.transport.base import Arrival
-from tests.helpers.fakes import EXACT, MARKERS, OVERTAKING, Stage
+from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 from tests.helpers.hub import Hub
 
 GOOD = """
@@ -216,20 +215,15 @@ def fleet_file(folder: Path, text: str = FLEET) -> Path:
 
 def test_a_second_make_drives_a_fake_and_is_read(rover: CarProfile) -> None:
     stage = Stage("svea_overtaking", OVERTAKING, EXACT, profile=rover)
-    backend = Svea(stage.fleet, bind(stage.scenario, OVERTAKING, MARKERS, "test", None, rover), stage.hub.connect())
-    try:
-        stage.drive("svea7", 0.3, 0.25, 2.0)
-        truth, wheel = stage.arrivals("svea7", Role.TRUTH)[-1], stage.arrivals("svea7", Role.WHEEL)[-1]
-        assert wheel.twist.twist.linear.x == pytest.approx(0.3, abs=1e-3)
-        assert truth.twist.twist.angular.z == pytest.approx(0.3 * 0.2553419 / 0.324, abs=1e-2)  # to the left
-        assert {a.topic for a in stage.hub_arrivals} >= {"robots/svea7/wheel_odometry/velocity", "vicon/svea7"}
-        assert not [a for a in stage.hub_arrivals if "mavros" in a.topic or "qualisys" in a.topic]
-        assert set(backend.intake.topics) <= {a.topic for a in stage.hub_arrivals}
-        read = [sample for arrival in stage.hub_arrivals for sample in backend.intake.samples(arrival)]
-        assert {sample.role for sample in read} == {Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.TRUTH}
-        assert not any(backend.intake.rejected[car] for car in ("svea7", "svea8"))
-    finally:
-        backend.close()
+    stage.drive("svea7", 0.3, 0.25, 2.0)
+    truth, wheel = stage.arrivals("svea7", Role.TRUTH)[-1], stage.arrivals("svea7", Role.WHEEL)[-1]
+    assert wheel.twist.twist.linear.x == pytest.approx(0.3, abs=1e-3)
+    assert truth.twist.twist.angular.z == pytest.approx(0.3 * 0.2553419 / 0.324, abs=1e-2)  # to the left
+    topics = {arrival.topic for arrival in stage.hub_arrivals}
+    assert topics >= {"robots/svea7/wheel_odometry/velocity", "vicon/svea7"}
+    assert not [topic for topic in topics if "mavros" in topic or "qualisys" in topic]
+    assert set(Intake(stage.binding, stage.fleet.sensors).topics) <= topics
+    assert stage.roles_read(stage.hub_arrivals) == {Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.TRUTH}
 
 
 def test_a_differential_drive_by_its_profile_alone() -> None:
@@ -245,11 +239,7 @@ def test_a_differential_drive_by_its_profile_alone() -> None:
             sent = stage.arrivals("svea7", Role.MANUAL)[-1].twist
             assert sent.linear.x == pytest.approx(0.3)
             assert sent.angular.z == pytest.approx(0.3 * math.tan(0.25) / 0.324)
-            backend = Svea(stage.fleet, bind(stage.scenario, OVERTAKING, MARKERS, "t", None, robot), Hub().connect())
-            read = [sample for arrival in stage.hub_arrivals for sample in backend.intake.samples(arrival)]
-            assert {sample.role for sample in read} == {Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.TRUTH}
-            assert not backend.intake.rejected["svea7"]
-            backend.close()
+            assert stage.roles_read(stage.hub_arrivals) == {Role.WHEEL, Role.IMU, Role.DETECTIONS, Role.TRUTH}
     assert turns["geometry_msgs/msg/TwistStamped"] == pytest.approx(turns["mavros_msgs/msg/ManualControl"], abs=1e-4)
 
 
