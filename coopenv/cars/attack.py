@@ -331,9 +331,9 @@ def _try(intruder: Intruder, what: str, send: Send, each: int) -> Outcome:
 def _look(intruder: Intruder, found: Outcome, before: Mapping[str, Any]) -> Outcome:
     found.refused, found.through = 0, intruder.answered
     for car, gate in intruder.gates.states.items():
-        new = {reason: count - before[car].rejections.get(reason, 0) for reason, count in gate.rejections.items()}
+        new = gate.rejections - before[car].rejections
         passed = new.pop(Reason.FOREIGN, 0) + gate.accepted - before[car].accepted + (gate.state in OPEN)
-        found.refused += sum(new.values())
+        found.refused += new.total()
         found.through += passed
         found.speed = float(np.fmax(found.speed, intruder.speeds[car]))
     return found

@@ -161,7 +161,7 @@ class GateState:
     session: str = ""
     nonce: str = ""
     stamp: int = 0  # ns, by the clock of the car
-    rejections: dict[str, int] = field(default_factory=dict)
+    rejections: Counter[str] = field(default_factory=Counter)
     accepted: int = 0  # commands, since its start
     received: float = float("-inf")  # by the monotonic clock, s
 
@@ -191,7 +191,7 @@ class Gates:
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
         self.profile, self._probed, self._lock = profile, probed, threading.Lock()
         self._states = {car: GateState() for car in cars}
-        self._before: dict[str, dict[str, int]] = {}
+        self._before: dict[str, Counter[str]] = {}
         self._cars = {self.profile.topic_of(car, Role.GATE): car for car in cars}
         self._stopping = False
         self.stopped_by_others: set[str] = set()
@@ -215,8 +215,8 @@ class Gates:
         The gate itself counts since its start.
         """
         with self._lock:
-            counts, before = self._states[car].rejections, self._before.get(car, {})
-        since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
+            counts, before = self._states[car].rejections, self._before.get(car, Counter())
+        since = {reason: count - before[reason] for reason, count in counts.items()}
         return dict(counts) if any(count < 0 for count in since.values()) else since  # the gate was started anew
 
     def _receive(self, arrival: Arrival) -> None:
@@ -233,7 +233,7 @@ class Gates:
         if not -AHEAD <= arrival.received - stamp <= LATE:
             self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
             return
-        counts = dict(zip(m.rejections, (int(n) for n in m.counts), strict=False))
+        counts = Counter(dict(zip(m.rejections, map(int, m.counts), strict=False)))
         with self._lock:
             if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
@@ -266,7 +266,7 @@ class Gates:
                 if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
                     self.end()
                     self.stopped_by_others.add(car)
-                    if states[car].rejections.get(Reason.FOREIGN, 0) > before[car].rejections.get(Reason.FOREIGN, 0):
+                    if states[car].rejections[Reason.FOREIGN] > before[car].rejections[Reason.FOREIGN]:
                         raise CoopenvError(f"not armed: {car}: {BYPASSED}")
                     raise CoopenvError(f"{car}: was stopped while it was being armed")
             if time.monotonic() > until:
@@ -359,7 +359,7 @@ def neutral_command(profile: CarProfile, car: str) -> tuple[str, bytes]:
 
 def _why_closed(before: GateState, now: GateState) -> str:
     """Return why a gate has not opened, by what it has refused since."""
-    news = {r: n - before.rejections.get(r, 0) for r, n in now.rejections.items() if n > before.rejections.get(r, 0)}
+    news = now.rejections - before.rejections
     if "signature" in news:
         return (
             "its gate refuses this end's signature: does it trust this station (--station), "

@@ -133,17 +133,12 @@ def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patien
                 process.wait_until_ready(until)
             yield endpoint
         finally:
-            _end(started)
-
-
-def _end(started: list[Process]) -> None:
-    """End processes, the router last: the cars' gates take their leave."""
-    for some in (started[1:], started[:1]):
-        for process in some:
-            process.terminate()
-        until = time.monotonic() + GRACE
-        for process in some:
-            process.end(until)
+            for some in (started[1:], started[:1]):  # the router last: the cars' gates take their leave
+                for process in some:
+                    process.terminate()
+                until = time.monotonic() + GRACE
+                for process in some:
+                    process.end(until)
 
 
 def free_port() -> int:

@@ -243,9 +243,11 @@ def test_the_observers_own_message_counts_before_the_pose_and_a_stale_one_not_at
     assert assembler.refused["stale message"] == 1
 
 
+WITH_LORRY = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
+
+
 def test_a_moving_landmark_counts_as_long_as_it_is_heard() -> None:
-    fleet = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
-    assembler = begun(bind(world(), fleet, {"A": 1, "B": 2}, "lab.toml", None))
+    assembler = begun(bind(world(), WITH_LORRY, {"A": 1, "B": 2}, "lab.toml", None))
 
     def look(k: int) -> Sensed:
         stamp = START + k * 10 * MS
@@ -261,8 +263,7 @@ def test_a_moving_landmark_counts_as_long_as_it_is_heard() -> None:
 
 
 def test_what_a_moving_landmark_says_counts_once_and_not_for_long() -> None:
-    fleet = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
-    assembler = begun(bind(world(), fleet, {"A": 1, "B": 2}, "lab.toml", None))
+    assembler = begun(bind(world(), WITH_LORRY, {"A": 1, "B": 2}, "lab.toml", None))
 
     def say(stamp: int, place: float, delay: int = MS) -> None:
         said = CarPose(np.array([place, 2.0, 0.0]), np.eye(3))

@@ -121,6 +121,14 @@ def test_the_innovation_of_bearings_counts_in_standard_deviations() -> None:
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 
 
+def closed_watchdog(safety: Safety, monitor: LinkMonitor) -> Watchdog:
+    """Return one whose thread has ended; a is driven here, b is not."""
+    station, gates = Station(Hub().connect(), (), None, {}), Gates(Hub().connect(), (), USUAL, None)
+    made = Watchdog(safety, station, gates, monitor, ("a",), ("b",), (), 1.0)
+    made.close()
+    return made
+
+
 @pytest.mark.parametrize(
     ("places", "judge", "found"),
     [
@@ -139,10 +147,7 @@ def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[
     monitor.looked = BEGIN + 100 * MS
     for car, x in places.items():
         monitor.place(car, np.array([x, 0.0, 0.0]), BEGIN + 90 * MS)
-    safety = Safety(geofence=CORNERS, separation=0.3, judge=judge)
-    station = Station(Hub().connect(), (), None, {})
-    watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
-    watchdog.close()
+    watchdog = closed_watchdog(Safety(geofence=CORNERS, separation=0.3, judge=judge), monitor)
     assert [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()] == found
     monitor.looked = BEGIN + 700 * MS
     assert "a" in places or judge == "truth" or not [car for car, _ in watchdog.misplaced() if car == "a"], "settles"
@@ -168,9 +173,7 @@ def test_cars_stop_in_time_to_stand_inside_the_fence_and_apart(starts: Any, velo
         for car, x in starts.items():
             monitor.place(car, np.array([x + velocities.get(car, 0.0) * 0.01 * k, 0.0, 0.0]), BEGIN + 10 * k * MS)
     monitor.looked = BEGIN + 310 * MS
-    safety, station = Safety(geofence=CORNERS, separation=0.35), Station(Hub().connect(), (), None, {})
-    watchdog = Watchdog(safety, station, Gates(Hub().connect(), (), USUAL, None), monitor, ("a",), ("b",), (), 1.0)
-    watchdog.close()
+    watchdog = closed_watchdog(Safety(geofence=CORNERS, separation=0.35), monitor)
     reasons = [f"{car}: {wrong}" for car, wrong in watchdog.misplaced()]
     assert len(reasons) == len(found) and all(a.startswith(b) for a, b in zip(reasons, found, strict=True)), reasons
 

@@ -55,10 +55,10 @@ def clock(monkeypatch):
     return clock
 
 
-def begun() -> Pacer:
+def begun() -> tuple[Pacer, int]:
+    """Return one that has started, and when that was, ns."""
     pacer = Pacer(PERIOD, TICKS)
-    pacer.start()
-    return pacer
+    return pacer, pacer.start()
 
 
 def decision(pacer: Pacer, clock: Clock, works: tuple[int, ...]) -> list[int]:
@@ -72,15 +72,14 @@ def decision(pacer: Pacer, clock: Clock, works: tuple[int, ...]) -> list[int]:
 
 
 def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes(clock):
-    pacer = begun()
-    begin = pacer.now()
+    pacer, begin = begun()
     times = [t for _ in range(50) for t in decision(pacer, clock, (4 * MS, 9 * MS, 6 * MS))]
     assert times == [begin + 10 * MS * k for k in range(1, 151)]
     assert pacer.missed == 0 and pacer.late(1.0) == 0.0
 
 
 def test_a_decision_misses_its_deadline_once_however_often_the_computer_stands_still(clock):
-    pacer = begun()
+    pacer, _ = begun()
     decision(pacer, clock, (200 * MS, 200 * MS, 0))
     assert pacer.missed == 1
     decision(pacer, clock, (0, 0, 200 * MS))
@@ -91,8 +90,7 @@ def test_a_decision_misses_its_deadline_once_however_often_the_computer_stands_s
 
 
 def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_anything(clock):
-    pacer = begun()
-    begin = pacer.now()
+    pacer, begin = begun()
     decision(pacer, clock, (0, 0, 25 * MS))
     times = decision(pacer, clock, (0, 0, 0))
     assert [t - begin for t in times] == [55 * MS, 55 * MS, 60 * MS]
@@ -101,8 +99,7 @@ def test_a_late_decision_is_back_on_time_at_its_last_tick_without_having_missed_
 
 
 def test_what_takes_longer_than_a_decision_is_counted_once_and_never_made_up_for(clock):
-    pacer = begun()
-    begin = pacer.now()
+    pacer, begin = begun()
     decision(pacer, clock, (0, 0, 75 * MS))  # until 105: the decisions that end at 60 and 90 are over
     times = decision(pacer, clock, (0, 0, 0))
     assert [t - begin for t in times] == [105 * MS, 110 * MS, 120 * MS]
@@ -112,8 +109,7 @@ def test_what_takes_longer_than_a_decision_is_counted_once_and_never_made_up_for
 
 
 def test_a_computer_that_stands_still_between_two_ticks_leaves_that_time_out(clock):
-    pacer = begun()
-    begin = pacer.now()
+    pacer, begin = begun()
     pacer.decide()
     pacer.wait()
     clock.time += 3_000 * MS
@@ -124,8 +120,8 @@ def test_a_computer_that_stands_still_between_two_ticks_leaves_that_time_out(clo
 
 
 def test_late_waking_is_measured_and_does_not_add_up(clock):
-    pacer = begun()
-    begin, clock.late = pacer.now(), 2 * MS
+    pacer, begin = begun()
+    clock.late = 2 * MS
     for _ in range(20):
         times = decision(pacer, clock, (1 * MS, 1 * MS, 1 * MS))
     assert times[-1] - begin == 602 * MS
@@ -137,8 +133,7 @@ def test_whatever_the_work_takes_commands_are_never_sent_in_a_burst(works):
     clock = Clock()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "time", clock)
-        pacer = begun()
-        begin, sent = pacer.now(), []
+        (pacer, begin), sent = begun(), []
         for work in works:
             pacer.decide()
             sent.append(pacer.now() - begin)

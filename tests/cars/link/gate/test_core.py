@@ -18,9 +18,11 @@ from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
 MOST_AGE = SVEA.topics[Role.COMMAND].max_age_ns
 
 
-def armed(**options: Any) -> Bench:
+def armed(ticks: int = 0, **options: Any) -> Bench:
+    """Return an armed gate after some commands, one per tick."""
     bench = Bench(**options)
     assert bench.arm() is None
+    bench.drive(ticks)
     return bench
 
 
@@ -83,8 +85,7 @@ def test_without_commands_the_car_gets_neutral_and_newer_commands_go_on_from_a_s
 
 
 def test_what_a_stalled_link_delivers_late_moves_nothing() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     sent = []
     for sequence in range(100, 160):
         sent.append(messages.command(bench.wall, "s1", sequence))
@@ -121,8 +122,7 @@ def test_stamps_are_fresh(age: int, reason: Reason | None) -> None:
 
 
 def test_a_clock_that_is_set_stops_the_car() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     bench.wall += 10**9
     assert bench.send(Role.COMMAND, messages.command(bench.wall - 10**9, "s1", 99)) is Reason.STALE
     bench.wait(TIMEOUT)
@@ -174,8 +174,7 @@ def test_commands_are_finite_and_inside_the_limits(steering: float, speed: float
 
 
 def test_a_station_that_commands_what_is_no_number_stops_its_car_at_once() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     assert bench.command(speed=math.nan) is Reason.NOT_FINITE
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.TIMED_OUT
     bench.drive(10)
@@ -238,8 +237,7 @@ def test_a_session_has_a_plain_name(session: str) -> None:
 
 
 def test_another_session_begins_from_a_stand_and_ends_the_first() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     assert bench.arm("s2") is None
     assert bench.tick() == NEUTRAL
     assert bench.send(Role.COMMAND, messages.command(bench.wall, "s1", 50)) is Reason.SESSION
@@ -247,8 +245,7 @@ def test_another_session_begins_from_a_stand_and_ends_the_first() -> None:
 
 
 def test_a_session_that_is_armed_again_takes_no_command_twice() -> None:
-    bench = armed()
-    bench.drive(3)
+    bench = armed(3)
     old = messages.command(bench.wall, "s1", 3)
     assert bench.arm("s1", armed=False) is None and bench.arm("s1") is None
     assert bench.send(Role.COMMAND, old) is Reason.SEQUENCE
@@ -256,8 +253,7 @@ def test_a_session_that_is_armed_again_takes_no_command_twice() -> None:
 
 
 def test_disarming_needs_no_nonce() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     assert bench.arm("whatever", nonce="", armed=False) is None
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.DISARMED
     bench.session = "s1"
@@ -265,8 +261,7 @@ def test_disarming_needs_no_nonce() -> None:
 
 
 def test_a_stop_holds_until_the_next_arming() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     before = bench.status().nonce
     assert bench.stop() is None
     assert bench.tick() == NEUTRAL and bench.gate.state is GateMode.STOPPED
@@ -285,16 +280,14 @@ def test_a_stop_holds_until_the_next_arming() -> None:
 
 
 def test_what_is_no_stop_stops_nothing() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     for payload in (b"", b"\0\1\0\0", messages.stop() + bytes(4), bytes(600)):
         assert bench.gate.arrive(Role.STOP, payload) in (Reason.MALFORMED, Reason.TOO_LONG)
     assert bench.tick().speed > 0.19
 
 
 def test_a_gate_that_closes_is_neutral_for_good() -> None:
-    bench = armed()
-    bench.drive(10)
+    bench = armed(10)
     bench.gate.neutral()
     assert bench.command() is Reason.NOT_ARMED
     assert bench.tick() == MotionCommand()
