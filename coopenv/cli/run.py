@@ -186,8 +186,7 @@ def record(given: RecordOptions) -> None:
     replayed = is_recorded(environment) and not bag
     if not bag and given.topics is not None:
         raise CoopenvError(f"--map {given.topics}: is for ROS bags, {environment} is none")
-    if bag or replayed:
-        refuse_for_recordings(environment, given.seed, given.policy)
+    refuse_for_recordings(environment, given.seed, given.policy)
     log, keepers = options.console(stderr=True), list[Keeper]()
 
     def keep(engine: Engine, tick: int) -> None:

@@ -264,7 +264,9 @@ def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chose
 
 def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> list[Chosen]:
     """Return the topics of one car that are read; a moving landmark has a position alone."""
-    names, table = candidates(given, car), f"{given.path.name}: cars.{car.name}.topics"
+    table, patterns = f"{given.path.name}: cars.{car.name}.topics", patterns_of(given.names, given.make)
+    names = {role: tuple(name.format(**car.names) for name in some) for role, some in patterns.items()}
+    names |= {role: (name,) for role, name in car.topics.given.items()}
 
     def absent(name: str) -> str:
         known = listed(sorted(topics)) or "none at all"
@@ -298,12 +300,3 @@ def _of_car(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str)
         found.pop(Role.COMMAND if Role.MANUAL in found else Role.MANUAL, None)
         chosen += tuple(role for role in UNNEEDED if role in found)
     return [Chosen(found[role], car.name, role, car.landmark is not None) for role in chosen]
-
-
-def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
-    """Return the names that topics of a car may have, by role."""
-    scheme = {
-        role: tuple(pattern.format(**car.names) for pattern in patterns)
-        for role, patterns in patterns_of(given.names, given.make).items()
-    }
-    return scheme | {role: (name,) for role, name in car.topics.given.items()}

@@ -57,15 +57,21 @@ def written(tmp_path: Path) -> Path:
     return tmp_path / "drive.mcap"
 
 
+def messages_of(path: Path) -> list[tuple[str, Any]]:
+    """Return topics and messages as rosbags reads them."""
+    with AnyReader([path]) as reader:
+        return [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+
+
 def test_rosbags_reads_it_as_a_bag_of_ros_2(written: Path) -> None:
     with AnyReader([written]) as reader:
         found = {c.topic: c.msgtype for c in reader.connections}
         assert found == {f"/{WHEEL}": TYPES[WHEEL], f"/{FRAMES}": TYPES[FRAMES], f"/{TICK_TOPIC}": TICK}
-        messages = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
-    speeds = [m.twist.twist.linear.x for topic, _, m in messages if topic == f"/{WHEEL}"]
+    messages = messages_of(written)
+    speeds = [m.twist.twist.linear.x for topic, m in messages if topic == f"/{WHEEL}"]
     assert speeds == [0.1 * k for k in range(20)]
-    assert [len(m.objects) for topic, _, m in messages if topic == f"/{FRAMES}"] == [k % 3 for k in range(20)]
-    first = next(m for topic, _, m in messages if topic == f"/{TICK_TOPIC}")
+    assert [len(m.objects) for topic, m in messages if topic == f"/{FRAMES}"] == [k % 3 for k in range(20)]
+    first = next(m for topic, m in messages if topic == f"/{TICK_TOPIC}")
     assert (first.index, first.key, first.episode) == (0, 2**64 - 1, 3)
 
 
@@ -95,8 +101,7 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
     recorder.close()
     assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
-    with AnyReader([tmp_path / "drive.mcap"]) as reader:
-        messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    messages = messages_of(tmp_path / "drive.mcap")
     (stopped,) = [m for topic, m in messages if topic == f"/{STOPPED_TOPIC}"]
     assert (stopped.reason, stopped.car) == ("svea7: is gone", "svea7")
     assert (stopped.header.stamp.sec, stopped.header.stamp.nanosec) == (3, 5)
@@ -255,13 +260,11 @@ def ticks_of(path: Path) -> list[Any]:
 
 
 def test_what_explains_a_stop_is_on_the_tape(recorded: Any) -> None:
-    path, _, _ = recorded
-    with AnyReader([path]) as reader:
-        counts = {c.topic: c.msgcount for c in reader.connections}
-        messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    messages = messages_of(recorded[0])
+    counts = Counter(topic for topic, _ in messages)
     for car in ("svea7", "svea1"):
         for role in (Role.GATE, Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO, Role.COMMAND, Role.ARM):
-            assert counts.get(f"/{SVEA.topic_of(car, role)}"), role
+            assert counts[f"/{SVEA.topic_of(car, role)}"], role
         assert counts[f"/{presence_of(car)}"] == 1
     assert counts[f"/{SVEA.topic_of('svea7', Role.STOP)}"] > 1
     gates = [m.state for topic, m in messages if topic == f"/{SVEA.topic_of('svea7', Role.GATE)}"]

@@ -69,12 +69,6 @@ def test_bytes_that_are_no_message_are_refused_in_one_line(read: Any, payload: b
         read(payload, ODOMETRY)
 
 
-@given(cut=st.integers(0, 731))
-def test_a_message_that_is_cut_off_is_refused(cut: int) -> None:
-    with pytest.raises(CoopenvError):
-        decode(encode(odometry())[:cut], ODOMETRY)
-
-
 @given(payload=st.binary(max_size=200))
 def test_random_bytes_are_refused_or_read(payload: bytes) -> None:
     for read in (decode, cdr_of, ros1_of):
@@ -107,10 +101,6 @@ def test_checksums_of_ros1_are_those_of_the_cars(kind: str) -> None:
 @pytest.mark.parametrize("kind", RIHS01)
 def test_hashes_of_ros2_are_the_published_ones(kind: str) -> None:
     assert ros2().hash_rihs01(kind) == f"RIHS01_{RIHS01[kind]}"
-
-
-def test_every_topic_has_a_type() -> None:
-    assert {topic.type for topic in SVEA.topics.values()} <= set(ros2().types)
 
 
 NAMES = {
@@ -195,8 +185,10 @@ def test_no_command_goes_beyond_ninety_per_cent(steering: float, speed: float) -
 
 
 def test_low_level_has_the_values_of_the_cars_interface() -> None:
-    fields = low_level(MotionCommand(0.2, 0.8), COMMAND)
-    assert (fields.steering, fields.velocity) == (36, 70)
+    # At 90 %: 0.85 * 90 + 15 = 91.5.
+    for wanted, expected in (((0.2, 0.8), (36, 70)), ((1.0, 3.0), (114, 116)), ((-1.0, -3.0), (-114, -116))):
+        fields = low_level(MotionCommand(*wanted), COMMAND)
+        assert (fields.steering, fields.velocity) == expected
     still = low_level(NEUTRAL, COMMAND)
     assert (still.steering, still.velocity, still.trans_diff, still.ctrl) == (0, 0, 0b111000, 0)
     least = low_level(MotionCommand(speed=0.018), COMMAND).velocity  # 1 %

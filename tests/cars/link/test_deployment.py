@@ -347,7 +347,12 @@ def test_fields_hold_what_is_written_to_them(kind: str) -> None:
 def test_what_the_gate_writes_is_the_message_of_the_car(change: dict[str, Any], why: str) -> None:
     with pytest.raises(CoopenvError, match=rf"fleet\.toml: profile: command\.neutral: float64.*, but .* {why}"):
         check_types(load_profile({"base": "diffdrive", **change}), "fleet.toml")
-    for name in ("svea", "diffdrive", str(ROVER)):
+
+
+def test_every_profile_has_types_that_can_be_read() -> None:
+    shipped = sorted(file.stem for file in FOLDER.glob("*.toml"))
+    assert shipped == ["diffdrive", "svea"]
+    for name in (*shipped, str(ROVER)):
         check_types(load_profile(name), name)
 
 
@@ -368,8 +373,3 @@ def test_types_that_cannot_be_read_are_refused(rover: CarProfile) -> None:
     topics[Role.IMU] = topics[Role.IMU].model_copy(update={"type": "std_msgs/msg/Bool"})
     with pytest.raises(CoopenvError, match=r"test: profile: topics.imu.type: std_msgs/msg/Bool is none of sensor_msgs"):
         Stage("svea_overtaking", OVERTAKING, profile=rover.model_copy(update={"topics": topics}))
-
-
-def test_every_shipped_profile_is_valid() -> None:
-    names = sorted(file.stem for file in FOLDER.glob("*.toml"))
-    assert names == ["diffdrive", "svea"] and all(isinstance(load_profile(name), CarProfile) for name in names)

@@ -218,10 +218,8 @@ def test_every_topic_of_a_car_that_is_no_command_can_be_read() -> None:
     assert all(topic.type in READERS[role] for role, topic in SVEA.topics.items() if role not in commands)
 
 
-PIXY = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
 FISH = (-0.4, 0.0, 0.001, -0.002, 0.0)  # folds back beyond a radius of 0.91
 CUSHION = (0.3, 0.1, 0.0, 0.001, 0.02)
-LENS = Calibration((316, 208), (213.161906, 213.521038), (154.841998, 114.98398), PIXY)
 
 
 @wp.struct
@@ -244,7 +242,9 @@ coordinates = st.floats(-0.7, 0.7)
 
 
 @settings(max_examples=60)
-@given(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=7), st.sampled_from([PIXY, FISH, CUSHION]))
+@given(
+    st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=7), st.sampled_from([DISTORTION, FISH, CUSHION])
+)
 def test_undistorted_points_are_imaged_where_they_were(points: list[tuple[float, float]], distortion: Any) -> None:
     true = np.array(points)
     true = true[np.linalg.norm(true, axis=1) < 0.95 * min(largest_radius(distortion), 9.0)]
@@ -255,9 +255,9 @@ def test_undistorted_points_are_imaged_where_they_were(points: list[tuple[float,
 
 def test_the_simulator_undistorts_alike() -> None:
     points = np.random.default_rng(2).uniform(-0.45, 0.45, (50, 2))
-    found, there = undistort(points, PIXY)
+    found, there = undistort(points, DISTORTION)
     lens = Lens()
-    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), PIXY, strict=True):
+    for name, value in zip(("k1", "k2", "p1", "p2", "k3"), DISTORTION, strict=True):
         setattr(lens, name, value)
     out = wp.zeros(50, dtype=wp.vec2d, device="cpu")
     wp.launch(undistort_all, dim=50, inputs=[lens, wp.array(points, dtype=wp.vec2d, device="cpu"), out], device="cpu")
@@ -282,8 +282,8 @@ def test_far_points_of_a_lens_without_end_are_found() -> None:
 
 
 def test_rays_of_pixels_go_right_and_down() -> None:
-    pixels = np.array([LENS.principal_point, (250.0, 115.0), (155.0, 200.0), (316.0, 10.0), (-1.0, 10.0)])
-    directions, there = rays(pixels, LENS)
+    pixels = np.array([CAMERA.principal_point, (250.0, 115.0), (155.0, 200.0), (316.0, 10.0), (-1.0, 10.0)])
+    directions, there = rays(pixels, CAMERA)
     assert there.tolist() == [True, True, True, False, False]
     assert_allclose(directions[0], [0.0, 0.0, 1.0], atol=1e-15)
     assert directions[1, 0] > 0.4 and directions[2, 1] > 0.35

@@ -16,7 +16,7 @@ import pytest
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.deployment import Deployment, DeploymentError, parse_deployment
-from coopenv.cars.transport.base import Address, Arrival, LinkError, address_of, trouble_at
+from coopenv.cars.transport.base import Address, Arrival, LinkError, address_of
 from coopenv.cars.transport.zenoh import Zenoh, open_transport, open_zenoh
 from tests.helpers.brokers import Authority
 from tests.helpers.processes import wait_until
@@ -232,9 +232,3 @@ def test_what_is_on_this_computer_and_what_may_be_elsewhere() -> None:
 def test_what_is_none_is_refused(text: str) -> None:
     with pytest.raises(CoopenvError, match="is no endpoint, expected for example"):
         address_of(text)
-
-
-def test_the_reason_of_a_failure_is_found() -> None:
-    assert trouble_at(Address("tcp", "127.0.0.1", free_port()), None, 1.0) == "Connection refused"
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        assert trouble_at(Address("tcp", "127.0.0.1", server.getsockname()[1]), None, 1.0) is None
