@@ -238,7 +238,8 @@ def _public_text(key: Ed25519PublicKey) -> str:
 
 
 def _read_private(path: Path) -> Ed25519PrivateKey:
-    ed25519 = library()
+    library()
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     text = _read(path, OTHERS_READ, "read by others", "chmod 600")
@@ -246,7 +247,7 @@ def _read_private(path: Path) -> Ed25519PrivateKey:
         key = load_pem_private_key(text, None)
     except Exception:  # an error of the library could quote what it has read
         raise KeyFileError(f"{path}: no private key in PEM without a password") from None
-    if not isinstance(key, ed25519.Ed25519PrivateKey):
+    if not isinstance(key, Ed25519PrivateKey):
         raise KeyFileError(f"{path}: expected a key of Ed25519, made by `coopenv svea keys`")
     return key
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-import threading
 import time
-from collections import deque
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
@@ -14,10 +12,11 @@ from coopenv.cars.codec import decode
 from coopenv.cars.gate.core import Malformed, read_drive
 from coopenv.cars.keys import Signer
 from coopenv.cars.profile import SVEA, MotionCommand, Role, presence_of
-from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.cars.transport.base import Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
 from tests.helpers.processes import COOPENV, started, wait_until
+from tests.helpers.wire import heard_by, seen_by
 
 
 def running_gate(endpoint: str, folder: Path, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
@@ -29,35 +28,29 @@ class Station:
 
     def __init__(self, transport: Transport, signer: Signer | None) -> None:
         self._transport, self._signer = transport, signer
-        self._lock = threading.Lock()
-        self.status: Any = None
-        self.statuses, self.outputs, self.stops = 0, deque[tuple[float, MotionCommand]](maxlen=1000), 0
-        self.present = False
+        topics = (SVEA.topic_of(CAR, role) for role in (Role.GATE, Role.MANUAL, Role.STOP))
+        self.statuses, self._wheels, self.stops = (heard_by(transport, topic) for topic in topics)
+        self._seen = seen_by(transport)
         self.session, self.sequence = "", 0
-        transport.subscribe(SVEA.topic_of(CAR, Role.GATE), self._hear)
-        transport.subscribe(SVEA.topic_of(CAR, Role.MANUAL), self._see)
-        transport.subscribe(SVEA.topic_of(CAR, Role.STOP), self._halt)
-        transport.watch(presence_of("*"), self._watch)
 
-    def _hear(self, arrival: Arrival) -> None:
-        self.status, self.statuses = decode(arrival.payload, SVEA.topics[Role.GATE].type), self.statuses + 1
+    @property
+    def status(self) -> Any:
+        """The last status; None: there has been none."""
+        return decode(self.statuses[-1].payload, SVEA.topics[Role.GATE].type) if self.statuses else None
 
-    def _see(self, arrival: Arrival) -> None:
-        with suppress(Malformed), self._lock:
-            drive = read_drive(arrival.payload, SVEA.command)
-            self.outputs.append((time.monotonic(), drive))
+    @property
+    def present(self) -> bool:
+        """Whether the car is there."""
+        return dict(self._seen).get(presence_of(CAR), False)
 
-    def _halt(self, _arrival: Arrival) -> None:
-        self.stops += 1
-
-    def _watch(self, name: str, there: bool) -> None:
-        if name == presence_of(CAR):
-            self.present = there
-
-    def since(self, when: float) -> list[MotionCommand]:
-        """Return what the car has been told since an instant of the monotonic clock."""
-        with self._lock:
-            return [drive for at, drive in self.outputs if at >= when]
+    def since(self, when: float = 0.0) -> list[MotionCommand]:
+        """Return what the car has been told since an instant of the wall clock, s."""
+        told = []
+        for arrival in self._wheels.copy():
+            if arrival.received >= 1e9 * when:
+                with suppress(Malformed):
+                    told.append(read_drive(arrival.payload, SVEA.command))
+        return told
 
     def count(self, reason: str) -> int:
         return int(dict(zip(self.status.rejections, self.status.counts, strict=True))[reason])
@@ -92,7 +85,7 @@ class Station:
 
     def drive(self) -> None:
         """Send commands until the car is told to move."""
-        begun = time.monotonic()
+        begun = time.time()
 
         def moves() -> bool:
             self.command()

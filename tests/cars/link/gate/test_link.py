@@ -60,7 +60,7 @@ def test_a_tick_sends_what_it_returns() -> None:
     link, station = pair()
     assert station.present
     payloads = [link.tick() for _ in range(9)]
-    assert (len(station.outputs), station.statuses) == (9, 3)
+    assert (len(station.since()), len(station.statuses)) == (9, 3)
     assert decode(payloads[-1], SVEA.topics[Role.MANUAL].type).z == 500.0
 
 
@@ -70,7 +70,7 @@ def test_news_is_told_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
     station.send(Role.STOP, messages.stop())
     assert link.news.is_set()
     link.publish_status()
-    assert station.status.state == "stopped" and station.stops == 2 and not link.news.is_set()
+    assert station.status.state == "stopped" and len(station.stops) == 2 and not link.news.is_set()
     repeated: list[tuple[bytes, bytes]] = []
     link._transport.subscribe(SVEA.topic_of(CAR, Role.STOP), lambda a: repeated.append((a.payload, a.attachment)))
     link.publish_status()
@@ -81,7 +81,7 @@ def test_news_is_told_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
     station.session = "s"
     station.command()
     link.tick()
-    assert station.outputs[-1][1].speed > 0.0
+    assert station.since()[-1].speed > 0.0
 
 
 def test_another_arming_of_an_armed_gate_is_news() -> None:
@@ -115,15 +115,15 @@ def test_a_command_of_another_to_the_wheels_stops_the_car(payload: bytes, answer
         assert link._gate.state is GateMode.STOPPED and link._gate.nonce != nonce and link.news.is_set()
         link.publish_status()
         assert (station.status.state, station.count("foreign")) == ("stopped", count)
-    assert len(wheels) == 2 + answers and station.outputs[-1][1] == NEUTRAL
+    assert len(wheels) == 2 + answers and station.since()[-1] == NEUTRAL
 
 
 def test_an_exception_leaves_the_car_in_neutral() -> None:
     link, station = pair(Broken)
     with pytest.raises(RuntimeError, match="broken"):
         run(link)
-    assert len(station.outputs) == 3 + 5
-    assert {drive for _, drive in station.outputs} == {NEUTRAL}
+    assert len(station.since()) == 3 + 5
+    assert set(station.since()) == {NEUTRAL}
 
 
 WARM, MEASURED, ALL = 16_000, 18_000, 20_000

@@ -58,22 +58,22 @@ def station(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> Iterator[
 
 
 def test_a_station_arms_drives_and_stops(station: Station) -> None:
-    wait_until(lambda: station.present and station.outputs and station.status)
+    wait_until(lambda: station.present and station.since() and station.status)
     assert station.status.state == "disarmed"
-    begun = time.monotonic()
+    begun = time.time()
     time.sleep(0.6)
-    told, most = station.since(begun), 20.0 * (time.monotonic() - begun) + 3
+    told, most = station.since(begun), 20.0 * (time.time() - begun) + 3
     assert 3 <= len(told) <= most and set(told) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
     station.arm("a")
     station.drive()
     wait_until(lambda: station.status.state == "timed_out")
-    assert station.outputs[-1][1] == NEUTRAL
+    assert station.since()[-1] == NEUTRAL
     station.drive()
     station.send(Role.STOP, messages.stop())
-    wait_until(lambda: station.status.state == "stopped" and station.stops >= 3)  # repeated for who comes late
+    wait_until(lambda: station.status.state == "stopped" and len(station.stops) >= 3)  # repeated for who comes late
     station.command()
     wait_until(lambda: station.count("not_armed") > 0)
-    assert station.outputs[-1][1] == NEUTRAL
+    assert station.since()[-1] == NEUTRAL
     station.arm("b")
     time.sleep(0.5)  # its own repetitions of the stop must not come back to stop it again
     station.drive()
@@ -84,7 +84,7 @@ def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
     station.arm("a")
     station.drive()
     wait_until(lambda: station.status.state == "timed_out")
-    accepted, begun = station.status.accepted, time.monotonic()
+    accepted, begun = station.status.accepted, time.time()
     signers = load_signer(keys, "station"), load_signer(keys, "other")
     bad = messages_of_strangers(Random(3), *signers, "a", station.sequence, time.time_ns)
     for i in range(3000):
@@ -118,15 +118,15 @@ def test_what_comes_while_it_is_frozen_moves_nothing(
 ) -> None:
     station.arm("a")
     station.drive()
-    frozen = time.monotonic()
+    frozen = time.time()
     gate.send_signal(signal.SIGSTOP)
     time.sleep(0.05)
     sent = station.sequence
-    while time.monotonic() < frozen + duration:
+    while time.time() < frozen + duration:
         station.command(0.5)
         time.sleep(0.05)
     time.sleep(0.2)  # the youngest is older than it may be, too
-    resumed = time.monotonic()
+    resumed = time.time()
     gate.send_signal(signal.SIGCONT)
     wait_until(lambda: len(station.since(resumed)) > 10)
     if (
@@ -147,7 +147,7 @@ def test_a_signal_leaves_the_car_in_neutral(
     gate.send_signal(number)
     _, errors = gate.communicate(timeout=10)
     assert (gate.returncode, errors) == (status, f"interrupted; {CAR} is in neutral\n")
-    wait_until(lambda: [drive for _, drive in station.outputs][-5:] == [NEUTRAL] * 5)
+    wait_until(lambda: station.since()[-5:] == [NEUTRAL] * 5)
     wait_until(lambda: not station.present)
 
 
@@ -162,8 +162,8 @@ def test_a_router_that_comes_back_finds_the_gate(keys: Path, tmp_path: Path) -> 
             station.drive()
         time.sleep(0.5)
         with running("router", endpoint):
-            heard = station.statuses
-            wait_until(lambda: station.statuses > heard + 1)
+            heard = len(station.statuses)
+            wait_until(lambda: len(station.statuses) > heard + 1)
             assert station.status.state == "timed_out"
             station.drive()  # the session goes on
             wait_until(lambda: station.present)
