@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.base.sections import Section
 from coopenv.estimation.lens import largest_radius
 from coopenv.estimation.outcomes import KINDS, Outcome
 from coopenv.scenario import Scenario
@@ -106,44 +107,21 @@ def _groups(scenario: Scenario) -> dict[str, Any]:
 
 
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
-    """Return the values of the model's `FaultValues`."""
-    restart, corruption, lie, wrong, jammer = f.restart, f.corruption, f.lie, f.map_error, f.jammer
+    """Return the values of the model's `FaultValues` that are not entries of the section as they stand."""
+    lie, wrong = f.lie, f.map_error
     return {
         "clock": f.clock_offset,
-        "restart_chance": restart.chance,
-        "restart_time": restart.time,
-        "restart_spread": restart.time_spread,
-        "corruption": corruption.probability,
-        "corruption_start": corruption.start,
-        "corruption_size": corruption.size,
-        "corruption_turn": corruption.turn,
         "lie": KINDS[lie.kind],
-        "lie_chance": lie.chance,
-        "lie_start": lie.start,
-        "lie_spread": lie.start_spread,
         "lie_offset": lie.offset if lie.kind in ("jump", "collude") else 0.0,
         "lie_speed": lie.speed if lie.kind == "drift" else 0.0,
         "lie_replay": scenario.ticks_of_replay(lie.age),
         "lie_direction": _unit(lie.direction),
         "lie_std": lie.std or 0.0,
-        "lie_turn": lie.turn,
         "lie_consistent": int(lie.kind != "none" and lie.odometry == "consistent"),
-        "map_chance": wrong.chance,
-        "map_landmark": -1 if wrong.landmark is None else scenario.target_names.index(wrong.landmark),
-        "map_offset": wrong.offset,
-        "map_offset_spread": wrong.offset_spread,
-        "map_direction": _unit(wrong.direction),
-        "map_start": wrong.start,
-        "map_spread": wrong.start_spread,
-        "jammer_chance": jammer.chance,
-        "jammer_start": jammer.start,
-        "jammer_spread": jammer.start_spread,
-        "jammer_duration": math.inf if jammer.duration is None else jammer.duration,
-        "jammer_period": jammer.period,
-        "jammer_duty": jammer.duty,
-        "jammer_range": math.inf if jammer.range is None else jammer.range,
-        "jammer_fixed": jammer.position is not None,
-        "jammer_position": np.array(jammer.position or NOWHERE) - scenario.map.origin,
+        "map_error_landmark": -1 if wrong.landmark is None else scenario.target_names.index(wrong.landmark),
+        "map_error_direction": _unit(wrong.direction),
+        "jammer_fixed": f.jammer.position is not None,
+        "jammer_position": np.array(f.jammer.position or NOWHERE) - scenario.map.origin,
     }
 
 
@@ -160,8 +138,6 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
         "pinhole": c.model == "pinhole",
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
         "max_radius": largest_radius(c.distortion),
-        "range": math.inf if c.range is None else c.range,
-        "miss": c.miss_probability,
         "orientation_std": on * c.extrinsics_error,
         "position_std": on * c.extrinsics_position_error,
         "focal_std": on * c.focal_length_error,
@@ -169,8 +145,8 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
 
 
 def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
-    """Return the values of the model's `NoiseValues`."""
-    on, slip = float(n.enabled), n.slip
+    """Return the values of the model's `NoiseValues` that are not entries of the section as they stand."""
+    on = float(n.enabled)
     axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     if abs(axis[2]) > 1 - 1e-12:
@@ -187,10 +163,7 @@ def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
         "odometry_scale_walk": on * n.odometry_scale_walk,
         "gyro_bias": on * np.broadcast_to(n.gyro_bias, 3),
         "gyro_bias_walk": on * np.broadcast_to(n.gyro_bias_walk, 3),
-        "slip_rate": on * slip.rate,
-        "slip_duration": slip.duration,
-        "slip_size": slip.size,
-        "slip_angle": slip.angle,
+        "slip_rate": on * n.slip.rate,
     }
 
 
@@ -248,11 +221,19 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
 
 
 def _fill(struct: Any, device: str, values: Mapping[str, Any], section: Any = None) -> None:
-    """Write fields of a struct in their types: the values, and entries of the same names of a scenario's section."""
+    """Write fields of a struct in their types: the values, and entries of the same names of a scenario's section.
+
+    An entry of a table in the section has the name of both, such as `jammer_period`. A limit that there is not (None)
+    is infinite.
+    """
+    entries = dict(section or ())
+    tables = {name: table for name, table in entries.items() if isinstance(table, Section)}
+    entries |= {f"{name}_{key}": value for name, table in tables.items() for key, value in table}
+    entries |= values
     for name, kind in field_types(struct).items():
-        if name not in values and not hasattr(section, name):
+        if name not in entries:
             continue
-        value = values[name] if name in values else getattr(section, name)
+        value = math.inf if entries[name] is None else entries[name]
         if isinstance(kind, wp.array):
             scalar = scalar_of(kind.dtype)
             data = np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(scalar))
@@ -358,9 +339,8 @@ def _dynamics(d: Dynamics, scenario: Scenario, traffic: bool) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
     return {
         "min_speed": -d.max_speed if d.reverse else 0.0,
-        "speed_lag": 0.0 if accelerates or traffic else d.speed_time_constant,  # an acceleration acts at once
+        "speed_time_constant": 0.0 if accelerates or traffic else d.speed_time_constant,  # an acceleration acts at once
         "in_traffic": traffic,
-        "steering_lag": d.steering_time_constant,
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": accelerates,
         "action_steering": scenario.action.steering or d.max_steering,
@@ -414,13 +394,10 @@ def _cells(scenario: Scenario) -> dict[str, Any]:
 
 
 def _radio(scenario: Scenario) -> dict[str, Any]:
-    v = scenario.v2x
     return {
         "entry": (2 if scenario.action.pan is None else 3) if scenario.action.radio else 0,
-        "to_all": v.links == "all",
-        "slots": max(v.delay, 1) + 1 + scenario.replay_ticks,
-        "range": math.inf if v.range is None else v.range,
-        "staleness": math.inf if v.staleness is None else v.staleness,
+        "to_all": scenario.v2x.links == "all",
+        "slots": max(scenario.v2x.delay, 1) + 1 + scenario.replay_ticks,
     }
 
 

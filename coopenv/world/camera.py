@@ -290,7 +290,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if camera.focal_std > zero:  # the image is wider than a vehicle knows: as seen through the nominal lens
         wider = zero + place.dtype(1.0) + state.camera_focal[world, vehicle]
         to_camera = wp.diag(type(place)(wider, wider, place.dtype(1.0))) * to_camera
-    random = camera.miss > zero or level > zero
+    random = camera.miss_probability > zero or level > zero
     kept = model.kept
     for n in range(entry_count(model, state, world, vehicle)):
         entry = entry_at(model, state, kept, world, vehicle, n)
@@ -305,7 +305,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
             b = wp.normalize(ray)
         if sight == VISIBLE and random:
             words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING)
-            if model.sensing != IDEAL and uniform(words[2], zero) < camera.miss:
+            if model.sensing != IDEAL and uniform(words[2], zero) < camera.miss_probability:
                 sight = MISSED
             if level > zero:
                 b = noisy_bearing(noise, level, b, words)

@@ -313,9 +313,9 @@ def actuate(d: Any, speed: Any, steering: Any, command: Any, dt: Any):
     wanted = command[SPEED]
     if wp.abs(wanted) < d.dead_band:
         wanted = type(wanted)(0.0)
-    new_speed = first_order_lag(speed, wanted, dt, d.speed_lag, command[ACCELERATION])
+    new_speed = first_order_lag(speed, wanted, dt, d.speed_time_constant, command[ACCELERATION])
     angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
-    new_steering = first_order_lag(steering, angle, dt, d.steering_lag, d.max_steering_rate)
+    new_steering = first_order_lag(steering, angle, dt, d.steering_time_constant, d.max_steering_rate)
     return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering
 
 

@@ -124,8 +124,8 @@ def model_struct(p: Precision) -> Any:
         max_acceleration: scalar
         max_steering: scalar
         max_steering_rate: scalar
-        speed_lag: scalar
-        steering_lag: scalar
+        speed_time_constant: scalar
+        steering_time_constant: scalar
         latency_ticks: wp.int32
         dead_band: scalar  # m/s
         gated: wp.int32  # 1: commands change gradually
@@ -227,7 +227,7 @@ def model_struct(p: Precision) -> Any:
         undistort: wp.int32
         quantise: wp.int32
         range: scalar  # m; infinity: unlimited
-        miss: scalar
+        miss_probability: scalar
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
         focal_std: scalar  # of the error of `focal_length`, relative
@@ -271,15 +271,15 @@ def model_struct(p: Precision) -> Any:
         clock: scalar  # standard deviation, s
         restart_chance: scalar
         restart_time: scalar  # s
-        restart_spread: scalar  # s
-        corruption: scalar  # chance
+        restart_time_spread: scalar  # s
+        corruption_probability: scalar
         corruption_start: scalar  # s
         corruption_size: scalar  # m
         corruption_turn: scalar  # rad
         lie: wp.int32  # see `coopenv.world.v2x.KINDS`
         lie_chance: scalar
         lie_start: scalar  # s
-        lie_spread: scalar  # s
+        lie_start_spread: scalar  # s
         lie_offset: scalar  # m
         lie_speed: scalar  # m/s
         lie_replay: wp.int32  # ticks by which messages are old
@@ -287,16 +287,16 @@ def model_struct(p: Precision) -> Any:
         lie_std: scalar  # claimed, rad and m; 0: honest
         lie_turn: scalar  # rad
         lie_consistent: wp.int32  # whether the odometry in messages leads where the lie does
-        map_chance: scalar
-        map_landmark: wp.int32  # that is off; -1: any
-        map_offset: scalar  # m
-        map_offset_spread: scalar  # m
-        map_direction: vec3  # of length 1; zero: drawn
-        map_start: scalar  # s
-        map_spread: scalar  # s
+        map_error_chance: scalar
+        map_error_landmark: wp.int32  # that is off; -1: any
+        map_error_offset: scalar  # m
+        map_error_offset_spread: scalar  # m
+        map_error_direction: vec3  # of length 1; zero: drawn
+        map_error_start: scalar  # s
+        map_error_start_spread: scalar  # s
         jammer_chance: scalar
         jammer_start: scalar  # s
-        jammer_spread: scalar  # s
+        jammer_start_spread: scalar  # s
         jammer_duration: wp.float64  # s
         jammer_period: wp.float64  # s
         jammer_duty: wp.float64

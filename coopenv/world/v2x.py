@@ -102,7 +102,7 @@ def draw_restart(model: Any, state: Any, world: int, vehicle: int, o: Any):
     one = o.dtype(1.0)
     words = random_words(state.seed[world], state.episode[world], 0, vehicle, RESTART)
     if uniform(words[0], one) < fault.restart_chance:
-        time = wp.float64(fault.restart_time + fault.restart_spread * uniform(words[1], one))
+        time = wp.float64(fault.restart_time + fault.restart_time_spread * uniform(words[1], one))
         ticks = wp.min(time * model.camera_rate, wp.float64(model.horizon_ticks) + wp.float64(1.0))
         decisions = int(wp.ceil(ticks / wp.float64(model.ticks_per_decision) - wp.float64(1.0e-6)))
         state.restart_tick[world, vehicle] = 1 + model.ticks_per_decision * wp.max(decisions, 1)
@@ -115,7 +115,7 @@ def draw_lie(model: Any, state: Any, world: int, vehicle: int, o: Any):
     subject = wp.where(fault.lie == COLLUDE, model.vehicles, vehicle)
     words = random_words(state.seed[world], state.episode[world], 0, subject, LIE)
     if uniform(words[0], o.dtype(1.0)) < fault.lie_chance:
-        state.lie_tick[world, vehicle] = first_tick_of(model, fault.lie_start, fault.lie_spread, words[1])
+        state.lie_tick[world, vehicle] = first_tick_of(model, fault.lie_start, fault.lie_start_spread, words[1])
         direction = drawn_direction(fault.lie_direction, words[2])
         state.lie_offset[world, vehicle] = fault.lie_offset * direction
         state.lie_velocity[world, vehicle] = fault.lie_speed * direction
@@ -127,7 +127,8 @@ def draw_jammer(model: Any, state: Any, world: int, vehicle: int, o: Any):
     fault = model.fault[vehicle]
     words = random_words(state.seed[world], state.episode[world], 0, vehicle, JAMMER)
     if uniform(words[0], o.dtype(1.0)) < fault.jammer_chance:
-        state.jammer_tick[world, vehicle] = first_tick_of(model, fault.jammer_start, fault.jammer_spread, words[1])
+        begin = first_tick_of(model, fault.jammer_start, fault.jammer_start_spread, words[1])
+        state.jammer_tick[world, vehicle] = begin
 
 
 @wp.func
@@ -136,11 +137,12 @@ def draw_map_error(model: Any, state: Any, world: int, vehicle: int, landmark: i
     fault = model.fault[vehicle]
     one = o.dtype(1.0)
     words = random_words(state.seed[world], state.episode[world], 0, landmark, MAP_ERROR)
-    concerned = fault.map_landmark < 0 or fault.map_landmark == landmark
-    if concerned and uniform(words[0], one) < fault.map_chance:
-        offset = fault.map_offset + fault.map_offset_spread * uniform(words[3], one)
-        state.map_tick[world, vehicle, landmark] = first_tick_of(model, fault.map_start, fault.map_spread, words[1])
-        state.map_error[world, vehicle, landmark] = offset * drawn_direction(fault.map_direction, words[2])
+    concerned = fault.map_error_landmark < 0 or fault.map_error_landmark == landmark
+    if concerned and uniform(words[0], one) < fault.map_error_chance:
+        offset = fault.map_error_offset + fault.map_error_offset_spread * uniform(words[3], one)
+        begin = first_tick_of(model, fault.map_error_start, fault.map_error_start_spread, words[1])
+        state.map_tick[world, vehicle, landmark] = begin
+        state.map_error[world, vehicle, landmark] = offset * drawn_direction(fault.map_error_direction, words[2])
 
 
 @wp.func
@@ -163,9 +165,10 @@ def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
         shift = state.lie_offset[world, vehicle] + state.lie_velocity[world, vehicle] * shift.dtype(since)
         if fault.lie != REPLAY:
             turn[2] = fault.lie_turn
-    if fault.corruption > one - one and wp.float64(tick) * model.camera_period >= wp.float64(fault.corruption_start):
+    time = wp.float64(tick) * model.camera_period
+    if fault.corruption_probability > one - one and time >= wp.float64(fault.corruption_start):
         words = random_words(state.seed[world], state.episode[world], tick, vehicle, CORRUPTION)
-        if uniform(words[3], one) < fault.corruption:
+        if uniform(words[3], one) < fault.corruption_probability:
             more = random_words(state.seed[world], state.episode[world], tick, vehicle, CORRUPTION + wp.uint32(1))
             for axis in range(3):
                 shift[axis] += fault.corruption_size * signed_uniform(words[axis], one)
