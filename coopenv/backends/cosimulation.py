@@ -128,7 +128,7 @@ class CosimulatedWorld(SimulatedWorld):
 
     def _build_record(self) -> Any:
         struct, model = cosimulation_struct(self.precision), self.model
-        record = allocate(struct, {"W": self.worlds, "N": model.vehicles, "Z": model.traffic}, self.device)
+        record = allocate(struct, {"W": self.worlds, "N": model.vehicles}, self.device)
         self._motion = {name: getattr(record, name).numpy() for name in fields(struct)}
         return PerWorld(record)
 
@@ -215,9 +215,11 @@ class CosimulatedWorld(SimulatedWorld):
         row["true_rotation"][...] = about_z(poses.heading)
         row["true_position"][..., :2] = poses.xy
         row["true_velocity"][..., :2], row["true_angular_velocity"][..., 2] = velocity, yaw_rate
-        row["traffic_rotation"][...] = about_z(poses.traffic_heading)
-        for name in ("speed", "steering", "crashed", "left", "driven", "traffic_position", "traffic_half"):
+        for name in ("speed", "steering", "crashed", "left", "driven"):
             row[name][...] = getattr(poses, name)
+        self.view("traffic_rotation")[world] = about_z(poses.traffic_heading)
+        for name in ("traffic_position", "traffic_half"):
+            self.view(name)[world] = getattr(poses, name)
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks, see `World.advance`; `fetch` moves the vehicles to each."""

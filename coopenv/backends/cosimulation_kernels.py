@@ -21,7 +21,7 @@ def cosimulation_struct(p: Precision) -> Any:
 
     @wp.struct
     class HostMotion:
-        """W worlds, N vehicles, Z bodies of the traffic; lengths in m, angles in rad, map and body frames as named."""
+        """W worlds, N vehicles; lengths in m, angles in rad, map and body frames as named."""
 
         true_rotation: array("WN", mat33)  # body to map
         true_position: array("WN", vec3)  # map
@@ -32,9 +32,6 @@ def cosimulation_struct(p: Precision) -> Any:
         crashed: array("WN", wp.int32)
         left: array("WN", wp.int32)
         driven: array("WN", wp.int32)  # moved here, by commands; its row of the others is not read
-        traffic_position: array("WZ", vec3)  # map
-        traffic_rotation: array("WZ", mat33)
-        traffic_half: array("WZ", vec3)
 
     return HostMotion
 
@@ -50,15 +47,6 @@ def take_pose(model: Any, state: Any, motion: Any, world: int, vehicle: int):
     for sample in range(model.samples_per_tick):
         state.sampled_velocity[world, vehicle, sample] = motion.true_velocity[world, vehicle]
         state.sampled_angular_velocity[world, vehicle, sample] = motion.true_angular_velocity[world, vehicle]
-
-
-@wp.func
-def take_traffic(model: Any, state: Any, motion: Any, world: int):
-    """Write where the traffic is."""
-    for k in range(model.traffic):
-        state.traffic_position[world, k] = motion.traffic_position[world, k]
-        state.traffic_rotation[world, k] = motion.traffic_rotation[world, k]
-        state.traffic_half[world, k] = motion.traffic_half[world, k]
 
 
 @wp.func
@@ -80,7 +68,6 @@ def renew_sample(model: Any, state: Any, motion: Any, world: int, vehicle: int, 
 def begin_cosimulation(model: Any, state: Any, motion: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     place_everybody(model, state, world)
-    take_traffic(model, state, motion, world)
     for vehicle in range(model.vehicles):
         take_pose(model, state, motion, world, vehicle)
         agent = model.landmarks + vehicle
@@ -102,13 +89,6 @@ def move_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: i
 
 
 @wp.func
-def arrange_cosimulated(model: Any, state: Any, motion: Any, world: int, tick: int):
-    """Take the traffic, and do what a simulation does."""
-    take_traffic(model, state, motion, world)
-    arrange_world(model, state, motion, world, tick)
-
-
-@wp.func
 def look_cosimulated(model: Any, state: Any, motion: Any, world: int, vehicle: int, tick: int):
     """Do what a simulation does; the moving program may know of past contacts and departures."""
     if state.ended[world, vehicle] == UNDER_WAY:
@@ -125,7 +105,7 @@ COSIMULATED = Source(
     "cosimulated",
     begin_cosimulation,
     move_cosimulated,
-    arrange_cosimulated,
+    arrange_world,
     look_cosimulated,
     cosimulation_struct,
     keeps_nearby=True,
