@@ -19,7 +19,7 @@ import pytest
 from coopenv.base import files
 from coopenv.base.errors import OutputError
 from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
-from tests.helpers.processes import small_disk
+from tests.helpers.processes import small_disk, start
 
 NAMES = ("a.txt", "b.txt", "c.txt", "sometimes.txt")
 
@@ -73,16 +73,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_writers_killed_at_random_instants_leave_a_whole_result(kills: int, place: Path) -> None:
     (place / "single.txt").write_text("0" * 200_000)
     draw, least = random.Random(3), 0
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     for _ in range(kills):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(least + 1)],
-            cwd=place,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
+        writer = start([sys.executable, "-c", WRITER, str(least + 1)], place)
         assert writer.stdout is not None
         least = int(writer.stdout.readline())
         time.sleep(draw.uniform(0.0, 0.1))
@@ -117,10 +109,7 @@ def test_a_new_folder_goes_again_with_what_failed_in_it(tmp_path: Path) -> None:
 
 
 def test_readers_find_a_whole_result_at_every_instant(place: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, "1"], cwd=place, stdout=subprocess.DEVNULL, env=environment
-    )
+    writer = start([sys.executable, "-c", WRITER, "1"], place, stdout=subprocess.DEVNULL)
     seen = set()
     try:
         while len(seen) < 20:

@@ -30,6 +30,16 @@ def constant(linear: Sequence[float], angular: Sequence[float] = (0.0, 0.0, 0.0)
     return {"kind": "constant", "linear": list(linear), "angular": list(angular)}
 
 
+FOLLOWING = (["L1", "L2", "L3"], ["L1", "L2", "vehicle_1"], ["L3", "vehicle_1", "vehicle_2"])
+
+
+def circling(neighbours: Sequence[list[str]] | None = None, **more: Any) -> list[dict[str, Any]]:
+    """Return vehicles that drive circles: by default three, each of which hears all before it."""
+    motion = constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2])
+    names = neighbours or FOLLOWING
+    return [vehicle((2.0 * i, -1.0, 0.5), motion=motion, neighbours=n, **more) for i, n in enumerate(names)]
+
+
 def raw(vehicles: Sequence[dict[str, Any]] | None = None, **sections: Any) -> dict[str, Any]:
     """Return the data of a scenario: one standing vehicle among four landmarks, unless told otherwise."""
     return {

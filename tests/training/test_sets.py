@@ -21,7 +21,7 @@ from coopenv.policies.loader import read_card
 from coopenv.policies.sets import CONSTANTS, Inputs, SavedSetDriver, SetDriver
 from coopenv.training.command import train
 from coopenv.training.sets import SetNetwork
-from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan, read_settings
+from coopenv.training.settings import Clone, EvaluationSettings, Ppo, Settings, TrainingPlan
 
 pytestmark = pytest.mark.train
 EVERYWHERE = ("facade", "behind_truck", "lighthouse")
@@ -125,22 +125,6 @@ def test_other_weights_are_refused(folder: Path) -> None:
     other = card.model_copy(update={"sha256": foreign.network.sha256})
     with pytest.raises(CoopenvError, match=r"weights\.safetensors: not the weights of a network over sets: 'mean'"):
         SavedSetDriver(load_scenario("facade"), folder=foreign.folder, network=other)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("network = 'sets'", r"'sets' learns by a clone alone: set clone\.agent and steps = 0"),
-        ("network = 'sets'\nsteps = 9\nclone.agent = 'peek'", r"'sets' learns by a clone alone"),
-        ("steps = 0\nclone = { agent = 'peek', elsewhere = ['facade'] }", r"clone\.elsewhere: only with network = 'se"),
-        ("network = 'graph'", r"network: .*'sets'"),
-    ],
-)
-def test_settings_are_refused_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
-    (tmp_path / "train.toml").write_text(text)
-    with pytest.raises(CoopenvError, match=expected) as caught:
-        read_settings(tmp_path / "train.toml")
-    assert "\n" not in str(caught.value)
 
 
 def test_what_is_not_possible_is_refused(tmp_path: Path) -> None:

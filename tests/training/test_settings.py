@@ -143,13 +143,18 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("[environments.facade]\narms = 3", r"train\.toml: environments\.facade\.arms: expected tables by name"),
         ("arms = 3", r"train\.toml: arms: expected tables by name"),
         ("steps = ", r"train\.toml: not valid TOML"),
+        ("network = 'sets'", r"'sets' learns by a clone alone: set clone\.agent and steps = 0"),
+        ("network = 'sets'\nsteps = 9\nclone.agent = 'peek'", r"'sets' learns by a clone alone"),
+        ("steps = 0\nclone = { agent = 'peek', elsewhere = ['facade'] }", r"clone\.elsewhere: only with network = 'se"),
+        ("network = 'graph'", r"network: .*'sets'"),
     ],
 )
 def test_mistakes_are_one_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "train.toml"
     path.write_text(text)
-    with pytest.raises(coopenv.CoopenvError, match=message):
+    with pytest.raises(coopenv.CoopenvError, match=message) as caught:
         read_settings(path, environment="facade")
+    assert "\n" not in str(caught.value)
 
 
 def test_missing_file_and_unknown_arm(path: Path) -> None:

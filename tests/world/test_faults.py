@@ -12,25 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
-from tests.helpers.builders import constant, estimated_position, run, same_bits, scenario, start, vehicle
+from tests.helpers.builders import circling, estimated_position, run, same_bits, scenario, start
 
 WORLDS = 1000
-NEIGHBOURS = (["L1", "L2", "L3"], ["L1", "L2", "vehicle_1"], ["L3", "vehicle_1", "vehicle_2"])
 State = dict[str, np.ndarray]
 
 
 def fleet(own: dict[int, dict[str, Any]], **sections: Any) -> Scenario:
     """Return three vehicles that drive circles, each of which hears all before it; `own`: faults by vehicle."""
-    vehicles = [
-        vehicle(
-            (2.0 * i, -1.0, 0.5),
-            motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]),
-            initial_estimate={"position_radius": 0.3, "orientation_angle": 0.1},
-            neighbours=names,
-            **({"faults": own[i]} if i in own else {}),
-        )
-        for i, names in enumerate(NEIGHBOURS)
-    ]
+    vehicles = circling(initial_estimate={"position_radius": 0.3, "orientation_angle": 0.1})
+    for i, faults in own.items():
+        vehicles[i]["faults"] = faults
     return scenario(vehicles, **sections)
 
 

@@ -13,7 +13,7 @@ from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 from coopenv.world.state import size_of, state_sizes, state_struct
-from tests.helpers.builders import constant, landmark, scenario, simulate, start, vehicle
+from tests.helpers.builders import assert_same, constant, landmark, scenario, simulate, start, vehicle
 
 RANGE = 25.0
 
@@ -125,8 +125,7 @@ def test_saved_states_go_on_as_they_were_and_are_checked() -> None:
     expected = world.get_state()
     world.set_state(saved)
     world.advance(6)
-    for name, values in world.get_state().items():
-        assert_array_equal(values, expected[name], err_msg=name)
+    assert_same(world.get_state(), expected)
     saved["kept_agent"][0, 0, 0] = 1000
     with pytest.raises(CoopenvError, match="'kept_agent'"):
         world.set_state(saved)

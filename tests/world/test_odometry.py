@@ -18,6 +18,7 @@ from coopenv.world.state import LASTING_ERRORS
 from tests.helpers.builders import command, constant, run, same_bits, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 from tests.oracles.continuous import left_jacobian
+from tests.oracles.geometry import OPTICAL_TO_BODY_FORWARD as FORWARD
 
 NOISE = {"velocity": 0.3, "angular_velocity": 0.2}
 SEGMENTS = {
@@ -263,8 +264,7 @@ def test_camera_looks_from_where_it_truly_is() -> None:
     state = drawn({}, 20, "float64", position=place, **{**MISPLACED, "extrinsics_error": 0.3})
     state = {name: values.astype(float) for name, values in state.items() if values.dtype.kind == "f"}
     R, position = state["rotation"][:, -1], state["position"][:, -1]
-    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    turned = R @ forward @ Rotation.from_rotvec(state["camera_turn"][:, 0]).as_matrix()
+    turned = R @ FORWARD @ Rotation.from_rotvec(state["camera_turn"][:, 0]).as_matrix()
     eye = position + np.einsum("wij,wj->wi", R, np.array(place) + state["camera_shift"][:, 0])
     for target in range(4):
         line = np.einsum("wji,wj->wi", turned, state["position"][:, target] - eye)
@@ -276,10 +276,9 @@ def test_a_longer_focal_length_spreads_the_image() -> None:
     """Pixels are f (1 + e) x, bearings are computed from them with f: the tangents to the optical axis are wider."""
     state = drawn({}, 20, "float64", focal_length_error=0.1)
     state = {name: values.astype(float) for name, values in state.items() if values.dtype.kind == "f"}
-    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     for target in range(4):
         ray = np.einsum(
-            "wji,wj->wi", state["rotation"][:, -1] @ forward, state["position"][:, target] - state["position"][:, -1]
+            "wji,wj->wi", state["rotation"][:, -1] @ FORWARD, state["position"][:, target] - state["position"][:, -1]
         )
         wide, seen = 1.0 + state["camera_focal"][:, 0], state["bearing"][:, 0, target]
         assert_allclose(seen[:, 0] / seen[:, 2], wide * ray[:, 0] / ray[:, 2], rtol=1e-4)
@@ -292,11 +291,10 @@ def test_a_pinhole_s_view_is_that_of_its_true_focal_length() -> None:
     camera = {"model": "pinhole", "focal_length_error": 0.3, "orientation": "forward"}
     made = scenario([vehicle(motion=TURNING)], camera=camera, topology={"mode": "sensed"})
     state = start(made, range(500)).get_state()
-    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     (fx, fy), (cx, cy), (width, height) = made.camera.focal_length, made.camera.principal_point, made.camera.image_size
     for target in range(4):
         line = state["position"][:, target] - state["position"][:, -1]
-        x, y, z = np.einsum("wji,wj->iw", state["rotation"][:, -1] @ forward, line)
+        x, y, z = np.einsum("wji,wj->iw", state["rotation"][:, -1] @ FORWARD, line)
         wide = 1.0 + state["camera_focal"][:, 0]
         u, v = fx * wide * x / np.abs(z) + cx, fy * wide * y / np.abs(z) + cy
         inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)

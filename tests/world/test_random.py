@@ -21,6 +21,7 @@ from coopenv.scenario import load_scenario
 from coopenv.world import quality, random
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES, Calls
+from tests.oracles.geometry import OPTICAL_TO_BODY_FORWARD as FORWARD
 
 LARGEST = 2**32 - 1
 call = Calls(
@@ -242,7 +243,6 @@ def expected(samples: list[tuple[float, float, np.ndarray]], length: float) -> f
 def test_it_is_the_mean_over_the_last_metres() -> None:
     engine = engine_of(observer__gramian_distance=1.0)
     landmarks = engine.world.model.landmarks
-    camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # to body
     rng, samples, way = np.random.default_rng(0), [], 0.0
     compared = 0
     for tick in range(1, 241):
@@ -254,7 +254,7 @@ def test_it_is_the_mean_over_the_last_metres() -> None:
             R = engine.view("estimate_rotation")[0, 0]
             G = np.zeros((6, 6))
             for n in np.flatnonzero(engine.view("sight")[0, 0, :landmarks] == Sight.VISIBLE):
-                b = R @ camera @ engine.view("bearing")[0, 0, n]
+                b = R @ FORWARD @ engine.view("bearing")[0, 0, n]
                 z = engine.view("position")[0, n]
                 cross = np.array([[0, -z[2], z[1]], [z[2], 0, -z[0]], [-z[1], z[0], 0]])
                 C = (np.eye(3) - np.outer(b, b)) @ np.hstack([-cross, np.eye(3)])

@@ -26,6 +26,7 @@ from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.helpers.builders import command, constant, run, same_bits, scenario, simulate, start, vehicle
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES
+from tests.oracles.geometry import OPTICAL_TO_BODY_FORWARD as FORWARD
 
 WORLDS, DECISIONS = 6, 60
 OF_TRUTH_AND_RADIO = (
@@ -83,14 +84,13 @@ def test_what_is_sensed_anyway_has_the_same_noise() -> None:
 
 def _deviations(state: dict[str, np.ndarray]) -> np.ndarray:
     """Return the angles (W, N, A) between measured and true bearings, rad."""
-    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     scenario = coopenv.load_scenario(FOUR_WAY)
     markers = np.array([agent.marker for agent in (*scenario.landmarks, *scenario.vehicles)])
     R, position = state["rotation"], state["position"]
     point = position + np.einsum("waij,aj->wai", R, markers)
     eye = position[:, 12:] + R[:, 12:] @ np.array(scenario.camera.position)
     line = point[:, None] - eye[:, :, None]
-    ray = np.einsum("wnji,wnaj->wnai", R[:, 12:] @ forward, line)
+    ray = np.einsum("wnji,wnaj->wnai", R[:, 12:] @ FORWARD, line)
     ray /= np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
     return np.arcsin(np.minimum(np.linalg.norm(np.cross(ray, state["bearing"]), axis=-1), 1.0))
 
@@ -227,7 +227,6 @@ def test_a_recording_keeps_them() -> None:
 
 PAN = {"limit": 1.2, "rate": 0.9}
 DRIVEN = {"kind": "driven"}
-FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 CROSSING: dict[str, Any] = {
     "action.pan": PAN,
     "observation.include": ["estimate", "quality", "bearings", "odometry", "messages", "goal", "pan"],

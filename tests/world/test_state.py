@@ -15,6 +15,7 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.observers.registry import find_embedded
 from coopenv.world.world import World
+from tests.fuzz.states import same
 from tests.helpers.builders import errors, estimated_position, quaternion_wxyz, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 
@@ -178,10 +179,6 @@ def env() -> Any:
     for _ in range(3):
         made.step({agent: np.zeros(2, np.float32) for agent in made.agents})
     return made
-
-
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    return all(a[name].tobytes() == b[name].tobytes() for name in a if isinstance(a[name], np.ndarray))
 
 
 @pytest.mark.parametrize(

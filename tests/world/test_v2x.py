@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.helpers.builders import LANDMARKS, constant, estimated_position, landmark, run, scenario, start, vehicle
+from tests.helpers.builders import circling, constant, estimated_position, landmark, raw, run, scenario, start, vehicle
 
 State = dict[str, np.ndarray]
 ESTIMATE = {"position_offset": [0.5, -0.4, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}
@@ -17,14 +17,7 @@ ESTIMATE = {"position_offset": [0.5, -0.4, 0.2], "orientation_offset_wxyz": [0.9
 
 def fleet(neighbours: list[list[str]] | None = None, v2x: dict[str, Any] | None = None, **sections: Any) -> Any:
     """Return three vehicles that drive circles; by default each hears all before it."""
-    names = neighbours or [["L1", "L2", "L3"], ["L1", "L2", "vehicle_1"], ["L3", "vehicle_1", "vehicle_2"]]
-    vehicles = [
-        vehicle(
-            (2.0 * i, -1.0, 0.5), motion=constant([0.3, 0, 0], [0, 0, 0.2]), initial_estimate=ESTIMATE, neighbours=n
-        )
-        for i, n in enumerate(names)
-    ]
-    return scenario(vehicles, v2x=v2x or {}, **sections)
+    return scenario(circling(neighbours, initial_estimate=ESTIMATE), v2x=v2x or {}, **sections)
 
 
 def assert_heard(now: State, then: State, receiver: int, sender: int, sent: int) -> None:
@@ -73,13 +66,7 @@ def test_order_follows_the_neighbours_not_the_index() -> None:
 def test_renaming_the_vehicles_changes_nothing() -> None:
     """The same fleet listed in another order gives the same estimates, vehicle by vehicle."""
     shuffled = [2, 0, 1]  # place in the new list -> vehicle in the old one
-    parts = []
-    for i in range(3):
-        names = [["L1", "L2", "L3"], ["L1", "L2", "vehicle_1"], ["L3", "vehicle_1", "vehicle_2"]][i]
-        parts.append(
-            vehicle((2.0 * i, -1.0, 0.5), motion=constant([0.3, 0, 0], [0, 0, 0.2]), initial_estimate=ESTIMATE)
-        )
-        parts[-1]["neighbours"] = names
+    parts = circling(initial_estimate=ESTIMATE)
     new_name = {f"vehicle_{old + 1}": f"vehicle_{new + 1}" for new, old in enumerate(shuffled)}
     renamed = [{**parts[old], "neighbours": [new_name.get(n, n) for n in parts[old]["neighbours"]]} for old in shuffled]
     first = run(start(scenario(parts)), 120)[-1]
@@ -166,7 +153,7 @@ def test_messages_carry_the_marker() -> None:
         vehicle((2, -1, 0.5), neighbours=["vehicle_1"], initial_estimate={"position_offset": [0.2, 0, 0]}),
         vehicle((2, -1.5, 0.5), neighbours=["lamp"], initial_estimate={"position_offset": [0.2, 0, 0]}),
     ]
-    landmarks = [landmark(f"L{i + 1}", p) for i, p in enumerate(LANDMARKS)]
+    landmarks = raw()["landmarks"]
     turned = [0.3 * np.cos(0.9) - 0.2 * np.sin(0.9), 0.3 * np.sin(0.9) + 0.2 * np.cos(0.9), 1.1]
     vehicles[2]["initial_pose"]["position"] = [2.0, -1.0 + 1e-5, 0.5]
     landmarks.append(landmark("lamp", turned))
