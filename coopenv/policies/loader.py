@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, PositiveFloat, ValidationError
+from pydantic import Field, PositiveFloat, ValidationError
 
 from coopenv.base import installation
 from coopenv.base.errors import CoopenvError, error_text, printable, shown, suggest
 from coopenv.base.installation import data_directory, list_agents
-from coopenv.base.sections import one_line, read_toml
+from coopenv.base.sections import Section, one_line, read_toml
 from coopenv.policies.base import PLAIN, Policy, decide, restart
 
 if TYPE_CHECKING:
@@ -29,10 +29,8 @@ LATER_FIELDS = {"center", "settings"}
 """Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
 
 
-class NetworkColumn(BaseModel):
+class NetworkColumn(Section):
     """A field of the observation or of the action that a network was trained with."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start: int
     stop: int
@@ -43,10 +41,8 @@ class NetworkColumn(BaseModel):
     unit: str
 
 
-class NetworkCard(BaseModel):
+class NetworkCard(Section):
     """The table `network` of an `agent.toml`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     weights: str
     """File in the agent's folder."""
@@ -60,14 +56,12 @@ class NetworkCard(BaseModel):
     action: dict[str, NetworkColumn]
     settings: dict[str, float]
     """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
-    seen: dict[str, tuple[float, float]] = {}
+    seen: dict[str, tuple[float, float]] = Field(default={})
     """Between which values nearly all entries of a field lay in training, by its name."""
 
 
-class AgentCard(BaseModel):
+class AgentCard(Section):
     """The contents of an `agent.toml`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
     description: str
@@ -77,13 +71,13 @@ class AgentCard(BaseModel):
     """Environments that it was made for: names, or TOML files in the agent's folder."""
     kind: Kind = "scripted"
     """Trained, scripted, or a reference for what is possible."""
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default={})
     """Keyword arguments of the entry."""
     network: NetworkCard | None = None
     """Of a learned one: its weights, and the observation and action that it was trained with."""
-    training: dict[str, Any] = {}
+    training: dict[str, Any] = Field(default={})
     """How it was trained: command, seed, versions."""
-    results: dict[str, Any] = {}
+    results: dict[str, Any] = Field(default={})
     """What it reached on held-out maps when it was trained."""
 
 
