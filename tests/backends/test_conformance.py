@@ -81,15 +81,11 @@ def processes(folder: Path) -> Iterator[Path]:
             process = start([*COOPENV, "svea", *arguments], folder)
             stack.callback(process.wait)
             stack.callback(process.kill)
-            assert "ready" in process.stdout.readline()
-            return process
+            return process.stdout
 
-        launch("router", "--listen", f"tcp/127.0.0.1:{port}")
-        first = start([*COOPENV, "svea", "fake", str(path), "--car", "svea7"], folder)  # both load at a time
-        stack.callback(first.wait)
-        stack.callback(first.kill)
-        launch("fake", str(path), "--car", "svea1")
-        assert first.stdout is not None and "ready" in first.stdout.readline()
+        assert "ready" in launch("router", "--listen", f"tcp/127.0.0.1:{port}").readline()
+        both = [launch("fake", str(path), "--car", car) for car in ("svea7", "svea1")]  # which load at a time
+        assert all("ready" in said.readline() for said in both)
         yield path
 
 

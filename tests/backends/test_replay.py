@@ -250,7 +250,7 @@ def everything_drawn() -> Scenario:
             {"routes": ["r4"], "presence": 0.5, **car},
         ],
         routes=routes,
-        landmark_groups=[{**group, "presence": 0.7}],
+        landmark_groups=[group],
         termination={"after_arrival": "continue", "collision": False},
         randomisation={"camera_range": [0.3, 1.0], "landmark_presence": [0.5, 1.0]},
         camera={"orientation": "body", "range": 8.0},
