@@ -77,7 +77,7 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
 
 @device_function
 def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
-    """Return 1 when a vehicle's box overlaps a building, the traffic, or another of the first `count` agents."""
+    """Return 1 when a vehicle's box overlaps a building, another of the first `count` agents or, with all, traffic."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
@@ -94,7 +94,7 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
                 return 1
             item = first_in(state, world, cell, last)
             while item >= 0:
-                counts = item < count or item >= model.agents
+                counts = item < count or count == model.agents
                 if counts and item != agent and has_body(model, state, world, item):
                     other_R, other_center, other_half = body_of(model, state, world, item)
                     if boxes_touch(center, R, half, other_center, other_R, other_half):

@@ -10,6 +10,7 @@ import pytest
 
 import coopenv
 from coopenv import CoopenvError
+from coopenv.api.engine import Engine
 
 CODE = '''
 import numpy as np
@@ -124,6 +125,17 @@ def test_other_bodies_may_be_fewer_than_there_can_be(own: dict[str, Any]) -> Non
     env = coopenv.parallel_env(coopenv.scenario.parse_scenario({**own, "program": program}, "circle"))
     env.reset(seed=0)
     assert env.engine.view("traffic_half")[0].tolist() == [[1.0] * 3, [0.0] * 3, [0.0] * 3]
+
+
+def test_routes_are_drawn_whatever_stood_there_before(own: dict[str, Any]) -> None:
+    route = {"name": "way", "waypoints": [[0, 0], [20, 0]], "lateral_spread": 1.0}
+    driven = {"motion": {"kind": "driven"}, "routes": ["way"], "body": {"size": [0.6, 0.3, 0.3]}}
+    made = coopenv.scenario.parse_scenario({**own, "routes": [route], "vehicles": [own["vehicles"][0], driven]}, "c")
+    engine, drawn = Engine(made, 1), []
+    for _ in range(2):
+        engine.reset([3])
+        drawn.append(engine.view("route")[0, 1].copy())
+    np.testing.assert_array_equal(*drawn)
 
 
 def test_a_recording_names_no_code_and_reads_no_files(own: dict[str, Any]) -> None:
