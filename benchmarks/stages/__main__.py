@@ -86,13 +86,14 @@ def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) 
             for side in sides:
                 side.wait()
         with Progress(log, "measuring", total=len(cases)) as progress:
-            for n, case in enumerate(progress.track(cases)):
+            for n, case in enumerate(cases):
                 times = 1e9 * alternate([partial(side.step, n, asked.decisions) for side in sides], asked.rounds)
                 cells = [f"{value:.0f}" for value in np.median(times, axis=0)]
                 if asked.against:
                     share, low, high = ratio(times[:, 1], times[:, 0])
                     cells += [f"{share:.3f}", f"{low:.3f}..{high:.3f}"]
                 table.add_row(case.name, *cells)
+                progress.advance()
     return table
 
 
@@ -125,11 +126,12 @@ def compile_table(asked: argparse.Namespace, log: Console) -> Table:
     cases = [Case("busy_intersection", 1, dtype, overrides) for dtype, overrides in kinds]
     table = number_table(["first step, empty cache"], ["other [s]", "this [s]", "this / other"])
     with Progress(log, "compiling", total=len(cases)) as progress:
-        for case in progress.track(cases):
+        for case in cases:
             sides = [partial(compile_seconds, checkout, case) for checkout in (asked.against.resolve(), HERE)]
             times = alternate(sides, asked.compiles)
             other, this = np.median(times, axis=0)
             table.add_row(f"{case.name}, {case.dtype}", f"{other:.1f}", f"{this:.1f}", f"{this / other:.2f}")
+            progress.advance()
     return table
 
 

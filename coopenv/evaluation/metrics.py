@@ -149,10 +149,6 @@ def _rmse(name: str, start: float, episodes: Episodes) -> Statistic:
     return _over_moments(_counted(episodes, start), getattr(episodes, name).astype(float) ** 2, root=True)
 
 
-def _few_targets(episodes: Episodes) -> Statistic:
-    return _over_moments(_counted(episodes, SETTLED_FROM), episodes.targets_in_view < FEW_TARGETS)
-
-
 def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, Metric]:
     """Return median, 95th percentile and root mean square of an error, from 3 s on and over whole episodes."""
     found = {}
@@ -173,7 +169,9 @@ METRICS: dict[str, Metric] = {
     **_errors("position", "m", "position_error"),
     **_errors("orientation", "deg", "orientation_error", "orientation_"),
     "few_targets_share": Metric(
-        f"Share of time from {SETTLED_FROM:g} s on with fewer than {FEW_TARGETS} targets in view", "1", _few_targets
+        f"Share of time from {SETTLED_FROM:g} s on with fewer than {FEW_TARGETS} targets in view",
+        "1",
+        lambda e: _over_moments(_counted(e, SETTLED_FROM), e.targets_in_view < FEW_TARGETS),
     ),
     "return": Metric("Sum of the rewards of a vehicle", "1", lambda e: _share(e, e.reward.sum(axis=0, dtype=float))),
 }

@@ -3,11 +3,11 @@
 import math
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import inf, isnan, nan
 from time import monotonic
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from rich import box
@@ -21,8 +21,6 @@ from coopenv.base.terminal import NumberTable
 from coopenv.estimation.metrics import CONVERGED, SETTLED
 from coopenv.world import launch
 from coopenv.world.launch import start_warp
-
-T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
 ENOUGH = 1.0  # s of work after its first part, from which on its pace can be estimated; at least 2 % are then done
@@ -92,14 +90,6 @@ class Progress:
     def advance(self, description: str | None = None) -> None:
         """Say that one more unit is done."""
         self.update(self._completed + 1.0, description)
-
-    def track(self, items: Iterable[T]) -> Iterator[T]:
-        """Yield the items, each of which is one unit of work."""
-        if isinstance(items, Sized):
-            self._total = len(items)
-        for item in items:
-            yield item
-            self.advance()
 
     def line(self) -> str:
         """Return how far the work is, e.g. `simulating: 40 % after 20 s, about 30 s left`."""

@@ -136,11 +136,11 @@ class View3d:
         self._ghosts = [[self._mesh(meshes.car(), own, **ghost)] for own in self._colours]
         flat: dict[str, Any] = {"opacity": 0.3, "lighting": False}
         self._ellipses = [self._mesh(meshes.sphere(), own, **flat) for own in self._colours]
-        self._landmarks = [self._landmark() for _ in range(self._stage.landmarks)]
+        self._landmarks = [
+            (self._mesh(meshes.pole(), DARK_BLUE), self._mesh(meshes.sphere(6), DARK_BLUE, ambient=0.5))
+            for _ in range(self._stage.landmarks)
+        ]
         self._bodies: list[list[Any]] = []
-
-    def _landmark(self) -> tuple[Any, Any]:
-        return self._mesh(meshes.pole(), DARK_BLUE), self._mesh(meshes.sphere(6), DARK_BLUE, ambient=0.5)
 
     def _add_light(self) -> None:
         light = self._pv.Light

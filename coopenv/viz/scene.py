@@ -114,16 +114,6 @@ class Frame:
         return self.position[self.landmarks :]
 
     @property
-    def sees(self) -> np.ndarray:
-        """(N,) how many targets each camera measures."""
-        return np.asarray(np.sum(self.sight == Sight.VISIBLE, axis=-1))
-
-    @property
-    def could_see(self) -> np.ndarray:
-        """(N,) how many targets there are for each camera."""
-        return np.asarray(np.sum(self.sight != Sight.NOT_A_NEIGHBOUR, axis=-1))
-
-    @property
     def under_way(self) -> np.ndarray:
         """(N,) bool: has not ended."""
         return np.asarray(self.ended == Outcome.UNDER_WAY)
@@ -136,10 +126,11 @@ class Frame:
     def table(self, sigma: bool = True) -> list[tuple[str, str, str, str]]:
         """Return, per vehicle, both errors (m, deg), 3 sigma (m; with `sigma`), and targets seen of all, as text."""
         sigmas = self.three_sigma if sigma else np.full(len(self.nees), np.nan)
-        columns = self.position_error, self.orientation_error, sigmas, self.sees, self.could_see
+        seen, all_targets = self.sight == Sight.VISIBLE, self.sight != Sight.NOT_A_NEIGHBOUR
+        columns = self.position_error, self.orientation_error, sigmas, seen.sum(axis=-1), all_targets.sum(axis=-1)
         return [
-            (fixed(error, 3), fixed(angle, 1), fixed(bound, 3), f"{sees}/{could_see}")
-            for error, angle, bound, sees, could_see in zip(*columns, strict=True)
+            (fixed(error, 3), fixed(angle, 1), fixed(bound, 3), f"{count}/{most}")
+            for error, angle, bound, count, most in zip(*columns, strict=True)
         ]
 
 

@@ -106,11 +106,6 @@ class Box(NamedTuple):
         corners = self.center + 0.5 * _SIGNS[_FACES] * np.asarray(self.size, float) @ self.rotation.T
         return np.asarray(corners)
 
-    @property
-    def footprint(self) -> np.ndarray:
-        """Return its corners (4, 2) in plan, if it is upright."""
-        return np.asarray(self.faces[-2, :, :2])
-
 
 def entries(start: np.ndarray, path: np.ndarray, boxes: Sequence[Box]) -> np.ndarray:
     """Return at which shares (B, K) of straight paths boxes are entered; 0: it starts inside, infinite: it misses it.

@@ -109,13 +109,6 @@ def test_in_real_time_the_time_left_is_known(text: io.StringIO, monkeypatch: pyt
         assert progress.line() == "running: 1 % after 0 s, about 8 s left"
 
 
-def test_tracked_items_are_counted(text: io.StringIO) -> None:
-    with Progress(Console(file=text), "episodes") as progress:
-        assert list(progress.track(range(5))) == [0, 1, 2, 3, 4]
-        assert progress.line().startswith("episodes: 100 % after ")
-        assert list(progress.track(iter("ab"))) == ["a", "b"]
-
-
 def test_quick_work_says_nothing_where_there_is_no_terminal() -> None:
     text = io.StringIO()
     with Progress(Console(file=text), "quick", total=1) as progress:
