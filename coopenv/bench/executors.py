@@ -13,7 +13,7 @@ import signal
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -63,11 +63,11 @@ def _work(pipe: Connection) -> None:
     end_with_parent()
     while True:
         try:
-            task = pipe.recv()
+            task, done, ended = pipe.recv()
         except EOFError:  # the parent was interrupted before it sent a task
             return
         try:
-            for part in task.parts():
+            for part in task.parts(done, ended):
                 pipe.send((part,))
             pipe.send(())
         except BaseException as error:
@@ -125,11 +125,13 @@ class Pool:
     """Workers, and the tasks that wait for one."""
 
     def __init__(self, tasks: Sequence[Any], jobs: int, limits: Limits | None) -> None:
-        """Take tasks, `Divided`; without limits whatever a part raises ends all."""
-        self.tasks, self.jobs, self.limits = [*tasks], jobs, limits
+        """Take tasks such as `judge.Task`; without limits whatever a part raises ends all."""
+        self.tasks, self.jobs, self.limits = tasks, jobs, limits
         self.waiting = deque(range(len(tasks)))
         self.results: list[list[Any]] = [[] for _ in tasks]
-        self.done = [0] * len(tasks)  # parts of the present rest of each task that have come
+        """Of the parts of each task that are done."""
+        self.ended: list[tuple[str, Any, str]] = []
+        """Observers that are not started again, the world in which (None: everywhere), and why."""
         self.workers: list[_Worker] = []
 
     @property
@@ -169,8 +171,10 @@ class Pool:
             if not idle:
                 idle.append(_Worker())
                 self.workers.append(idle[0])
-            idle[0].number, idle[0].started = self.waiting.popleft(), False
-            idle[0].pipe.send(self.tasks[idle[0].number])
+            number = self.waiting.popleft()
+            idle[0].number, idle[0].started, task = number, False, self.tasks[number]
+            ended = {name: reason for name, world, reason in self.ended if world in (None, task.world)}
+            idle[0].pipe.send((task, len(self.results[number]), ended))
 
     def _look(self) -> bool:
         """Take what the workers send, and end those above a limit; return whether a task is finished."""
@@ -198,22 +202,20 @@ class Pool:
                 worker.before = worker.measured()
             if worker.started:
                 self.results[worker.number] += message
-                self.done[worker.number] += 1
             worker.started = True
         else:
             worker.number = -1
         return worker.number < 0
 
     def _fail(self, worker: _Worker, reason: str, everywhere: bool = False) -> None:
-        """End a worker; what remains of its task waits for another one. `everywhere` as for `Divided.ending`."""
+        """End a worker, and its observer in this world or everywhere; the rest of its task waits for another worker."""
         number, ended = worker.number, worker.end()
         self.workers.remove(worker)
         if not worker.started or self.limits is None:
             raise CoopenvError(f"a process died: out of memory, or killed, or an observer ended it ({ended})")
-        task, part, reason = self.tasks[number], self.done[number], reason or ended
-        for other in (number, *self.waiting):
-            self.tasks[other] = self.tasks[other].ending(task, part, reason, everywhere)
-        self.tasks[number], self.done[number] = self.tasks[number].rest(part), 0
+        task = self.tasks[number]
+        observer, world = [*task.observers][len(self.results[number])], None if everywhere else task.world
+        self.ended.append((observer, world, f"with seed {task.seed}: {reason or ended}"))
         self.waiting.appendleft(number)
 
 
@@ -257,7 +259,7 @@ class _Whole:
     function: Callable[[Any], Any]
     task: Any
 
-    def parts(self) -> Iterator[Any]:
+    def parts(self, done: int, ended: Mapping[str, str]) -> Iterator[Any]:
         yield None
         yield self.function(self.task)
 

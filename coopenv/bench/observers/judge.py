@@ -2,9 +2,10 @@
 
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from hashlib import sha256
 from itertools import compress, pairwise
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -205,49 +206,34 @@ RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory
 
 
 @dataclass(frozen=True)
-class Ended:
-    """In place of an observer that was ended and is not started again."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
 class Task:
     """One record and its observers, its parts; small, so that it travels to a worker."""
 
     source: RecordSource
     variant: str
     seed: int
-    observers: Mapping[str, str | Factory | Ended]
+    observers: Mapping[str, str | Factory]
     """By name, as `registry.find` takes them in another process."""
     steady_from: float | None
     edges: tuple[float, ...] = ()
     """s, of the windows that are judged one by one."""
 
-    def parts(self) -> Iterator[JudgedRun | None]:
-        """Make the record, and run every observer on it."""
+    @property
+    def world(self) -> tuple[RecordSource, str]:
+        """What the records of all seeds have in common."""
+        return self.source, self.variant
+
+    def parts(self, done: int = 0, ended: Mapping[str, str] = MappingProxyType({})) -> Iterator[JudgedRun | None]:
+        """Make the record, and run all observers but the first `done` on it; those of `ended` fail for that reason."""
         recording = self.source.recording(self.variant, self.seed)
         scene = scene_of(recording, self.source.steady_from(self.steady_from, recording), self.edges)
         yield None
-        for name, factory in self.observers.items():
-            if isinstance(factory, Ended):
+        for name, factory in [*self.observers.items()][done:]:
+            if name in ended:
                 dof = len(PLANAR_STATES) if recording.on_a_plane else 6
-                yield failed_run(self.variant, name, scene, dof, factory.reason, {})
+                yield failed_run(self.variant, name, scene, dof, ended[name], {})
             else:
                 yield sample_of(self.variant, name, scene, recording, run(factory, recording))
-
-    def rest(self, done: int) -> "Task":
-        """Return the task without its first observers."""
-        return replace(self, observers=dict([*self.observers.items()][done:]))
-
-    def ending(self, other: "Task", part: int, reason: str, everywhere: bool) -> "Task":
-        """Return the task without the observer that was ended as another's part; unless everywhere, of one variant."""
-        name = [*other.observers][part]
-        alike = (self.source, self.variant) == (other.source, other.variant)
-        if name not in self.observers or not (alike or everywhere):
-            return self
-        ended = Ended(f"with seed {other.seed}: {reason}")
-        return replace(self, observers={**self.observers, name: ended})
 
 
 def judge(task: Task) -> list[JudgedRun]:
