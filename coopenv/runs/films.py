@@ -5,7 +5,7 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -15,8 +15,10 @@ from coopenv.base.files import replacing_file, writing
 from coopenv.base.installation import install_command
 from coopenv.viz.scene import Frame, SceneRecord
 
-if TYPE_CHECKING:
-    from coopenv.viz.stage import Stage  # imports Matplotlib, which is only needed where there is a film
+if TYPE_CHECKING:  # imports Matplotlib, which is only needed where there is a film
+    from coopenv.viz.film3d import View3d
+    from coopenv.viz.stage import Stage
+    from coopenv.viz.topview import TopView
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 """Formats of films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
@@ -44,23 +46,11 @@ def video_path(folder: Path) -> Path:
     return folder / VIDEO_FILES[find_spec("imageio_ffmpeg") is None]
 
 
-class View(Protocol):
-    """Draws frames of one scenario."""
-
-    def paint(self, frame: Frame) -> np.ndarray:
-        """Return an (H, W, 3) uint8 picture of a frame."""
-        ...
-
-    def close(self) -> None:
-        """Let go of everything."""
-        ...
-
-
 class Shot(NamedTuple):
     """One part of the picture of a film."""
 
     record: SceneRecord
-    view: View
+    view: "TopView | View3d"
     name: str = ""
     """Stands above the picture, with whether the vehicles are lost; empty: nothing does."""
 

@@ -19,6 +19,7 @@ from coopenv.runs.console import compile_notice
 from coopenv.runs.scenes import MAX_FPS, frame_stride, source_of
 from coopenv.scenario import Scenario
 from coopenv.viz.scene import Frame, Origin, SceneRecord
+from coopenv.viz.stage import vehicle_mark
 from coopenv.viz.topview import PictureWindow, TopView
 from coopenv.viz.web.panel import Abilities
 
@@ -187,7 +188,7 @@ def vehicle_index(scenario: Scenario, name: str | None, driven: bool = False) ->
         raise CoopenvError("all motion here is prescribed, there is nothing to drive")
     if name is None:
         return min(known.values())
-    found = known | {f"f{i + 1}": i for i in known.values()}
+    found = known | {vehicle_mark(i): i for i in known.values()}
     if name not in found:
         kind = "driven vehicle" if driven else "vehicle"
         raise CoopenvError(f"--vehicle {name}: no such {kind}{suggest(name, known)}; known: {listed([*known])}")
@@ -268,7 +269,7 @@ class EngineReel(Reel):
         ticks = play(engine, [self._seed], scenario.horizon_ticks, policy, to_the_end=False)
         stride = max(1, round(scenario.rates.camera / MAX_FPS))
         source = source_of(engine, self._name, None if able.real_time else self._seed, driver)
-        abilities = Abilities(pace=False, seek=False)
+        abilities = Abilities(pace=False)
         if not able.real_time:
             running = scenario.observer.name
             others = (name for name in available_names() if name != running)

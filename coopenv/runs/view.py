@@ -88,7 +88,7 @@ class Viewer:
         if not self._step():
             self._live = False
             self._set_playing(False)
-            again = "; Restart shows it again" if self._reel.abilities.seek else ""
+            again = "; Restart shows it again" if self._reel.abilities.pace else ""
             self._panel.set_status(f"The episode is over{again}.")
             return False
         ticks = self._frame.tick - self._reel.frames[self._k - 1].tick

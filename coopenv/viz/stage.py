@@ -202,6 +202,11 @@ def pointers(origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.nd
     return np.stack([tip, base + aside, base - aside], axis=1)
 
 
+def vehicle_mark(index: int) -> str:
+    """Return the paper's name of a vehicle in plain text, f1 for the first."""
+    return f"f{index + 1}"
+
+
 _REACH = 0.4  # of the picture's side: how far a field of view is drawn of a camera that sees farther
 _STAND_IN = 0.042  # of the scene's side, length of a vehicle without a body
 _CAR = (4.4, 1.9, 1.5)  # proportions of a vehicle without a body
@@ -237,7 +242,7 @@ class Stage:
     def short_name(self, target: int) -> str:
         """Return f1 for the first vehicle, and a landmark's name; L1 for landmark_1."""
         if target >= self.landmarks:
-            return f"f{target - self.landmarks + 1}"
+            return vehicle_mark(target - self.landmarks)
         name = self.scenario.target_names[target]
         return f"L{name.removeprefix('landmark_')}" if name.startswith("landmark_") else name
 

@@ -183,7 +183,7 @@ class TopView:
         look: dict[str, Any] = {"fontsize": NORMAL, "weight": "bold", "color": INK, "path_effects": ground.HALO}
         look |= {"ha": "center", "va": "center", "clip_on": True}
         named = range(ground.MOST_ROWS)  # those of the table: more names would overlap
-        marks = (ground.vehicle_mark(i) if i in named else "" for i in range(len(colours)))
+        marks = (geometry.vehicle_mark(i) if i in named else "" for i in range(len(colours)))
         self._names = [layers.keep(self._axes.text(0, 0, mark, **look)) for mark in marks]
         boxes = [name.get_window_extent() for name in self._names]
         self._half_name = np.array([(box.width, box.height) for box in boxes]) / 2 * self._pixel
@@ -282,4 +282,4 @@ class TopView:
         self._time.set_text(f"{error}t = {time:.2f} s")
         table = frame.table(not self._gain)
         for i, row in enumerate(self._rows):
-            row.set_text("  {:<4}{:>7}{:>7}{:>7}{:>6}".format(ground.vehicle_mark(i), *table[i]))
+            row.set_text("  {:<4}{:>7}{:>7}{:>7}{:>6}".format(geometry.vehicle_mark(i), *table[i]))

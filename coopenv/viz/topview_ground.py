@@ -21,7 +21,7 @@ from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz import style
 from coopenv.viz.scene import Frame
-from coopenv.viz.stage import Stage, roads, ways
+from coopenv.viz.stage import Stage, roads, vehicle_mark, ways
 from coopenv.viz.style import (
     DARK_BLUE,
     DPI,
@@ -60,11 +60,6 @@ SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
     Sight.OCCLUDED_BY_BODY: {"linewidth": 1.1, "linestyle": DASHED, "color": INK},
 }
 """Lines of sight; those without a colour have their observer's."""
-
-
-def vehicle_mark(index: int) -> str:
-    """Return the paper's name of a vehicle in plain text, f1 for the first."""
-    return f"f{index + 1}"
 
 
 def pixels(x: float, y: float) -> tuple[float, float]:

@@ -294,9 +294,7 @@ def test_circles_of_protection_levels(overtaking: SceneRecord) -> None:
 def test_table_with_protection_levels(overtaking: SceneRecord) -> None:
     frame = overtaking.frame(0)
     level = np.full((len(frame.estimate_position), 2), np.inf)
-    assert "level" not in table_html(
-        Stage(overtaking.scenario), overtaking.source, replace(frame, protection_level=level)
-    )
+    assert "level" not in table_html(overtaking.source, replace(frame, protection_level=level))
     level[0] = 1.25, 0.1
-    text = table_html(Stage(overtaking.scenario), overtaking.source, replace(frame, protection_level=level))
+    text = table_html(overtaking.source, replace(frame, protection_level=level))
     assert "level [m]" in text and ">1.25</td>" in text and text.count(">-</td>") >= len(level) - 1

@@ -14,7 +14,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.error_figures import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Origin, semi_axes
-from coopenv.viz.stage import Stage
+from coopenv.viz.stage import Stage, vehicle_mark
 from coopenv.viz.style import BLUE, DARK_BLUE, GREY, INK, VEHICLE_COLOURS, VERMILION, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import Look
@@ -116,9 +116,7 @@ class Abilities:
     """Controls that a source supports."""
 
     pace: bool = True
-    """Pause, step and speed; not of real cars."""
-    seek: bool = True
-    """Go back to earlier frames."""
+    """Pause, step, speed, and back to earlier frames; not of real cars."""
     observers: Sequence[str] = ()
     """Observers to choose from; the first one runs."""
     faults: Sequence[str] = ()
@@ -155,8 +153,8 @@ class Panel:
         self._head = gui.add_markdown("")
         self._status = gui.add_markdown("", visible=False)
         if abilities.pace:
-            self._add_playback(length, abilities.seek)
-        vehicles = {NONE_PICKED: None} | {stage.short_name(stage.landmarks + i): i for i in range(stage.vehicles)}
+            self._add_playback(length)
+        vehicles = {NONE_PICKED: None} | {vehicle_mark(i): i for i in range(stage.vehicles)}
         self._vehicles = self._choice("Vehicle", vehicles, "Its camera, its plots; the view goes along.")
         if abilities.observers:
             hint = "The episode runs again from its start to this moment, under this observer."
@@ -181,16 +179,15 @@ class Panel:
             self._legend = gui.add_html("")
         self.set_source(source)
 
-    def _add_playback(self, length: float, seek: bool) -> None:
+    def _add_playback(self, length: float) -> None:
         self._playing = self._gui.add_button("Pause")
         self._playing.on_click(lambda event: self.wishes.put(("play", None)))
         group = self._gui.add_button_group("Go", ("Step", "Restart"))
         self._on(group.on_click, "go", {"Step": "step", "Restart": "restart"})
         self._choice("Speed", SPEEDS, "Times real time.", initial="1")
-        if seek:
-            end = max(0.1, round(length, 2))
-            self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
-            self._on(self._time.on_update, "seek", (0.0, end))
+        end = max(0.1, round(length, 2))
+        self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
+        self._on(self._time.on_update, "seek", (0.0, end))
 
     def _choice(self, label: str, offered: Mapping[str, Any], hint: str, initial: str | None = None) -> Any:
         """Add a control that offers values by their texts, at first the first one unless another one is given."""
@@ -246,8 +243,8 @@ class Panel:
 
     def pick(self, vehicle: int | None) -> None:
         """Look at a vehicle, or at none."""
-        self._look.picked, stage = vehicle, self._stage
-        self._vehicles.value = NONE_PICKED if vehicle is None else stage.short_name(stage.landmarks + vehicle)
+        self._look.picked = vehicle
+        self._vehicles.value = NONE_PICKED if vehicle is None else vehicle_mark(vehicle)
         self._image.visible = vehicle is not None
         self._plots.set_visible(vehicle is not None)
         if vehicle is None:
@@ -265,7 +262,7 @@ class Panel:
             self._time.value = round(float(frame.tick) / rate, 2)
         if now - self._texts_at >= TEXTS_EVERY:
             self._texts_at = now
-            self._table.content = table_html(self._stage, self._source, frame)
+            self._table.content = table_html(self._source, frame)
         picked = self._look.picked
         if picked is not None and now - self._plots_at >= PLOTS_EVERY:
             self._plots_at = now
@@ -324,7 +321,7 @@ def swatch(colour: str) -> str:
     return f'<span style="display:inline-block;{look}"></span>'
 
 
-def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
+def table_html(source: Origin, frame: Frame) -> str:
     """Return the table of errors as HTML."""
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
     level = frame.protection_level[:, 0]
@@ -336,7 +333,7 @@ def table_html(stage: Stage, source: Origin, frame: Frame) -> str:
     rows = []
     for i, values in enumerate(table):
         numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
-        mark = f"{swatch(vehicle_colour(i))} <b>{stage.short_name(stage.landmarks + i)}</b>"
+        mark = f"{swatch(vehicle_colour(i))} <b>{vehicle_mark(i)}</b>"
         rows.append(f'<tr><td style="white-space:nowrap">{mark}</td>{numbers}</tr>')
     style = "width:100%;font:12px/1.3 ui-monospace,monospace;border-collapse:collapse"
     whole = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
@@ -355,9 +352,8 @@ def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
 
     hidden = [*names(Sight.OCCLUDED_BY_BODY), *names(Sight.OCCLUDED_BY_BUILDING)]
     lines = ("sees", names(Sight.VISIBLE)), ("hidden", hidden), ("missed", names(Sight.MISSED))
-    mark = stage.short_name(stage.landmarks + vehicle)
     listed = "; ".join(f"{word} {_plain(', '.join(found))}" for word, found in lines if found)
-    return f"**{mark}** {listed or 'sees nothing'}"
+    return f"**{vehicle_mark(vehicle)}** {listed or 'sees nothing'}"
 
 
 def _plain(text: str) -> str:

@@ -9,7 +9,7 @@ from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.viz import meshes
 from coopenv.viz.scene import Frame, Origin, semi_axes
-from coopenv.viz.stage import Box, Stage, entries
+from coopenv.viz.stage import Box, Stage, entries, vehicle_mark
 from coopenv.viz.style import DARK_BLUE, GREY, INK, rgb, vehicle_colour
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web.ground import (
@@ -265,7 +265,7 @@ class Labels:
     def __init__(self, scene: Any, stage: Stage) -> None:
         """Add them."""
         self._stage, self._said = stage, -np.inf
-        self._marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
+        self._marks = [vehicle_mark(i) for i in range(stage.vehicles)]
         self._above = stage.bodies()[0] * [0.0, 0.0, 1.0] + [0.0, 0.0, 0.005 * stage.side]
 
         def label(name: str, text: str, **look: Any) -> Any:
