@@ -60,10 +60,7 @@ def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
         ax.set_yscale("log")
         for look, episodes in zip(_looks(evaluation), evaluation.episodes.values(), strict=True):
             _draw_error(ax, episodes, share, edges, look["color"])
-        style.show_decades(ax)
-    low, high = zip(*(ax.get_ylim() for ax in panels), strict=True)
-    for ax in panels:
-        ax.set_ylim(min(low), max(high))
+    style.share_decades(panels)
     style.legend_above(figure, [Line2D([], [], lw=1.5, **look) for look in _looks(evaluation, marks=False)])
     return figure
 

@@ -355,7 +355,7 @@ def find_executor(
     return executor
 
 
-def reach(address: str, patience: float = 10.0) -> None:
+def reach(address: str) -> None:
     """Make sure that something listens at HOST:PORT.
 
     Raises:
@@ -365,6 +365,6 @@ def reach(address: str, patience: float = 10.0) -> None:
     if not host or not port.isdigit():
         raise CoopenvError(f"--address {address}: expected HOST:PORT or {AUTO}")
     try:
-        socket.create_connection((host, int(port)), timeout=patience).close()
+        socket.create_connection((host, int(port)), timeout=10.0).close()
     except (OSError, OverflowError) as error:
         raise CoopenvError(f"no Ray cluster at '{address}': {error}") from None

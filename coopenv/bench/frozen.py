@@ -28,7 +28,7 @@ from coopenv.bench.executors import Limits, Local
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import judge_all
-from coopenv.bench.observers.rows import spread
+from coopenv.bench.observers.rows import median_of, spread
 from coopenv.bench.observers.sources import SimulatedRecords, find_source
 from coopenv.bench.observers.tables import mean_of, short_name
 from coopenv.estimation.metrics import DIVERGED_POSITION
@@ -38,6 +38,8 @@ from coopenv.runs.console import number_table
 FOLDER = Path(__file__).parent
 TOLERANCE = 1e-3
 """Relative, of the figures of records: other processors round differently."""
+COSTS = ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")
+"""Columns whose totals are medians over the scenes."""
 SHOWN = ("robust", "split_covariance_intersection")
 """Observers of the zoo beside the new one in the table of scenes."""
 
@@ -221,7 +223,7 @@ def totals_of(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "rmse_se_m": means["rmse_m"] * float(np.sqrt(np.square(spreads).sum())) / len(own),
                 "above": sum(1 for row in whole if _limited(row["rmse_m"]) == DIVERGED_POSITION),
                 "failed": len(own) - len(whole),
-                **{key: _median(whole, key) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")},
+                **{key: median_of(row[key] for row in whole) for key in COSTS},
             }
         )
     return sorted(totals, key=lambda total: total["rmse_m"])
@@ -229,11 +231,6 @@ def totals_of(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _limited(value: float | None) -> float:
     return DIVERGED_POSITION if value is None or not value < DIVERGED_POSITION else max(value, 1e-9)
-
-
-def _median(rows: Sequence[Mapping[str, Any]], key: str) -> float:
-    values = [row[key] for row in rows if row[key] is not None and math.isfinite(row[key])]
-    return float(np.median(values)) if values else math.nan
 
 
 def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str]:
@@ -245,7 +242,7 @@ def report(benchmark: Frozen, result: Mapping[str, Any]) -> Iterator[Table | str
     for total in totals_of([*result["rows"], *zoo]):
         figures = [number(total[key], 3) for key in ("median_m", "worst_m")]
         counts = [str(total[key]) for key in ("above", "failed")]
-        costs = [number(total[key], 2) for key in ("anees_median", "anees_worst", "bytes_per_s", "us_per_update")]
+        costs = [number(total[key], 2) for key in COSTS]
         mark = "* " if total["observer"] in own else ""
         error = in_parentheses(total["rmse_m"], total["rmse_se_m"])
         totals.add_row(mark + total["observer"], error, *figures, *counts, *costs)

@@ -94,12 +94,12 @@ def resamples(worlds: int, seed: int, count: int = RESAMPLES) -> np.ndarray:
     return generator.multinomial(worlds, np.full(worlds, 1.0 / worlds), size=count).astype(float)
 
 
-def interval(values: np.ndarray, level: float = LEVEL) -> Interval:
-    """Return the percentile interval of resampled figures (R,); NaN where there are none."""
+def interval(values: np.ndarray) -> Interval:
+    """Return the 95 % percentile interval of resampled figures (R,); NaN where there are none."""
     known = values[np.isfinite(values)]
     if not len(known):
         return Interval(np.nan, np.nan)
-    low, high = np.quantile(known, [(1.0 - level) / 2.0, (1.0 + level) / 2.0])
+    low, high = np.quantile(known, [(1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0])
     return Interval(float(low), float(high))
 
 

@@ -213,7 +213,7 @@ def consistency_figure(
         _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(spread[part][:, 0]))
     _finish(axes, trajectory, live, _NARROW_TITLES if narrow else _TITLES)
     for column, room in zip(axes.T, (_ROOM, 0.0, 0.0), strict=True):
-        _share_decades(column, room)
+        style.share_decades(column, room)
     style.explain(figure, GAIN if gain else CONSISTENT)
     marks = style.marks(
         (True, "95 % of $\\chi^2_6$", {"facecolor": style.SHADE}),
@@ -225,16 +225,6 @@ def consistency_figure(
     )
     style.legend_above(figure, marks)
     return figure
-
-
-def _share_decades(column: Sequence[Axes], room: float) -> None:
-    """Give panels the same logarithmic ordinate, wide enough for all of them, with room above the curves."""
-    for ax in column:
-        style.show_decades(ax)
-    limits = [ax.get_ylim() for ax in column]
-    bottom, top = min(low for low, _ in limits), max(high for _, high in limits)
-    for ax in column:
-        ax.set_ylim(bottom, top * (top / bottom) ** room)
 
 
 def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> None:

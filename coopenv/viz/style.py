@@ -127,9 +127,9 @@ def target_labels(trajectory: Trajectory) -> list[str]:
     return labels
 
 
-def thinned(count: int) -> np.ndarray:
-    """Return the indices of at most `MAX_POINTS` of `count` samples, first and last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
+def thinned(count: int, most: int = MAX_POINTS) -> np.ndarray:
+    """Return the indices of at most so many of `count` samples, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def summed_up(t: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -296,6 +296,24 @@ def show_decades(ax: Axes) -> None:
             below, above = np.ceil(bottom) - 1, np.floor(top) + 1
             bottom, top = (below, top) if bottom - below < above - top else (bottom, above)
         ax.set_ylim(10**bottom, 10**top)
+
+
+def share_decades(axes: Sequence[Axes], room: float = 0.0) -> None:
+    """Give panels the same logarithmic ordinate, wide enough for all of them, with room above the curves."""
+    for ax in axes:
+        show_decades(ax)
+    limits = [ax.get_ylim() for ax in axes]
+    bottom, top = min(low for low, _ in limits), max(high for _, high in limits)
+    for ax in axes:
+        ax.set_ylim(bottom, top * (top / bottom) ** room)
+
+
+def panels(figure: Figure, count: int, columns: int) -> np.ndarray:
+    """Return axes of a figure, row by row in so many columns."""
+    axes = figure.subplots(-(-count // columns), columns, squeeze=False).ravel()
+    for unused in axes[count:]:
+        unused.set_visible(False)
+    return np.asarray(axes[:count])
 
 
 def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:

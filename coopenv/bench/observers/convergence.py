@@ -70,18 +70,18 @@ class Basin:
     """The vehicle that failed in the first of them, when and why; empty where there is none."""
 
 
-def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Recording:
+def random_start(recording: Recording, seed: int) -> Recording:
     """Return the record with attitudes uniform over SO(3) and positions uniform in a ball about the true ones.
 
-    The covariance is that of these distributions: (pi^2 / 3 + 2) / 3 rad^2 and radius^2 / 5 per axis.
+    The covariance is that of these distributions: (pi^2 / 3 + 2) / 3 rad^2 and RADIUS^2 / 5 per axis.
     """
     generator = np.random.default_rng([seed, 3])
     N = len(recording.setups)
     direction = generator.normal(size=(N, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    distance = radius * generator.random((N, 1)) ** (1 / 3)
+    distance = RADIUS * generator.random((N, 1)) ** (1 / 3)
     rotations = np.array(Rotation.random(N, generator).as_matrix())
-    covariance = np.diag(np.repeat([UNIFORM_ROTATION, radius**2 / 5.0], 3))
+    covariance = np.diag(np.repeat([UNIFORM_ROTATION, RADIUS**2 / 5.0], 3))
     return replace(
         recording,
         start_rotation=rotations,

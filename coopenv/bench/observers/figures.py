@@ -75,7 +75,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
         return None
     scene = board.samples[0].scene
     figure, inches = style.canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
-    shown = _chosen(len(scene.vehicles), style.fitting(inches, 1.6, MOST_VEHICLES))
+    shown = style.thinned(len(scene.vehicles), style.fitting(inches, 1.6, MOST_VEHICLES)).tolist()
     axes = figure.subplots(len(groups), len(shown), squeeze=False)
     for (name, own), line in zip(groups.items(), axes, strict=True):
         curves, bound = _curves(own), _bound(own)
@@ -94,15 +94,13 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
         ax.set_title(vehicle_label(scene.vehicles[i]), fontsize=NORMAL + 2, color=INK, pad=4)
     figure.supylabel("position error [m], log", **style.TEXT)
     median = ", median over seeds" if len(board.seeds) > 1 else ""
-    handles = [
-        Line2D([], [], color=BLUE, lw=1.2, label=f"error{median}"),
-        Line2D([], [], color=VERMILION, lw=1.2, ls=_DASHED, label=f"3 standard deviations claimed{median}"),
-    ]
-    if np.isfinite(scene.bound).any():
-        handles.append(Line2D([], [], color=GREY, lw=1.2, label="Cramér-Rao bound (joint)"))
-    if scene.steady_from > 0.0:
-        handles.append(Line2D([], [], color=INK, lw=0.8, ls=_DOTTED, label="steady state begins"))
-    style.legend_above(figure, handles)
+    marks = style.marks(
+        (True, f"error{median}", {"color": BLUE, "lw": 1.2}),
+        (True, f"3 standard deviations claimed{median}", {"color": VERMILION, "lw": 1.2, "ls": _DASHED}),
+        (np.isfinite(scene.bound).any(), "Cramér-Rao bound (joint)", {"color": GREY, "lw": 1.2}),
+        (scene.steady_from > 0.0, "steady state begins", {"color": INK, "lw": 0.8, "ls": _DOTTED}),
+    )
+    style.legend_above(figure, marks)
     return figure
 
 
@@ -119,11 +117,9 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     columns = style.fitting(width or style.PAGE, 3.0, min(3, len(groups)))
     rows = -(-len(groups) // columns)
     figure, _ = style.canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for unused in axes[len(groups) :]:
-        unused.set_visible(False)
-    shown = _chosen(len(scene.vehicles), MOST_VEHICLES)
-    for ax, (name, own) in zip(axes, groups.items(), strict=False):
+    axes = style.panels(figure, len(groups), columns)
+    shown = style.thinned(len(scene.vehicles), MOST_VEHICLES).tolist()
+    for ax, (name, own) in zip(axes, groups.items(), strict=True):
         style.tidy(ax)
         ax.axhspan(*mean_bounds(dof, runs), color=SHADE, zorder=0)
         ax.axhline(1.0, color=GREY, linewidth=0.7)
@@ -133,18 +129,13 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
             ax.plot(scene.t, values, color=vehicle_colour(i), linewidth=0.8)
         ax.set_yscale("log")
         ax.set_title(name, fontsize=NORMAL, color=INK, pad=3)
-    _share_axes(axes[: len(groups)], columns, scene.t)
+    _share_axes(axes, columns, scene.t)
     figure.supylabel(f"NEES / {dof}, log" + (", mean over runs" if runs > 1 else ""), **style.TEXT)
     vehicles = [Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i])) for i in shown]
     runs_word = f"{runs} run{'s' if runs > 1 else ''}"
     band = Patch(facecolor=SHADE, label=f"95 % of a consistent observer ($\\chi^2$, {runs_word}, at one instant)")
     style.legend_above(figure, [*vehicles, band])
     return figure
-
-
-def _chosen(vehicles: int, most: int) -> list[int]:
-    """Return which vehicles are drawn: all, or some from first to last."""
-    return [int(i) for i in np.unique(np.linspace(0, vehicles - 1, min(vehicles, most)).round())]
 
 
 def _share_axes(axes: np.ndarray, columns: int, t: np.ndarray) -> None:
@@ -246,14 +237,12 @@ def stanford_figure(board: Leaderboard, variant: str, width: float | None = None
     rows = -(-len(counts) // columns)
     figure, inches = style.canvas(width or min(style.PAGE, 1.6 + 4.0 * columns), 1.0, f"{board.title}, {variant}")
     figure.set_figheight(_FRAME + rows * (inches - 1.3) / columns)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for unused in axes[len(counts) :]:
-        unused.set_visible(False)
+    axes = style.panels(figure, len(counts), columns)
     used = np.flatnonzero(np.sum([of + of.T for of in counts.values()], axis=0).any(axis=0))
     low, high = (float(10.0**ends) for ends in (np.floor(_DECADE[used[0]]), np.ceil(_DECADE[used[-1] + 1])))
     norm = LogNorm(1.0, max(10.0, *(float(of.max()) for of in counts.values())))
     ends = np.array([low, high])
-    for n, (ax, (name, of)) in enumerate(zip(axes, counts.items(), strict=False)):
+    for n, (ax, (name, of)) in enumerate(zip(axes, counts.items(), strict=True)):
         exceeded, _, unknown, _ = figures[name]
         below, left = n + columns >= len(counts), n % columns == 0
         style.tidy(ax, x_label="horizontal error [m], log" * below, y_label="protection level [m], log" * left)
@@ -266,11 +255,11 @@ def stanford_figure(board: Leaderboard, variant: str, width: float | None = None
     bar = figure.colorbar(image, ax=axes.tolist(), fraction=0.05, aspect=30, pad=0.01)
     bar.set_label("vehicle ticks", fontsize=SMALL, color=INK)
     bar.ax.tick_params(labelsize=SMALL, colors=INK)
-    handles = [
-        Line2D([], [], color=INK, lw=1.0, label="error = protection level"),
-        Patch(facecolor=VERMILION, alpha=0.14, label="level exceeded"),
-    ]
-    style.legend_above(figure, handles)
+    marks = style.marks(
+        (True, "error = protection level", {"color": INK, "lw": 1.0}),
+        (True, "level exceeded", {"facecolor": VERMILION, "alpha": 0.14}),
+    )
+    style.legend_above(figure, marks)
     return figure
 
 
@@ -345,7 +334,7 @@ def _variant(board: Leaderboard, name: str, points: int) -> dict[str, Any]:
     groups = board.samples_in(name)
     samples = [sample for sample in board.samples if sample.variant == name]
     t = samples[0].scene.t
-    keep = np.unique(np.linspace(0, len(t) - 1, min(len(t), points)).round().astype(int))
+    keep = style.thinned(len(t), points)
     bound = _bound(groups[next(iter(groups))] if groups else samples[:1])
     return {
         "name": name,

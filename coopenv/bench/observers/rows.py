@@ -207,15 +207,15 @@ def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedR
         **{ERRORS[column]: figure.error for column, figure in measured.items()},
         **dict(zip(BOUNDS, bounds, strict=True)),
         settled_fraction=float(np.mean(np.isfinite(seeds("settle_time")))),
-        settle_time_s=_median(seeds("settle_time")),
+        settle_time_s=median_of(seeds("settle_time")),
         bytes_per_s=float(np.mean(seeds("bytes_per_s"))),
-        us_per_update=_median(seeds("us_per_update")),
+        us_per_update=median_of(seeds("us_per_update")),
         failure=next((sample.failure for sample in own if sample.failure), ""),
         position_rmse_median_m=float(np.quantile(each, 0.5)),
         position_rmse_p90_m=float(np.quantile(each, 0.9)),
         converged_fraction=float(np.mean(np.isfinite(seeds("converge_time")))),
-        convergence_time_s=_median(seeds("converge_time")),
-        convergence_rate_per_s=_median(seeds("rate")),
+        convergence_time_s=median_of(seeds("converge_time")),
+        convergence_rate_per_s=median_of(seeds("rate")),
         diverged_fraction=float(np.mean(seeds("diverged"))),
         ate_m=root("ate"),
         rpe_m=root("rpe"),
@@ -230,14 +230,14 @@ def row_of(environment: str, own: Sequence[JudgedRun], nominal: Sequence[JudgedR
         level_exceeded_fraction=float(np.mean(seeds("level_exceeded"))),
         angle_level_exceeded_fraction=float(np.mean(seeds("angle_level_exceeded"))),
         level_unknown_fraction=float(np.mean(seeds("level_unknown"))),
-        level_over_e95=_median(seeds("level_over_e95")),
+        level_over_e95=median_of(seeds("level_over_e95")),
     )
 
 
-def _median(values: Array) -> float:
+def median_of(values: Iterable[float | None]) -> float:
     """Return the median of what is finite, NaN where nothing is."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else math.nan
+    finite = [value for value in values if value is not None and math.isfinite(value)]
+    return float(np.median(finite)) if finite else math.nan
 
 
 @dataclass(frozen=True)

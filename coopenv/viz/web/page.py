@@ -22,6 +22,7 @@ from coopenv.base.files import replace_text
 from coopenv.base.installation import install_command, needing
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.stage import Stage
+from coopenv.viz.style import thinned
 from coopenv.viz.web.ground import Look
 from coopenv.viz.web.panel import legend_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, first_look
@@ -175,7 +176,7 @@ def write_replay(
         CoopenvError: the extra `view` is not installed.
         OutputError: the file cannot be written.
     """
-    record = record.of(np.unique(np.linspace(0, len(record) - 1, min(len(record), MOST_FRAMES)).round().astype(int)))
+    record = record.of(thinned(len(record), MOST_FRAMES))
     stage = Stage(record.scenario)
     sigma = np.array([record.frame(k).three_sigma for k in range(0, len(record), max(1, len(record) // 20))])
     look = first_look(sigma, stage, record.source)
