@@ -23,6 +23,7 @@ from benchmarks.stages.ablated_stages import NEVER, STAGES, Setting, ablated_set
 from benchmarks.stages.against import HERE
 from benchmarks.stages.rounds import alternate
 from coopenv.base.errors import CoopenvError
+from tests.helpers.commands import refused
 
 HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
 
@@ -133,16 +134,14 @@ def test_a_torch_that_is_there_is_not_installed_again() -> None:
     assert {line.partition(">")[0] for line in with_it} >= {"warp-lang", "numpy", "tyro", "tensorboard", "pytest"}
 
 
-def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for arguments, words in (
         (["--device", "tpu"], "unknown device 'tpu'"),
         (["--device", "cpu", "--out", str(tmp_path / "file" / "gpu.json")], "cannot write to"),
         (["--table", str(tmp_path / "none.json")], "none.json"),
     ):
-        assert main(arguments) == 2
-        error = capsys.readouterr().err
-        assert words in error and len(error.splitlines()) == 1
+        assert words in refused(*arguments, command=main)
 
 
 @pytest.mark.slow

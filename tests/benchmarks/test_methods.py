@@ -15,6 +15,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import scenario_path
 from coopenv.policies import Policy
 from coopenv.scenario import load_scenario
+from tests.helpers.commands import refused
 
 SMALL = """
 decisions = 400
@@ -179,15 +180,13 @@ def test_the_verdict_names_a_winner_only_where_intervals_are_apart(shift: float,
     assert report.verdict({"a": [runs], "b": [runs + shift]}).startswith(words)
 
 
-def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
     for old, new, words in (
         ("decisions = 400", "decisions = 0", "decisions"),
         ('"route_follower"]', '"ppo"]', "ppo is a method and a reference"),
         ('learner = "coopenv"', 'learner = "rllib"', "learner"),
     ):
-        assert command.main([str(written(tmp_path, SMALL.replace(old, new)))]) == 2
-        text = capsys.readouterr().err
-        assert words in text and len(text.splitlines()) == 1
+        assert words in refused(str(written(tmp_path, SMALL.replace(old, new))), command=command.main)
 
 
 @pytest.mark.train

@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("cv2", reason="needs the extra 'vision'")
 
 from benchmarks import vision
+from tests.helpers.commands import refused
 
 
 def test_near_tags_are_found_and_the_table_has_a_row_each(capsys: pytest.CaptureFixture[str]) -> None:
@@ -19,7 +20,5 @@ def test_near_tags_are_found_and_the_table_has_a_row_each(capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("given", [["--family", "tag36h12"], ["--frames", "9"], ["--side", "0"]])
-def test_what_is_wrong_is_one_line(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert vision.main(given) == 2
-    printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith("error: ") and printed.err.count("\n") == 1
+def test_what_is_wrong_is_one_line(given: list[str]) -> None:
+    refused(*given, command=vision.main)

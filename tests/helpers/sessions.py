@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+NEEDS = {"train": ("stable_baselines3", "train"), "logs": ("rosbags", "log"), "cars": ("zenoh", "svea")}
+"""By tutorial a module and the extra that brings it."""
 
 
 class Block(NamedTuple):
@@ -44,16 +47,26 @@ def blocks(page: Path) -> Iterator[Block]:
             yield Block(language, file or "", code, after[3] if after and follows else "")
 
 
+def prepare(tutorial: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skip a tutorial whose extra is missing; give others the command and, where it is read, the sample of a clone."""
+    if tutorial in NEEDS:
+        module, extra = NEEDS[tutorial]
+        pytest.importorskip(module, reason=f"needs the extra {extra!r}")
+    if tutorial == "logs":
+        shutil.copytree(ROOT / "examples" / "bags", folder / "examples" / "bags")
+    tool = folder / "bin" / "coopenv"
+    tool.parent.mkdir()
+    tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tool.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
 def run_page(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Run a page in a folder and return the names of its program."""
-    tools = folder / "bin"
-    tools.mkdir()
-    command = tools / "coopenv"
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")
-    command.chmod(0o755)
+    prepare(page.stem, folder, monkeypatch)
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
-    environment = os.environ | {"PATH": f"{tools}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     program: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks(page):
         if block.file:
@@ -62,7 +75,6 @@ def run_page(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[
             done = subprocess.run(
                 ["bash", "-euo", "pipefail", "-c", block.code],
                 cwd=folder,
-                env=environment,
                 capture_output=True,
                 text=True,
                 timeout=900,

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.helpers.sessions import ROOT
+from tests.helpers.sessions import ROOT, prepare
 
 pytest.importorskip("jupytext", reason="needs the extra 'docs'")
 nbformat = pytest.importorskip("nbformat", reason="needs the extra 'docs'")
@@ -18,8 +15,6 @@ nbformat = pytest.importorskip("nbformat", reason="needs the extra 'docs'")
 from sitegen import notebooks  # noqa: E402
 
 NAMES = ("first_steps", "own_observer", "train", "logs", "cars")
-NEEDS = {"train": ("stable_baselines3", "train"), "logs": ("rosbags", "log"), "cars": ("zenoh", "svea")}
-"""A module and the extra that brings it."""
 
 
 def cells(text: str) -> list[str]:
@@ -58,17 +53,7 @@ def test_every_tutorial_becomes_one_without_outputs_as_in_the_clone(tmp_path: Pa
 def test_notebooks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient = pytest.importorskip("nbclient", reason="needs the extra 'docs'")
     pytest.importorskip("ipykernel", reason="needs the extra 'docs'")
-    if name in NEEDS:
-        module, extra = NEEDS[name]
-        pytest.importorskip(module, reason=f"needs the extra {extra!r}")
-    if name == "logs":  # the sample of a clone
-        shutil.copytree(ROOT / "examples" / "bags", tmp_path / "examples" / "bags")
-    tool = tmp_path / "bin" / "coopenv"
-    tool.parent.mkdir()
-    tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")
-    tool.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tool.parent}:{os.environ['PATH']}")
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    prepare(name, tmp_path, monkeypatch)
     page = ROOT / "docs" / "tutorials" / f"{name}.md"
     made = nbformat.reads(notebooks.notebook(page.read_text(encoding="utf-8")), as_version=4)
     client = nbclient.NotebookClient(

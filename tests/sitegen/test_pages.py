@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -144,12 +143,6 @@ PAGES = {
     "how-to/faults.md": [pytest.mark.slow],
     "how-to/batches.md": [],
 }
-NEEDS = {
-    "tutorials/train.md": ("stable_baselines3", "train"),
-    "tutorials/logs.md": ("rosbags", "log"),
-    "tutorials/cars.md": ("zenoh", "svea"),
-}
-"""A module and the extra that brings it."""
 
 
 def test_every_page_with_programs_is_run() -> None:
@@ -169,11 +162,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("page", [pytest.param(page, marks=marks, id=page) for page, marks in PAGES.items()])
 def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if page in NEEDS:
-        module, extra = NEEDS[page]
-        pytest.importorskip(module, reason=f"needs the extra {extra!r}")
-    if page == "tutorials/logs.md":
-        shutil.copytree(ROOT / "examples" / "bags", folder / "examples" / "bags")
     program = run_page(DOCS / page, folder, monkeypatch)
     if page == "tutorials/first_steps.md":
         assert (folder / "lost.png").stat().st_size > 20_000
