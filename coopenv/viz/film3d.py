@@ -23,12 +23,10 @@ _SOUTH = np.array([0.0, -0.6, 0.8])  # direction from the middle to the camera t
 _ANGLE, _AWAY = 40.0, 1.35  # its vertical field of view, deg, and its distance in the scene's sides
 _SHORTEST = 0.07  # of the scene's side, length of a vehicle in its picture
 _GHOST = 0.42  # opacity of an estimate
-_DOT = 0.008  # of the scene's side, radius of a landmark
 _LARGEST = 0.3  # of the scene's side, semi-axis of an ellipse that is drawn
 _GRID = 8  # lines of the grid on the ground from the middle to an end
 _LANES = 14  # dashes of a road's marks over a side of the scene
 _BEHIND, _ABOVE = 5.5, 2.6  # lengths of the vehicle, of the camera that follows it
-_FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
 _LEFTMOST = 60.0  # deg, vertical field of view of a driver's camera that sees in every direction
 
 
@@ -77,7 +75,7 @@ class View3d:
     def paint(self, frame: Frame) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of a frame; estimates below their vehicles are drawn at their height."""
         R, R_hat = frame.vehicle_rotation @ self._turn, frame.estimate_rotation @ self._turn
-        estimate = self._stage.nearer(frame.estimate_position, _FAR)
+        estimate = self._stage.nearer(frame.estimate_position, meshes.FAR)
         estimate[:, 2] = np.maximum(estimate[:, 2], frame.vehicle_position[:, 2])
         cars = self._boxes(R, frame.vehicle_position), self._boxes(R_hat, estimate)
         for parts, places in zip((self._cars, self._ghosts), cars, strict=True):
@@ -155,7 +153,7 @@ class View3d:
         ball, _ = meshes.sphere(4)
         for place in here.targets(frame)[: here.landmarks]:
             foot = [*place[:2], here.floor]
-            corners.append(np.vstack([_DOT * here.side * ball + place, foot]).T)
+            corners.append(np.vstack([meshes.DOT * here.side * ball + place, foot]).T)
         outlines = []
         for points in (points for points in corners if np.isfinite(points).all()):
             flat = (points[:2] - SUN[:2, None] / SUN[2] * (points[2] - here.floor)).T
@@ -214,7 +212,7 @@ class View3d:
     def _place_others(self, frame: Frame) -> None:
         """Place landmarks, their bodies, and other traffic."""
         here = self._stage
-        thick, dot = 0.15 * _DOT * here.side, np.full(3, _DOT * here.side)
+        thick, dot = 0.15 * meshes.DOT * here.side, np.full(3, meshes.DOT * here.side)
         for (pole, ball), place in zip(self._landmarks, here.targets(frame), strict=False):
             foot = [*place[:2], here.floor]
             _put(pole, _affine(np.eye(3), foot, [thick, thick, max(place[2] - here.floor, 0.0)]))

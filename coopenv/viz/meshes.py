@@ -4,6 +4,10 @@ import numpy as np
 
 SKY, HORIZON, GRASS, GRID = "#6FA8DC", "#DCEBF7", "#8DAA74", "#9CB785"
 ASPHALT, MARKS, WALL, DARK = "#54585D", "#F2F2F2", "#D8C9AE", "#1B2026"
+DOT = 0.008
+"""Of the scene's side, radius of a landmark."""
+FAR = 2.0
+"""Scene's sides from its middle: estimates farther away are drawn there."""
 SUN = np.array([-0.45, -0.6, 0.85])
 """Direction to the sun, map."""
 Mesh = tuple[np.ndarray, np.ndarray]

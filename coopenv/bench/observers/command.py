@@ -165,8 +165,8 @@ def report_text(board: Leaderboard, content: Mapping[str, Any]) -> str:
         "definitions": {f.name: f.metadata["meaning"] for f in fields(Row)},
     }
     texts = environment(autoescape=True)
-    texts.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
-    texts.globals["spread"] = spread
+    texts.globals |= {"with_error": with_error, "spread": spread, "tint": _tints(board), "nan": math.nan}
+    texts.globals["breakable"] = lambda name: Markup("<wbr>").join(re.split(r"(?<=_)", name))
     texts.filters["append"] = lambda text, more: text + more
     template = texts.get_template("report.html.j2")
     text = template.render(values, with_rows=True)
@@ -184,11 +184,6 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
         "levels": level_figures(board, name),
         "stanford": "" if (drawn := stanford_figure(board, name)) is None else _svg(drawn),
     }
-
-
-def _breakable(name: str) -> Markup:
-    """Return a name that may be broken after underscores."""
-    return Markup("<wbr>").join(re.split(r"(?<=_)", name))
 
 
 def _tints(board: Leaderboard) -> Callable[[float], Markup]:

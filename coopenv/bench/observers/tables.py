@@ -173,13 +173,9 @@ def _headings(board: Leaderboard) -> list[str]:
     return [f"f{number[1] if number else i + 1}" for i, number in enumerate(numbers)]
 
 
-def _few(board: Leaderboard) -> bool:
-    return len(board.vehicles) <= MOST_COLUMNS
-
-
 def error_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE in m of one variant per vehicle, and their mean, the bounds first."""
-    few = _few(board)
+    few = len(board.vehicles) <= MOST_COLUMNS
     table = number_table(["position RMSE [m]"], [*_headings(board), "mean"] if few else ["mean", "worst"], gap=0)
     for column, values in board.bounds_in(variant).items():
         average = sum(values) / len(values)
@@ -195,7 +191,7 @@ def error_table(board: Leaderboard, variant: str) -> Table:
 
 def ratio_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE over the ancestors' bound per vehicle, and the worst one over the joint bound."""
-    few, column = _few(board), "ratio_to_bound_ancestors"
+    few, column = len(board.vehicles) <= MOST_COLUMNS, "ratio_to_bound_ancestors"
     headings = [*(_headings(board) if few else ["mean", "worst"]), "x joint\nworst"]
 
     def cells(own: list[Row]) -> list[str]:

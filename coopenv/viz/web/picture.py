@@ -33,8 +33,6 @@ _STEPS, _TURN = 32, 2.0**-9  # of an ellipsoid: sizes in a doubling, and steps o
 _SMALL = 0.25  # of that, where the view is near
 _LIT: dict[str, Any] = {"flat_shading": True, "cast_shadow": True}
 _PIN = 0.035  # of the scene's side, height of the pin over a vehicle, which is drawn to scale
-_DOT = 0.008  # of the scene's side, radius of a landmark
-_FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
 
 
 def pin_height(stage: Stage, look: Look) -> float:
@@ -100,7 +98,7 @@ class Actors:
             self._traffic.put(placed(frame.traffic_rotation, fine(frame.traffic_position, step), size))
 
     def _near(self, points: np.ndarray) -> np.ndarray:
-        return fine(self._stage.nearer(points, _FAR), self._floor.step)
+        return fine(self._stage.nearer(points, meshes.FAR), self._floor.step)
 
     def _place_landmarks(self, frame: Frame) -> None:
         L, side, step = self._stage.landmarks, self._stage.side, self._floor.step
@@ -108,9 +106,9 @@ class Actors:
         if np.array_equal(place, self._marks, equal_nan=True):
             return
         self._marks = place
-        self._dots.put(placed(None, fine(place, step), np.full((L, 3), _DOT * side)))
+        self._dots.put(placed(None, fine(place, step), np.full((L, 3), meshes.DOT * side)))
         foot = np.column_stack([place[:, :2], np.full(L, self._floor.z)])
-        thick = np.full((L, 2), 0.2 * _DOT * side)
+        thick = np.full((L, 2), 0.2 * meshes.DOT * side)
         self._poles.put(placed(None, fine(foot, step), np.column_stack([thick, np.maximum(place - foot, 0.0)[:, 2]])))
         boxes = [box for box in self._stage.solid(frame) if 0 <= box.agent < L]
         if boxes:
