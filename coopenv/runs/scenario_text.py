@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
-from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import listed
 from coopenv.base.format import number
@@ -50,11 +49,12 @@ def setting(value: Any) -> str:
 
 def turn(quaternion_wxyz: Sequence[float]) -> str:
     """Return a rotation as `90 deg about z`, or about the axis' coordinates."""
-    rotation = Rotation.from_quat(quaternion_wxyz, scalar_first=True)
-    angle = float(rotation.magnitude())
+    w, *xyz = quaternion_wxyz if quaternion_wxyz[0] >= 0.0 else [-part for part in quaternion_wxyz]
+    sine = math.hypot(*xyz)
+    angle = 2.0 * math.atan2(sine, w)
     if angle < 1e-9:
         return "0 deg"
-    axis = rotation.as_rotvec() / angle
+    axis = np.array(xyz) / sine
     for name, unit in zip("xyz", np.eye(3), strict=True):
         if abs(axis @ unit) > 1.0 - 1e-9:
             return f"{number(math.degrees(math.copysign(angle, axis @ unit)))} deg about {name}"

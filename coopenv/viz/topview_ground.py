@@ -14,7 +14,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation, Text
-from scipy.sparse.csgraph import connected_components
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
@@ -251,8 +250,11 @@ class Goals:
 
 def touching(center: np.ndarray, radius: np.ndarray) -> list[list[int]]:
     """Return the indices of circles, centres (N, 2) and radii (N,), in groups that touch one another."""
-    there = np.flatnonzero(np.isfinite(center).all(axis=1))
-    center, radius = center[there], radius[there]
-    near = np.linalg.norm(center[:, None] - center, axis=-1) < radius[:, None] + radius
-    count, group = connected_components(near)
-    return [there[group == number].tolist() for number in range(count)]
+    groups: list[list[int]] = []
+    for i in range(len(center)):
+        if not np.isfinite(center[i]).all():
+            continue
+        reach = np.linalg.norm(center - center[i], axis=-1) < radius + radius[i]
+        near = [group for group in groups if reach[group].any()]
+        groups = [group for group in groups if group not in near] + [sorted(sum(near, [i]))]
+    return groups

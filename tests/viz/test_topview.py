@@ -373,7 +373,7 @@ def test_vehicles_point_where_they_go(name: str) -> None:
 
 def test_goals_that_touch_share_a_name() -> None:
     center = np.array([[0, 0], [5, 0], [1.5, 0], [2.9, 0], [np.nan, 0], [0, 9]])
-    assert touching(center, np.full(6, 0.8)) == [[0, 2, 3], [1], [5]]
+    assert touching(center, np.full(6, 0.8)) == [[1], [0, 2, 3], [5]]
     _, view = drawn("large_crossing")
     names = [name for name in view._goals._names if name.get_text()]
     assert 1 < len(names) < 16
