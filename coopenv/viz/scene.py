@@ -19,7 +19,7 @@ from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import fixed, jsonable, read_npz
 from coopenv.base.sections import Section, validated
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.poses import position_covariance
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
@@ -112,11 +112,6 @@ class Frame:
     def vehicle_position(self) -> np.ndarray:
         """(N, 3) true, map, m."""
         return self.position[self.landmarks :]
-
-    @property
-    def under_way(self) -> np.ndarray:
-        """(N,) bool: has not ended."""
-        return np.asarray(self.ended == Outcome.UNDER_WAY)
 
     @property
     def three_sigma(self) -> np.ndarray:

@@ -277,7 +277,7 @@ class TopView:
 
     def _write(self, frame: Frame) -> None:
         time = float(frame.tick) / self.scenario.rates.camera
-        errors = frame.position_error[frame.under_way]
+        errors = frame.position_error[frame.ended == Outcome.UNDER_WAY]
         error = f"{self._error_words} {fixed(errors.mean(), 2)} m   " if len(errors) and not self._panel else ""
         self._time.set_text(f"{error}t = {time:.2f} s")
         table = frame.table(not self._gain)

@@ -194,11 +194,6 @@ class FaultVariant:
             words.append(f"{fault.text}: {meaning if kind.words else f'{kind.value.lower()} {meaning}'.strip()}")
         return "; ".join(words) or "as simulated"
 
-    @property
-    def needs_followers(self) -> bool:
-        """Whether a vehicle lies that is not named."""
-        return any(fault.name == "lie" and not fault.vehicles for fault in self.faults)
-
     def applied(self, recording: Recording, seed: int) -> Recording:
         """Return the changed record; `recording` is of the variant's scenario."""
         for fault in self.faults:

@@ -86,8 +86,8 @@ class RecordSource(ABC):
 
     def obstacle(self, variant: str) -> str:
         """Return why it cannot have one of the variants; empty where it can."""
-        alone = self.fault(variant).needs_followers and not leaders_of(self.world())
-        return NO_FOLLOWERS if alone else ""
+        unnamed = any(fault.name == "lie" and not fault.vehicles for fault in self.fault(variant).faults)
+        return NO_FOLLOWERS if unnamed and not leaders_of(self.world()) else ""
 
     def check(self) -> None:
         """Look at recorded data, so that errors and warnings come before the work."""
