@@ -176,23 +176,25 @@ def health(
     car. On the car it connects to where the gate does, and tries from the deployment's network.connect. From elsewhere:
     --connect ROUTER --off-board.
     """
-    from coopenv.cars.backend.station import BYPASSED, UNTRIED, neutral_command
+    from coopenv.cars.backend.station import BYPASSED, UNTRIED, Gates, neutral_command
     from coopenv.cars.deployment import load_deployment
     from coopenv.cars.gate.core import Reason
     from coopenv.cars.gate.process import gate_deployment
-    from coopenv.cars.profile import GATE_TYPES, Role
+    from coopenv.cars.keys import load_verifier
     from coopenv.cars.transport.base import UNIX, LinkError
     from coopenv.cars.transport.zenoh import open_transport
 
     fleet = gate_deployment(car, deployment, connect, off_board)
-    topic = fleet.profile.topic_of(car, Role.GATE)
+    verifier = None if fleet.keys is None else load_verifier(fleet.keys)
     with closing(open_transport(fleet)) as transport:
-        status = next_message(transport, topic, GATE_TYPES[Role.GATE], patience)
-        if status is None:
+        gates = Gates(transport, (car,), fleet.limits, None, verifier, fleet.profile)
+        try:
+            status = gates.fresh_states(patience)[car]
+        except CoopenvError as error:
             unset = not off_board and UNIX not in fleet.gate_connect[0]
             hint = "; with docker/car-zenoh.json5 set [gate] connect" if unset else ""
-            raise CoopenvError(f"{car}: no message of its gate for {patience:g} s on {topic}{hint}")
-        refused = sum(int(count) for count in status.counts)
+            raise CoopenvError(f"{error}{hint}") from None
+        refused = status.rejections.total()
         print(f"{car}: gate {status.state}, {status.accepted} commands accepted, {refused} messages refused")
         v, brake = fleet.limits.speed, fleet.profile.command.brake
         (after, way), by = fleet.safety.stopping(v, brake), " braking" if brake else ""
@@ -200,23 +202,18 @@ def health(
         if fleet.network.kind != "zenoh":
             print(f"{car}: network.kind = {fleet.network.kind} {UNTRIED}")
             return
-        foreign = _count(status, Reason.FOREIGN)
         try:
             lab = load_deployment(deployment, connect if off_board else None)
             with closing(open_transport(lab, timeout=1.0)) as outside:
                 outside.publish(*neutral_command(fleet.profile, car), reliable=True)
                 for _ in range(2):  # the first may have been under way
-                    status = next_message(transport, topic, GATE_TYPES[Role.GATE], patience) or status
+                    gates.fresh_states(patience)
         except LinkError as error:
             print(f"{car}: not tried from outside: {error}")
             return
-    if _count(status, Reason.FOREIGN) > foreign:
+    if gates.refused(car).get(Reason.FOREIGN):
         raise CoopenvError(f"{car}: {BYPASSED}")
     print(f"{car}: a command to its wheels from outside does not get through")
-
-
-def _count(status: Any, reason: str) -> int:
-    return int(dict(zip(status.rejections, status.counts, strict=True)).get(reason, 0))
 
 
 def next_message(transport: "Transport", topic: str, kind: str, patience: float) -> Any | None:

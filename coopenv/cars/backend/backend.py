@@ -180,7 +180,9 @@ class Svea:
         safety, profile = self.deployment.safety, self.binding.profile
         for car in self._local:
             clocks = self.intake.unsynchronised(car, safety.max_clock_offset)  # other ages depend on them
-            yield from ((car, f"{why}: let chrony or PTP synchronise them") for why in clocks)
+            yield from (
+                (car, f"{why}: let chrony or PTP synchronise them, or is a computer too busy?") for why in clocks
+            )
             yield from ((car, why) for why in self.watchdog.silent(car))
             camera = profile.topic_of(car, Role(self.deployment.sensors.detections))
             if (age := self.station.silence(camera)) > safety.odometry_age:

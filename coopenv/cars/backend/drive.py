@@ -23,6 +23,7 @@ from coopenv.base.files import writing
 from coopenv.base.installation import install_command, version
 from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, reset_options
+from coopenv.cars.backend.station import refusal
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
 from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC, presence_of
@@ -272,7 +273,7 @@ class RecordedTransport:
         self.subscribe, self.announce, self.watch = transport.subscribe, transport.announce, transport.watch
         self.close = transport.close
         for topic in aside:
-            transport.subscribe(topic, lambda arrival: recorder.write(arrival.topic, arrival.payload, arrival.received))
+            transport.subscribe(topic, self._write_aside)
         transport.watch(presence_of("*"), self._write_presence)
 
     def publish(
@@ -281,6 +282,10 @@ class RecordedTransport:
         """Send, see `Transport`, and record the message."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
         self._recorder.write(topic, payload, time.time_ns())
+
+    def _write_aside(self, arrival: Arrival) -> None:
+        if not refusal(arrival):
+            self._recorder.write(arrival.topic, arrival.payload, arrival.received)
 
     def _write_presence(self, name: str, there: bool) -> None:
         self._recorder.write(name, encode(make(PRESENCE, data=there)), time.time_ns())

@@ -12,7 +12,7 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
-from coopenv.cars.gate.core import Reason, write_drive
+from coopenv.cars.gate.core import GateMode, Reason, write_drive
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.profile import GATE_TYPES, NEUTRAL, SVEA, CarProfile, Limits, Role
 from coopenv.cars.transport.base import Arrival, Transport
@@ -21,7 +21,7 @@ MOST_WAITING = 256
 """Messages of one topic that wait for the next tick; older ones are dropped, so that a flood fills nothing."""
 
 
-def refusal(arrival: Arrival, verifier: Verifier | None, signers: Collection[str] | None) -> str:
+def refusal(arrival: Arrival, verifier: Verifier | None = None, signers: Collection[str] | None = None) -> str:
     """Return why not to read a message: its length, or its signature where only some may sign it; empty: it is read."""
     if len(arrival.payload) > MOST_BYTES:
         return "too long"
@@ -226,7 +226,8 @@ class Gates:
             return
         try:
             m = decode(arrival.payload, GATE_TYPES[Role.GATE])
-        except CoopenvError:
+            mode = GateMode(m.state)
+        except (CoopenvError, ValueError):
             self.dropped[car]["malformed"] += 1
             return
         stamp = stamp_of(m)
@@ -238,9 +239,9 @@ class Gates:
             if stamp < self._states[car].stamp:
                 self.dropped[car]["out of order"] += 1
                 return
-            known = m.state, m.session, m.nonce, stamp, counts, int(m.accepted)
+            known = mode, m.session, m.nonce, stamp, counts, int(m.accepted)
             self._states[car] = GateState(*known, time.monotonic())
-            if m.state == "stopped" and not self._stopping:
+            if mode is GateMode.STOPPED and not self._stopping:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)
 
@@ -251,7 +252,7 @@ class Gates:
             CoopenvError: a gate is absent, does not open, or is stopped meanwhile; all are closed again then.
         """
         self.session, self._sequence = secrets.token_hex(8), 0
-        before = self._fresh_states()
+        before = self.fresh_states()
         with self._lock:
             stopped = sorted(car for car in self.stopped_by_others if before[car].state == "stopped")
         if stopped and not release:
@@ -282,10 +283,10 @@ class Gates:
             self.stopped_by_others.clear()
             self._before = {car: state.rejections for car, state in self._states.items()}
 
-    def _fresh_states(self) -> dict[str, GateState]:
-        """Return a status of each gate that was sent after this call. Raises CoopenvError: a gate is silent."""
+    def fresh_states(self, patience: float = STATUS_TIME) -> dict[str, GateState]:
+        """Return a status of each gate that came within s from now. Raises CoopenvError: a gate is silent."""
         asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
-        while any(state.received < asked for state in self.states.values()) and time.monotonic() < asked + STATUS_TIME:
+        while any(state.received < asked for state in self.states.values()) and time.monotonic() < asked + patience:
             time.sleep(POLL)
         for car, state in self.states.items():
             if state.age <= OLD:
@@ -343,8 +344,8 @@ class Gates:
 
 
 BYPASSED = (
-    "commands get to its wheels without its gate: give its bridge docker/car-zenoh.json5 "
-    "(docs/cars_safety.md#ways-around-the-gate)"
+    "commands get to its wheels that this gate has not sent: stop a second gate, or give its bridge "
+    "docker/car-zenoh.json5 (docs/cars_safety.md#ways-around-the-gate)"
 )
 
 

@@ -293,10 +293,11 @@ class Watchdog:
 
     def _problems(self) -> Iterator[tuple[str, str]]:
         """Yield the car and the reason of each violated rule; a car is empty where it is no single one."""
+        away = [car for car in self._cars if not self._present[presence_of(car)]]
         for car in self._cars:
             yield from ((car, why) for why in self.silent(car))
-            if not self._present[presence_of(car)]:
-                yield car, "is gone"
+            if car in away:
+                yield car, "is gone" + (", as others: is the router running?" if len(away) > 1 else "")
             if why := self._happened(car) or self._monitor.doubt(car):
                 yield car, why
         for car, gate in self._gates.states.items():

@@ -203,6 +203,8 @@ class Gate:
         """What the next arming has to name."""
         self._session, self._sequence, self._accepted = "", -1, 0
         self._wanted: MotionCommand | None = None  # by the last valid command, while it counts
+        self._set = 0
+        """Wall clock less the steady one at the last arming, ns: a clock that is set later makes no command fresh."""
         self.commanded = self._ticked = clock.steady()
         """When the last valid command came, steady clock, ns."""
         self._output = NEUTRAL
@@ -283,7 +285,8 @@ class Gate:
             raise Rejected(Reason.MALFORMED)
         if int(digits) <= self._sequence:
             raise Rejected(Reason.SEQUENCE)
-        self._check(Role.COMMAND, stamp, payload, attachment)
+        ages = self._clock.wall() - stamp, self._clock.steady() + self._set - stamp
+        self._check(Role.COMMAND, ages, payload, attachment)
         if not all(map(math.isfinite, numbers)):
             self._come_to_a_stand(GateMode.TIMED_OUT)  # the station itself has lost its way
             raise Rejected(Reason.NOT_FINITE)
@@ -296,7 +299,7 @@ class Gate:
 
     def _arm(self, payload: bytes, attachment: bytes) -> None:
         stamp, _, session, nonce, armed = read(payload, ARM)
-        self._check(Role.ARM, stamp, payload, attachment)
+        self._check(Role.ARM, (self._clock.wall() - stamp,), payload, attachment)
         if not armed:
             if self.state is not GateMode.STOPPED:
                 self._come_to_a_stand(GateMode.DISARMED)
@@ -307,6 +310,7 @@ class Gate:
             raise Rejected(Reason.SESSION)
         if session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
             self._session, self._sequence = session, -1
+        self._set = self._clock.wall() - self._clock.steady()
         self._come_to_a_stand(GateMode.ARMED)
 
     def _stop(self, payload: bytes, _attachment: bytes) -> None:
@@ -324,12 +328,11 @@ class Gate:
         if state is not GateMode.TIMED_OUT:
             self.nonce = secrets.token_hex(8)
 
-    def _check(self, role: Role, stamp: int, payload: bytes, attachment: bytes) -> None:
-        """Reject a message that is not of this moment, or not of the station."""
-        age = self._clock.wall() - stamp
-        if age > self.profile.topics[Role.COMMAND].max_age_ns:
+    def _check(self, role: Role, ages: tuple[int, ...], payload: bytes, attachment: bytes) -> None:
+        """Reject a message that is not of this moment, by its ages in ns, or not of the station."""
+        if max(ages) > self.profile.topics[Role.COMMAND].max_age_ns:
             raise Rejected(Reason.STALE)
-        if age < -MOST_AHEAD:
+        if min(ages) < -MOST_AHEAD:
             raise Rejected(Reason.FUTURE)
         if self._verifier is None:
             return

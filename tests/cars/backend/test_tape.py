@@ -28,7 +28,7 @@ from coopenv.backends.base import Command
 from coopenv.backends.mcap import read_recording
 from coopenv.base.errors import DataError, DataWarning, OutputError
 from coopenv.cars.backend.drive import PRESENCE, Drive, DriveRecorder, RecordedTransport, is_drive
-from coopenv.cars.codec import TICK, encode, header, make
+from coopenv.cars.codec import MOST_BYTES, TICK, encode, header, make
 from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role, presence_of
 from coopenv.runs.command import execute, report
 from coopenv.runs.demo import links_report
@@ -94,13 +94,14 @@ def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> Non
     for name in ("svea7", "stranger"):
         others.announce(f"fleet/alive/{name}")
     others.publish(state, encode(make(types[state])))
+    others.publish(state, bytes(MOST_BYTES + 1))  # is not read, and makes no file that nobody reads
     others.publish(stop, encode(make(types[stop], data=True)))
     others.publish(WHEEL, encode(make(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
     others.close()
     recorded.publish(WHEEL, encode(make(TYPES[WHEEL])), b"signature")
     recorder.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
     recorder.close()
-    assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
+    assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 4
     messages = messages_of(tmp_path / "drive.mcap")
     (stopped,) = [m for topic, m in messages if topic == f"/{STOPPED_TOPIC}"]
     assert (stopped.reason, stopped.car) == ("svea7: is gone", "svea7")

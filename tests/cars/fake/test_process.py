@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import sys
+import time
 import tracemalloc
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import repeat
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -22,6 +26,7 @@ from coopenv.cars.codec import MOST_BYTES, encode, make
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.fake.fleet import FakesError, free_port
 from coopenv.cars.fake.fleet import fakes as fake_processes
+from coopenv.cars.gate.core import write_status
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.profile import SVEA, Limits, Role, presence_of
 from coopenv.cars.transport.base import Arrival
@@ -139,14 +144,38 @@ def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Pa
     text = SHIPPED.read_text().replace("tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447")
     file.write_text(f'{text}\n[gate]\nconnect = ["{endpoint}"]\n')
     with closing(open_zenoh("router", listen=[endpoint])):
-        absent = "svea7: no message of its gate for 0.2 s on fleet/svea7/coopenv/gate; with docker/car-zenoh.json5 set"
-        absent += " [gate] connect"
+        absent = "svea7: no gate status on fleet/svea7/coopenv/gate: is `coopenv svea gate` running there?"
+        absent += "; with docker/car-zenoh.json5 set [gate] connect"
         assert str(health(file, "", "--patience", "0.2").exception) == absent  # so it has got there
         assert str(health(SHIPPED, endpoint, "--patience", "0.2").exception) == absent
     for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):
         assert str(health(file, there).exception).startswith(f"{there}: is not on this computer")
     tried = health(file, "tcp/nowhere.invalid:7447", "--off-board")
     assert str(tried.exception).startswith("tcp/nowhere.invalid:7447: no Zenoh there")
+
+
+def test_health_takes_no_status_that_the_car_has_not_signed(tmp_path: Path) -> None:
+    make_keys(tmp_path / "keys", ["svea7", "svea8", "station"])
+    endpoint, file = free_endpoint(), tmp_path / "fleet.toml"
+    file.write_text(SHIPPED.read_text() + '\n[security]\nkeys = "keys"\n')
+    ended, topic = Event(), SVEA.topic_of("svea7", Role.GATE)
+    with closing(open_zenoh("router", listen=[endpoint])) as forger:
+
+        def forge() -> None:
+            while not ended.wait(0.05):
+                forger.publish(topic, write_status(time.time_ns(), "", "n", "disarmed", 0, 0, {"foreign": 0}))
+                forger.publish(topic, write_status(time.time_ns(), "", "n", "\x1b[2Jdisarmed", 0, 0, {}))
+
+        with ThreadPoolExecutor(1) as pool:
+            forging = pool.submit(forge)
+            try:
+                signed = str(health(file, endpoint).exception)
+                unsigned = health(SHIPPED, endpoint).output
+            finally:
+                ended.set()
+            forging.result()
+    assert re.match(r"svea7: the status of its gate is dropped \(signature \d+\)", signed)
+    assert "gate disarmed" in unsigned and "\x1b" not in unsigned
 
 
 def test_who_cannot_start_says_why() -> None:

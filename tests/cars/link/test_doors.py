@@ -143,7 +143,9 @@ def test_an_open_router_is_noticed_and_no_gate_behind_it_is_armed(tmp_path: Path
         stack.enter_context(running_gate(endpoint, tmp_path))
         gates, station = Gates(transport, (CAR,), USUAL, None), Station(transport, None)
         wait_until(lambda: gates.states[CAR].age < OLD)
-        with pytest.raises(CoopenvError, match=rf"^not armed: {CAR}: commands get to its wheels without its gate"):
+        with pytest.raises(
+            CoopenvError, match=rf"^not armed: {CAR}: commands get to its wheels that this gate has not"
+        ):
             gates.begin()
         Gates(transport, (CAR,), USUAL, None, probed=False).begin(release=True)
         wait_until(lambda: station.status.state == "armed")

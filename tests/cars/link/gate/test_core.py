@@ -129,6 +129,15 @@ def test_a_clock_that_is_set_stops_the_car() -> None:
     assert bench.tick() == NEUTRAL
 
 
+def test_a_clock_that_is_set_back_makes_no_command_fresh() -> None:
+    bench = armed(10)
+    late = messages.command(bench.wall, "s1", 99)
+    bench.wait(5 * TIMEOUT)
+    assert bench.send(Role.COMMAND, late) is Reason.STALE
+    bench.wall -= 5 * TIMEOUT
+    assert bench.send(Role.COMMAND, late) is Reason.STALE and bench.tick() == NEUTRAL
+
+
 def test_sequences_increase() -> None:
     bench = armed()
     assert bench.command(sequence=0) is None
