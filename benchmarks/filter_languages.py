@@ -44,7 +44,7 @@ def across(u: Array) -> Array:
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return what `bearing_measurements.linearise` does of a left error."""
+    """Return residuals, H, N and G of a left error, as `bearing_measurements.linearise` does."""
     a = (positions - p).dot(R)
     d = a - lever_arm
     distance = np.maximum(lengths(d), 1e-9)[:, None]

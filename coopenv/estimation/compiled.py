@@ -193,3 +193,13 @@ def orthonormalised(R: Array) -> Array:
 def cross_matrix(v: Array) -> Array:
     """Return S(v) (3, 3) with S(v) y = v x y."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@compiled(MATRIX, VECTOR)
+def adjoint(R: Array, p: Array) -> Array:
+    """Return Ad (6, 6) of T = (R, p): T Exp(xi) T^-1 = Exp(Ad xi). It turns left errors at T into right ones."""
+    A = np.zeros((6, 6))
+    place(A, 0, 0, R)
+    place(A, 3, 3, R)
+    place(A, 3, 0, product(cross_matrix(p), R))
+    return A

@@ -135,14 +135,6 @@ def exp_translation(w: Array, v: Array) -> Array:
     return np.array([x, y, z])
 
 
-def adjoint(R: Array, p: Array) -> Array:
-    """Return Ad (6, 6) of T = (R, p): T Exp(xi) T^-1 = Exp(Ad xi)."""
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = R
-    A[3:, :3] = skew(p).dot(R)
-    return A
-
-
 def about_z(angle: Array) -> Array:
     """Return the rotations (..., 3, 3) about z by angles (...) rad; NaN where an angle is."""
     c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle

@@ -1,7 +1,7 @@
 """Bearings of a frame as measurements: residuals, Jacobians, validity, and pose errors that odometry propagates."""
 
 import math
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import types
@@ -15,6 +15,7 @@ from coopenv.estimation.compiled import (
     ROW,
     VECTOR,
     WHOLE,
+    adjoint,
     compiled,
     congruent,
     cross_matrix,
@@ -47,16 +48,6 @@ def transition(rotation: Array, translation: Array) -> Array:
     return F
 
 
-@compiled(MATRIX, VECTOR)
-def from_left(R: Array, p: Array) -> Array:
-    """Return G (6, 6), which turns left errors (theta, rho) at a pose into right ones."""
-    G = np.zeros((6, 6))
-    place(G, 0, 0, R)
-    place(G, 3, 3, R)
-    place(G, 3, 0, product(cross_matrix(p), R))
-    return G
-
-
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR)
 def predicted(
     kind: int, R: Array, p: Array, P: Array, rotation: Array, translation: Array, noise: Array
@@ -65,7 +56,7 @@ def predicted(
     R, p = orthonormalised(product(R, rotation)), p + transformed(R, translation)
     Q = np.diag(noise)
     if kind == RIGHT:
-        return R, p, P + congruent(from_left(R, p), Q)
+        return R, p, P + congruent(adjoint(R, p), Q)
     return R, p, congruent(transition(rotation, translation), P) + Q
 
 
@@ -125,7 +116,7 @@ class UncertainPose(NamedTuple):
     def start(cls, kind: int, R: Array, p: Array, P: Array) -> Self:
         """Return the estimate of a pose with a covariance in LEFT coordinates."""
         R, p, P = (np.array(values, float) for values in (R, p, P))
-        return cls(kind, R, p, congruent(from_left(R, p), P) if kind == RIGHT else P)
+        return cls(kind, R, p, congruent(adjoint(R, p), P) if kind == RIGHT else P)
 
     def predicted(self, tick: Tick) -> Self:
         """Return the estimate after the tick's odometry."""
@@ -172,21 +163,11 @@ class BearingMeasurements(NamedTuple):
     positions: Array  # (m, 3) of the points, as known or reported, map frame, m
     covariances: Array  # (m, 3, 3) of the points, m^2, zero for known points and without a reported covariance
     targets: NDArray[np.int64]  # (m,)
-    messages: tuple[Message | None, ...]  # (m,) None for landmarks
+    messages: NDArray[Any]  # (m,) `Message`, None for landmarks
 
-    def only(self, kept: NDArray[np.bool_]) -> "BearingMeasurements":
-        """Return the bearings of a mask (m,)."""
-        messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
-        return BearingMeasurements(
-            self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages
-        )
-
-    def one(self, n: int) -> "BearingMeasurements":
-        """Return the n-th bearing alone."""
-        k = slice(n, n + 1)
-        return BearingMeasurements(
-            self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k]
-        )
+    def only(self, kept: NDArray[np.bool_] | slice) -> "BearingMeasurements":
+        """Return the bearings of a mask (m,) or of a range."""
+        return BearingMeasurements(*(part[kept] for part in self))
 
 
 class LinearisedBearings(NamedTuple):
@@ -196,15 +177,15 @@ class LinearisedBearings(NamedTuple):
     H: Array  # (m, 2, n) derivative of the measurement by the error
     N: Array  # (m, 2, 2) rad^2, covariance of the residuals given the own pose
     G: Array  # (m, 2, 3) derivative of the measurement by the points, map axes, rad/m
+    ahead: NDArray[np.bool_]  # (m,) whether the points are ahead along the bearings, and not behind
 
     def only(self, kept: NDArray[np.bool_]) -> "LinearisedBearings":
         """Return the bearings of a mask (m,)."""
-        return LinearisedBearings(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
+        return LinearisedBearings(*(part[kept] for part in self))
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
-        S: Array = spread(self.H, P, self.N)
-        return S
+        return spread(self.H, P, self.N)
 
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return the residual (2m,), H (2m, n) and N (2m, 2m)."""
@@ -223,7 +204,7 @@ def usable_bearings(tick: Tick, weighed: bool = True) -> BearingMeasurements | N
                 covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
     return BearingMeasurements(
-        np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages
+        np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), np.array(messages)
     )
 
 
@@ -269,13 +250,14 @@ def linearised(pose: UncertainPose, tick: Tick, measured: BearingMeasurements) -
 @compiled(MATRIX, VECTOR, FLAG, VECTOR, MATRIX, MATRIX, MATRICES, NUMBER)
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
-) -> tuple[Array, Array, Array, Array]:
-    """Return residuals, H, N and G as in `LinearisedBearings`; `right`: the error is about the map's axes.
+) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return what `LinearisedBearings` holds; `right`: the error is about the map's axes.
 
     With the rows j of J, and g = R j, the derivative by a left error is (j x a, -j), by a right one (g x z, -g).
     """
     m = len(bearings)
     residual, H, N, G = np.empty((m, 2)), np.empty((m, 2, 6)), np.empty((m, 2, 2)), np.empty((m, 2, 3))
+    ahead = np.empty(m, np.bool_)
     for n in range(m):
         z = positions[n]
         a = transformed(R.T, z - p)
@@ -293,23 +275,8 @@ def linearise(
         place(N[n], 0, 0, congruent(G[n], C[n]))
         N[n, 0, 0] += variance
         N[n, 1, 1] += variance
-    return residual, H, N, G
-
-
-def ahead(pose: UncertainPose, tick: Tick, measured: BearingMeasurements) -> NDArray[np.bool_]:
-    """Return (m,) whether the points are ahead along the bearings, and not behind."""
-    of: NDArray[np.bool_] = _ahead(pose.R, pose.p, frame_of(tick, measured))
-    return of
-
-
-@compiled(MATRIX, VECTOR, FRAME)
-def _ahead(R: Array, p: Array, frame: Frame) -> NDArray[np.bool_]:
-    lever_arm, bearings, positions, _, _ = frame
-    result = np.empty(len(bearings), np.bool_)
-    for n in range(len(bearings)):
-        d = transformed(R.T, positions[n] - p) - lever_arm
-        result[n] = d[0] * bearings[n, 0] + d[1] * bearings[n, 1] + d[2] * bearings[n, 2] > 0.0
-    return result
+        ahead[n] = d[0] * bearings[n, 0] + d[1] * bearings[n, 1] + d[2] * bearings[n, 2] > 0.0
+    return residual, H, N, G, ahead
 
 
 @compiled(MATRIX, MATRICES)

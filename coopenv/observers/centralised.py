@@ -111,11 +111,8 @@ class Centralised:
         """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
         before, P = self.poses, self.P
         linear = {i: self.linearise(i, ticks[i], mask) for i, mask in seen.items()}
-        kept = {
-            i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
-            for i, (of, in_front) in linear.items()
-        }
-        residual, H, N = _stacked([of.only(kept[i]) for i, (of, _) in linear.items()])
+        kept = {i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), of.ahead) for i, of in linear.items()}
+        residual, H, N = _stacked([of.only(kept[i]) for i, of in linear.items()])
         if not len(residual):
             return
         for i, mask in seen.items():
@@ -125,27 +122,26 @@ class Centralised:
         if self.halfway:
             at = 0.5 * dx
             self.poses = self.moved(before, at)
-            residual, H, N = _stacked([self.linearise(i, ticks[i], mask)[0] for i, mask in seen.items()])
+            residual, H, N = _stacked([self.linearise(i, ticks[i], mask) for i, mask in seen.items()])
             H = H.dot(self.recentring(at))
             K, dx, _ = gain(P, H, N, residual + H.dot(at))
         G = self.recentring(dx)
         self.poses, self.P = self.moved(before, dx), G.dot(joseph(P, K, H, N)).dot(G.T)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
-        R, p = self.poses[i]
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
         bearings = np.asarray(tick.bearings[mask], float)
-        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
-        own = linearised(UncertainPose(LEFT, R, p, self.P), tick, known)
+        known = BearingMeasurements(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), np.full(len(z), None))
+        own = linearised(UncertainPose(LEFT, *self.poses[i], self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
         H[:, :, self.block(i)] = own.H
         for n, target in enumerate(targets):
             if (j := target - self.landmarks) >= 0:
                 G = own.G[n].dot(self.poses[j][0])
                 H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
-        return own._replace(H=H), (((z - p).dot(R) - tick.lever_arm) * bearings).sum(1) > 0.0
+        return own._replace(H=H)
 
     def place(self, target: int, tick: Tick) -> Array:
         """Return (3,) the known or estimated position of a target, map frame, m."""
@@ -214,10 +210,10 @@ class FirstEstimatesEkf(Centralised):
             F[6 * i + 3 : 6 * i + 6, 6 * i : 6 * i + 3] = skew(self.first[i] - p - R.dot(tick.translation))
         return F
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
-        linear, in_front = super().linearise(i, tick, mask)
-        return linear._replace(H=self.turned(linear.H)), in_front
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
+        linear = super().linearise(i, tick, mask)
+        return linear._replace(H=self.turned(linear.H))
 
     @staticmethod
     def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, Array]]:
@@ -248,9 +244,9 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         NT = np.swapaxes(N, -1, -2)
         self.projection = N @ np.linalg.solve(NT @ N, NT)  # (N, N, 12, 12)
 
-    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[LinearisedBearings, NDArray[np.bool_]]:
-        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
-        linear, in_front = super().linearise(i, tick, mask)
+    def linearise(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> LinearisedBearings:
+        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors."""
+        linear = super().linearise(i, tick, mask)
         targets = tick.targets[mask] - self.landmarks
         rows = np.flatnonzero(targets >= 0)
         j = targets[rows]
@@ -258,4 +254,4 @@ class ObservabilityConstrainedEkf(FirstEstimatesEkf):
         H = np.concatenate([of[rows, :, i], of[rows, :, j]], axis=-1)
         H -= H @ self.projection[i, j]
         of[rows, :, i], of[rows, :, j] = H[..., :6], H[..., 6:]
-        return linear, in_front
+        return linear

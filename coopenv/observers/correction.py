@@ -212,13 +212,13 @@ def halfway_gain(
         turns: see `joint_jacobian`.
         places: see `joint_jacobian`.
     """
-    residual, H, N, G = linearise(R, p, kind == RIGHT, *frame)
+    residual, H, N, G, _ = linearise(R, p, kind == RIGHT, *frame)
     whole = joint_jacobian(H, G, np.eye(6), turns, places)
     _, dx, nis = gain(P, whole, dense(N), residual.ravel())
     at = 0.5 * dx
     at[6:] = 0.0
     R, p = moved(kind, R, p, at[:6])
-    residual, H, N, G = linearise(R, p, kind == RIGHT, *frame)
+    residual, H, N, G, _ = linearise(R, p, kind == RIGHT, *frame)
     whole = joint_jacobian(H, G, recentring(kind, at[:6]), turns, places)
     noise = dense(N)
     K, dx, _ = gain(P, whole, noise, residual.ravel() + transformed(whole, at))

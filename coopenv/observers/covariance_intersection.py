@@ -34,7 +34,6 @@ from coopenv.observers.bearing_measurements import (
     RIGHT,
     BearingMeasurements,
     Frame,
-    LinearisedBearings,
     UncertainPose,
     corrected,
     frame_of,
@@ -107,7 +106,7 @@ class CovarianceIntersection(Mekf):
 
     sends_covariance = True
 
-    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([m is None or m.covariance is None for m in measured.messages])
         self.correct_in_turn(tick, measured, known)

@@ -19,7 +19,6 @@ from coopenv.observers.bearing_measurements import (
     LinearisedBearings,
     UncertainPose,
     across,
-    ahead,
     dense,
     frame_of,
     linearised,
@@ -81,30 +80,29 @@ class Mekf(PoseObserver):
 
     def take(self, tick: Tick, measured: BearingMeasurements) -> None:
         """Correct by the bearings that pass the gate."""
-        linear = linearised(self.state, tick, measured)
         if self.gated:
-            S = self.spread(tick, measured, linear)
-            kept = self.gate.passed(tick.time, linear.residual, S, ahead(self.state, tick, measured))
+            linear = linearised(self.state, tick, measured)
+            S = self.spread(measured, linear)
+            kept = self.gate.passed(tick.time, linear.residual, S, linear.ahead)
             if not kept.all():
-                measured, linear = measured.only(kept), linear.only(kept)
-        if len(linear.residual):
-            self.correct(tick, measured, linear)
+                measured = measured.only(kept)
+        if len(measured.targets):
+            self.correct(tick, measured)
 
-    def spread(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
+    def spread(self, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
         """Return (m, 2, 2) the covariances of the innovations."""
         return linear.spread(self.state.P)
 
-    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
-        """Correct by bearings, which are linearised at the prediction."""
-        self.nis = self.fuse(tick, measured)
-        self.nis_dof = 2 * len(linear.residual)
+    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
+        """Correct by bearings."""
+        self.nis, self.nis_dof = self.fuse(tick, measured), 2 * len(measured.targets)
 
     def correct_in_turn(self, tick: Tick, measured: BearingMeasurements, known: NDArray[np.bool_]) -> None:
         """Correct by the bearings of a mask (m,) at once, then by the others, to neighbours, one at a time."""
         if known.any():
             self.nis, self.nis_dof = self.fuse(tick, measured.only(known)), 2 * int(known.sum())
         for n in np.flatnonzero(~known).tolist():
-            self.fuse_neighbour(tick, measured.one(n))
+            self.fuse_neighbour(tick, measured.only(slice(n, n + 1)))
 
     def fuse_neighbour(self, tick: Tick, one: BearingMeasurements) -> None:
         """Correct by one bearing to a neighbour."""
@@ -197,7 +195,7 @@ class Ukf(MekfCovariance):
         if self.gated:
             each = np.arange(len(measured.targets))
             blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
-            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, ahead(self.state, tick, measured)).repeat(2)
+            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, linear.ahead).repeat(2)
             if not kept.any():
                 return
             if not kept.all():

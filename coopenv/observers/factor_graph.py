@@ -14,16 +14,19 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from coopenv.estimation.poses import Array, adjoint
-from coopenv.observers.bearing_measurements import LEFT, UncertainPose, ahead, linearised, usable_bearings
+from coopenv.estimation.compiled import adjoint
+from coopenv.estimation.poses import Array
+from coopenv.observers.bearing_measurements import LEFT, UncertainPose, linearised, usable_bearings
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.correction import InnovationGate
-from coopenv.observers.error_state_filters import PoseObserver
+from coopenv.observers.error_state_filters import PoseObserver, unit
 
 LAG = 1.0  # s
 KEY_PERIOD = 0.1  # s between key frames
 RELINEARISE = 0.01  # rad and m, by which a variable moves before its factors are linearised anew
 EXACT = 1e-10 * np.eye(3)  # m^2, of points that are known
+
+gaussian = gtsam.noiseModel.Gaussian.Covariance
 
 
 @dataclass
@@ -102,8 +105,8 @@ class FactorGraph(PoseObserver):
         if measured is None:
             return
         linear = linearised(self.state, tick, measured)
-        S, in_front = linear.spread(self.state.P), ahead(self.state, tick, measured)
-        measured = measured.only(self.gate.passed(tick.time, linear.residual, S, in_front))
+        S = linear.spread(self.state.P)
+        measured = measured.only(self.gate.passed(tick.time, linear.residual, S, linear.ahead))
         for n, target in enumerate(measured.targets.tolist()):
             position = measured.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
@@ -143,13 +146,3 @@ class FactorGraph(PoseObserver):
         mean = gtsam.Unit3(unit(line) + self.state.R.T @ seen.total / seen.count)
         noise = gtsam.noiseModel.Isotropic.Sigma(2, self.noise.bearing_std / np.sqrt(seen.count))
         self.graph.add(gtsam.BearingFactor3D(self.pose_key, point, mean, noise))
-
-
-def gaussian(covariance: Array) -> gtsam.noiseModel.Gaussian:
-    """Return GTSAM's noise model of a covariance."""
-    return gtsam.noiseModel.Gaussian.Covariance(covariance)
-
-
-def unit(v: Array) -> Array:
-    """Return v (3,) at length 1."""
-    return v / np.sqrt(v @ v)

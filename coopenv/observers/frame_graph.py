@@ -37,7 +37,6 @@ from coopenv.observers.bearing_measurements import (
     BearingMeasurements,
     UncertainPose,
     across,
-    ahead,
     increment,
     linearised,
     measured_message,
@@ -187,12 +186,10 @@ class GraphEstimator(ABC):
             of = UncertainPose(LEFT, graph.R[k, j[n]], graph.p[k, j[n]], self.P[j[n]])
             z[n], C[n] = of.p + of.R.dot(graph.markers[j[n]]), of.point_covariance(graph.markers[j[n]])
         bearings = np.asarray(tick.bearings[tick.valid], float)
-        measured = BearingMeasurements(bearings, z, C, targets, (None,) * len(targets))
+        measured = BearingMeasurements(bearings, z, C, targets, np.full(len(targets), None))
         pose = UncertainPose(LEFT, graph.R[k, vehicle], graph.p[k, vehicle], self.P[vehicle])
         linear = linearised(pose, tick, measured)
-        kept = self.gates[vehicle].passed(
-            tick.time, linear.residual, linear.spread(pose.P), ahead(pose, tick, measured)
-        )
+        kept = self.gates[vehicle].passed(tick.time, linear.residual, linear.spread(pose.P), linear.ahead)
         graph.add(vehicle, targets[kept], bearings[kept], z[kept])
 
     def broadcast(self, ticks: Sequence[Tick]) -> list[Message]:

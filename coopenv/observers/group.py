@@ -94,7 +94,7 @@ class ObserverGroup:
         try:
             restarts = interference is not None and interference.restarts[vehicle]
             if restarts:
-                self.mail.forget(vehicle)
+                self.mail.received[vehicle].clear()
             messages = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
             tick = sensed.tick(self.observer_init.setups[vehicle], messages, interference)
             if restarts:

@@ -109,10 +109,6 @@ class Mailbox:
                     received[target] = Received(last.message, age)
         return received
 
-    def forget(self, vehicle: int) -> None:
-        """Clear the messages that a vehicle has received."""
-        self.received[vehicle].clear()
-
     def _receive(self, vehicle: int, sender: int, sent: int, message: Message | None, stamp: int) -> None:
         """Store a message that has reached a vehicle, or refuse it: then the last one stays."""
         lasts = self.received[vehicle]

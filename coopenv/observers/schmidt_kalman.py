@@ -106,9 +106,9 @@ class ConsiderFilter(Mekf):
                 self.receive(target, message)
         super().take(tick, measured)
 
-    def spread(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
+    def spread(self, measured: BearingMeasurements, linear: LinearisedBearings) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, cross-covariances included."""
-        S = super().spread(tick, measured, linear)
+        S = super().spread(measured, linear)
         for n, target in enumerate(measured.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
@@ -236,7 +236,7 @@ class SchmidtKalman(ConsiderFilter):
         extra: dict[str, Array] = {**report.extra, "targets": np.array(targets, float), "cross": cross}
         return Message(report.position, report.rotation, report.covariance, extra)
 
-    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
         """Correct by all bearings at once."""
         seen = [
             (target, message)
@@ -265,7 +265,7 @@ class Pairwise(ConsiderFilter):
     It sends its pose with covariance and its factor. The normalised innovation is that of the landmarks.
     """
 
-    def correct(self, tick: Tick, measured: BearingMeasurements, linear: LinearisedBearings) -> None:
+    def correct(self, tick: Tick, measured: BearingMeasurements) -> None:
         """Correct by the landmarks, then by neighbours one at a time."""
         known = np.array([target not in self.neighbours for target in measured.targets.tolist()])
         self.correct_in_turn(tick, measured, known)

@@ -18,7 +18,6 @@ from coopenv.observers.bearing_measurements import (
     LEFT,
     BearingMeasurements,
     UncertainPose,
-    ahead,
     linearised,
     normalised,
     usable_bearings,
@@ -96,17 +95,17 @@ def misfits(pose: UncertainPose, tick: Tick, data: BearingMeasurements, P: Array
 
     With P, the variance is that given a pose with this covariance.
     """
-    residual, H, N, _ = linearised(pose, tick, data)
+    residual, H, N, _, ahead = linearised(pose, tick, data)
     if P is not None:
         N = N + H @ P @ H.transpose(0, 2, 1)
-    return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
+    return np.where(ahead, normalised(residual, N), inf)
 
 
 def refined(start: UncertainPose, tick: Tick, data: BearingMeasurements) -> UncertainPose | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
-        residual, H, N, _ = linearised(pose, tick, data)
+        residual, H, N, *_ = linearised(pose, tick, data)
         determinants = N[:, 0, 0] * N[:, 1, 1] - N[:, 0, 1] * N[:, 0, 1]
         weighted = (N[:, ::-1, ::-1] * ADJUGATE / determinants[:, None, None] @ H).reshape(-1, 6)
         try:
@@ -121,7 +120,8 @@ def refined(start: UncertainPose, tick: Tick, data: BearingMeasurements) -> Unce
             return None
         pose = pose.moved(step, (P + P.T) / 2)
         if step.dot(gradient) < CONVERGED:
-            fits = ahead(pose, tick, data) & (normalised(residual - H @ step, N) < BEARING_GATE)
+            ahead = linearised(pose, tick, data).ahead
+            fits = ahead & (normalised(residual - H @ step, N) < BEARING_GATE)
             return pose if fits.all() else None
     return None
 

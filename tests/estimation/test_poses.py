@@ -12,9 +12,9 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
+from coopenv.estimation.compiled import adjoint
 from coopenv.estimation.poses import (
     Coordinates,
-    adjoint,
     are_covariances,
     are_numbers,
     are_rotations,

@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coopenv.backends.replay import Replay
-from coopenv.observers import Recording
+from coopenv.observers import Recording, Run, run
+from coopenv.observers.contract import Factory
+from coopenv.observers.group import Tamper
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
@@ -21,6 +23,13 @@ def simulated(name: str = "busy_intersection", seed: int = 0, **overrides: Any) 
     return record(
         load_scenario(name, {"horizon": 1.0, **{k.replace("__", "."): v for k, v in overrides.items()}}), seed
     )
+
+
+def completed(observer: str | Factory, recording: Recording, tamper: Tamper | None = None) -> Run:
+    """Return a run that has not failed."""
+    result = run(observer, recording, tamper)
+    assert not result.failure
+    return result
 
 
 def differences(a: Any, b: Any, where: str = "") -> list[str]:

@@ -27,37 +27,30 @@ ISOTROPIC = {
     "noise.odometry_rate": "sample",
     "rates.odometry": 60.0,
 }
+SMALL_ERRORS = {
+    "vehicles.*.initial_estimate": {
+        "position": None,
+        "position_radius": 1.0,
+        "orientation_angle": math.radians(10.0),
+        "orientation_offset_wxyz": [1.0, 0.0, 0.0, 0.0],
+    }
+}
+"""Initial errors drawn up to 10 degrees and 1 m."""
 
 
 @cache
 def small_errors(horizon: float, seed: int = 0) -> Recording:
     """Isotropic noise of 2.9 mrad; initial errors up to 10 degrees and 1 m."""
-    scenario = load_scenario("busy_intersection", {**ISOTROPIC, "horizon": horizon})
-    return record(with_small_errors(scenario), seed)
-
-
-def with_small_errors(scenario: Scenario) -> Scenario:
-    """Return the scenario with initial errors drawn up to 10 degrees and 1 m."""
-    start: dict[str, Any] = {"position": None, "position_radius": 1.0, "orientation_angle": math.radians(10.0)}
-    start["orientation_offset_wxyz"] = (1.0, 0.0, 0.0, 0.0)
-    vehicles = tuple(
-        v.model_copy(update={"initial_estimate": v.initial_estimate.model_copy(update=start)})
-        for v in scenario.vehicles
-    )
-    return scenario.model_copy(update={"vehicles": vehicles})
+    return record(load_scenario("busy_intersection", {**ISOTROPIC, **SMALL_ERRORS, "horizon": horizon}), seed)
 
 
 @cache
 def everybody_sees_everybody(horizon: float) -> Recording:
     """Three landmarks and all other vehicles for each: rumours go round in every way."""
-    scenario = load_scenario("busy_intersection", {**ISOTROPIC, "horizon": horizon, "topology.acyclic": False})
-    names = scenario.vehicle_names
-    landmarks = tuple(landmark.name for landmark in scenario.landmarks)
-    vehicles = tuple(
-        v.model_copy(update={"neighbours": landmarks + tuple(n for n in names if n != own)})
-        for own, v in zip(names, scenario.vehicles, strict=True)
-    )
-    return record(with_small_errors(scenario.model_copy(update={"vehicles": vehicles})), 0)
+    names = load_scenario("busy_intersection").target_names
+    everybody = {f"vehicles.{own}.neighbours": [n for n in names if n != own] for own in names[3:]}
+    overrides = {**ISOTROPIC, **SMALL_ERRORS, **everybody, "horizon": horizon, "topology.acyclic": False}
+    return record(load_scenario("busy_intersection", overrides), 0)
 
 
 @cache
@@ -75,24 +68,17 @@ def crowd(horizon: float, leaders: int, gone: int) -> Recording:
         leaders: how many.
         gone: how many go out of view.
     """
-    scenario = load_scenario("busy_intersection_tracking", {"horizon": horizon})
-    template, names = scenario.vehicles[0], [f"vehicle_{n + 1}" for n in range(leaders)]
-    landmarks = tuple(landmark.name for landmark in scenario.landmarks)
-    lead = dict.fromkeys(names, landmarks)
-    places = [(-2.0 - 1.5 * n, -10.0 + 2.0 * n, 2.0) for n in range(leaders)] + [(-12.0, -16.0, 2.5)]
-    vehicles = tuple(
-        template.model_copy(
-            update={
-                "neighbours": neighbours,
-                "initial_pose": template.initial_pose.model_copy(update={"position": place}),
-                "motion": template.motion.model_copy(
-                    update={"linear": (0.0, 0.6 if place is places[-1] else 0.3, 0.0)}
-                ),
-            }
-        )
-        for neighbours, place in zip([*lead.values(), tuple(names)], places, strict=True)
-    )
-    recording = record(scenario.model_copy(update={"vehicles": vehicles}), 0)
+    raw = load_scenario("busy_intersection_tracking", {"horizon": horizon}).model_dump()
+    template, landmarks = raw["vehicles"][0], tuple(landmark["name"] for landmark in raw["landmarks"])
+
+    def vehicle(place: tuple[float, ...], speed: float, neighbours: tuple[str, ...]) -> dict[str, Any]:
+        motion = {**template["motion"], "linear": (0.0, speed, 0.0)}
+        return {**template, "initial_pose": {"position": place}, "motion": motion, "neighbours": neighbours}
+
+    lead = [vehicle((-2.0 - 1.5 * n, -10.0 + 2.0 * n, 2.0), 0.3, landmarks) for n in range(leaders)]
+    follower = vehicle((-12.0, -16.0, 2.5), 0.6, tuple(f"vehicle_{n + 1}" for n in range(leaders)))
+    raw["vehicles"] = [*lead, follower]
+    recording = record(Scenario(**raw), 0)
     visible = recording.visible.copy()
     first = recording.landmarks.shape[1]
     visible[recording.ticks // 3 :, leaders, first : first + gone] = False

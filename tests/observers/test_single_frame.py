@@ -11,12 +11,13 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coopenv.observers import Message, Received, Recording, Tick, run
-from coopenv.observers.bearing_measurements import LEFT, UncertainPose
+from coopenv.observers import Message, Received, Recording, Tick
+from coopenv.observers.bearing_measurements import LEFT, LinearisedBearings, UncertainPose
 from coopenv.observers.centralised import Centralised, FirstEstimatesEkf, ObservabilityConstrainedEkf
 from coopenv.observers.single_frame import PerspectivePoints
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.helpers.recordings import completed
 from tests.observers.test_filters import QUIET, tick
 from tests.oracles.batch import small_record
 from tests.oracles.continuous import skew
@@ -136,8 +137,7 @@ def test_a_vehicle_that_sees_three_landmarks_is_found_in_one_frame_from_anywhere
         start_position=made.start_position + 8.0,
         start_covariance=np.tile(np.diag([1.0] * 3 + [60.0] * 3), (5, 1, 1)),
     )
-    result = run("p3p", lost)
-    assert not result.failure
+    result = completed("p3p", lost)
     assert result.position_error[1, 0] < 0.1 and result.orientation_error[1, 0] < 1.0
 
 
@@ -175,13 +175,13 @@ def unobservable_dimension(kind: type[Centralised], made: Recording) -> int:
             super().correct(ticks, seen)
             rows.extend(H @ whole for H in self.used[-len(seen) :])
 
-        def linearise(self, i: int, tick: Tick, mask: np.ndarray):  # type: ignore[no-untyped-def]
-            linear, in_front = super().linearise(i, tick, mask)
+        def linearise(self, i: int, tick: Tick, mask: np.ndarray) -> LinearisedBearings:
+            linear = super().linearise(i, tick, mask)
             self.used.append(linear.H.reshape(-1, linear.H.shape[-1]))
-            return linear, in_front
+            return linear
 
     Watched.joint = True
-    assert not run(Watched, made).failure
+    completed(Watched, made)
     values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
     return int((values < 1e-7 * values[0]).sum())
 
@@ -242,8 +242,7 @@ def test_it_is_the_filter_in_transformed_coordinates() -> None:
             xi = (np.eye(6 * N) - K @ H) @ xi
             R = Rotation.from_rotvec(e[:, :3]).as_matrix() @ R
             p = p + e[:, 3:]
-    result = run(Ungated, made)
-    assert not result.failure
+    result = completed(Ungated, made)
     assert_allclose(result.position[-1], p, atol=1e-6)
     assert_allclose(result.rotation[-1], R, atol=1e-6)
 
@@ -251,6 +250,5 @@ def test_it_is_the_filter_in_transformed_coordinates() -> None:
 @pytest.mark.parametrize("name", ["first_estimates_ekf", "observability_constrained_ekf"])
 def test_with_landmarks_it_tracks(name: str) -> None:
     made = record(load_scenario("busy_intersection_tracking", {"horizon": 5.0}), 0)
-    result = run(name, made)
-    assert not result.failure
+    result = completed(name, made)
     assert (result.position_rmse(3.0)[:3] < 0.3).all()

@@ -17,29 +17,23 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.routes import ConstantMotion
 
 
 def small_errors(overrides: dict[str, object], size: float = 1e-4, turning: bool = True) -> Scenario:
     """Return busy_intersection with initial errors of this size, turning vehicles, cameras and markers off centre."""
-    scenario = load_scenario("busy_intersection", {"noise.bearing.model": "isotropic", **overrides})
-    vehicles = []
-    for i, vehicle in enumerate(scenario.vehicles):
-        start = vehicle.initial_estimate.model_copy(
-            update={
-                "position": None,
-                "position_radius": size,
-                "orientation_angle": size,
-                "orientation_offset_wxyz": (1.0, 0.0, 0.0, 0.0),
-            }
-        )
-        update: dict[str, object] = {"initial_estimate": start}
-        if turning:
-            update["motion"] = ConstantMotion(kind="constant", linear=(3.0, 0.5, 0.1), angular=(0.2, -0.1, 1.0 + i))
-            update["marker"] = (0.3, -0.2, 0.5)
-        vehicles.append(vehicle.model_copy(update=update))
-    camera = scenario.camera.model_copy(update={"position": (0.4, 0.1, 0.2)} if turning else {})
-    return scenario.model_copy(update={"vehicles": tuple(vehicles), "camera": camera})
+    start = {
+        "position": None,
+        "position_radius": size,
+        "orientation_angle": size,
+        "orientation_offset_wxyz": [1.0, 0.0, 0.0, 0.0],
+    }
+    changes: dict[str, object] = {"noise.bearing.model": "isotropic", "vehicles.*.initial_estimate": start}
+    if turning:
+        changes |= {"camera.position": [0.4, 0.1, 0.2], "vehicles.*.marker": [0.3, -0.2, 0.5]}
+        for i in range(5):
+            angular = [0.2, -0.1, 1.0 + i]
+            changes[f"vehicles.{i}.motion"] = {"kind": "constant", "linear": [3.0, 0.5, 0.1], "angular": angular}
+    return load_scenario("busy_intersection", changes | overrides)
 
 
 @cache

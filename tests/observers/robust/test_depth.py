@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvalsh
 
-from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
 from tests.helpers.env_suite import rest_slow
-from tests.helpers.robust_worlds import nees_of, steps_of, watched, with_small_errors
+from tests.helpers.recordings import completed
+from tests.helpers.robust_worlds import SMALL_ERRORS, nees_of, steps_of, watched
 
 SEEDS = range(5200, 5232)
 SCENES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -53,14 +53,13 @@ def test_errors_are_as_large_as_their_covariances_say(scene: str) -> None:
 @pytest.mark.parametrize("name", ["busy_intersection_tracking", "lane:4", "random:6,seed=521"])
 def test_no_vehicle_knows_more_than_there_is(name: str) -> None:
     """Its covariance is no smaller, in any direction, than the bound over it and all whose messages can reach it."""
-    made = with_small_errors(load_scenario(name, {"horizon": 8.0, "noise.bearing.model": "isotropic"}))
-    recording = record(made, 5)
-    result, bound = run("robust", recording), cramer_rao_ancestors(recording)
+    overrides = {"horizon": 8.0, "noise.bearing.model": "isotropic", **SMALL_ERRORS}
+    recording = record(load_scenario(name, overrides), 5)
+    result, bound = completed("robust", recording), cramer_rao_ancestors(recording)
     for k in range(100, recording.ticks, 60):
         for i in range(len(recording.setups)):
             least = eigvalsh(result.covariance[k, i], bound.covariance[k, i])[0]
             assert least > 0.9, (k, i, least)
-    assert not result.failure
     assert (result.bytes_per_second * recording.period * recording.dt <= 8 * 28 * 1.001).all()  # in the mean
     size = [np.trace(P[-60:, :, 3:, 3:], axis1=2, axis2=3).mean(axis=0) for P in (result.covariance, bound.covariance)]
     assert (size[0] < 2.5 * size[1]).all(), size[0] / size[1]

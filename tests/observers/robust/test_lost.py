@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,18 +30,19 @@ from tests.helpers.robust_worlds import estimates, nees_of, position_errors
 
 NEAR, TURN = 0.5, np.radians(5.0)  # m and rad
 WRONG = 20.0  # NEES/6
-LOST: dict[str, Any] = {"position": None, "position_radius": 15.0, "orientation_angle": np.pi}
+LOST = {
+    "position": None,
+    "position_radius": 15.0,
+    "orientation_angle": np.pi,
+    "orientation_offset_wxyz": [1.0, 0.0, 0.0, 0.0],
+}
 SCENES = ("busy_intersection", "lane:8", "lane:12", "tree:12", "tree:20", "random:20,seed=31", "roots:12")
 
 
 def all_lost(name: str, seconds: float) -> Scenario:
     """Return an environment in which all start up to 15 m and 180 degrees off, and know that."""
-    made = load_scenario(name, {"observer.name": "robust", "horizon": seconds + 1.0})
-    start = {**LOST, "orientation_offset_wxyz": (1.0, 0.0, 0.0, 0.0)}
-    vehicles = tuple(
-        v.model_copy(update={"initial_estimate": v.initial_estimate.model_copy(update=start)}) for v in made.vehicles
-    )
-    return made.model_copy(update={"vehicles": vehicles})
+    lost = {"vehicles.*.initial_estimate": LOST}
+    return load_scenario(name, {"observer.name": "robust", "horizon": seconds + 1.0, **lost})
 
 
 @dataclass(frozen=True)
