@@ -105,8 +105,8 @@ def apply_corrections(memory: Any, world: int, i: int):
     for k in range(memory.belief[world, i].first_sender):
         correction = memory.scratch[world, i, k].correction
         if k == ERRORS:
-            memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
-            memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
+            memory.member[world, i, k].w += correction[:3]
+            memory.member[world, i, k].v += correction[3:]
         else:
             apply_error(memory, world, i, k, correction)
             memory.scratch[world, i, k].recentring = recentring(correction)

@@ -13,14 +13,6 @@ from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
-def store_poses(memory: Any, world: int, i: int):
-    """Store poses as they are before a correction."""
-    for k in range(memory.belief[world, i].members):
-        memory.scratch[world, i, k].last_correction = vec6d()
-        memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
-
-
-@device_function
 def linearise_again(frame: BearingFrame, memory: Any, world: int, i: int, share: Any):
     """Linearise the bearings after a share of the correction, in errors about the poses before the correction.
 
@@ -155,7 +147,9 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     Control 38(2), 1993.
     """
     bearings = frame.bearings
-    store_poses(memory, world, i)
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, i, k].last_correction = vec6d()
+        memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
     correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].gate_disabled == 0, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)

@@ -36,7 +36,7 @@ from coopenv.observers.robust.correlations import (
 from coopenv.observers.robust.measurements import is_received
 from coopenv.observers.robust.memory import Member, Pose, PoseEstimate, mat66d, vec6d
 from coopenv.observers.robust.messages import bit_of, depends_on_own, includes, propagate_member
-from coopenv.observers.robust.propagation import TWELFTH, calibration_variances
+from coopenv.observers.robust.propagation import TWELFTH
 from coopenv.observers.robust.source_monitor import add_to_drift
 from coopenv.observers.robust.sources import clear_drift, clear_source, is_excluded, take_slot
 from coopenv.world.camera import VISIBLE
@@ -120,14 +120,6 @@ def apply_sender_increment(memory: Any, world: int, i: int, n: int, d: Any):
     apply_corrections(memory, world, i)
 
 
-@device_function
-def monitor_increment(memory: Any, world: int, i: int, n: int, d: Any, known: Any, unknown: Any):
-    """Add an increment d of member n's report to the monitor of its drift; covariances (3, 3) of the position."""
-    R = memory.member[world, i, n].pose.R
-    N = wp.where(wp.trace(known) < wp.float64(0.0), unknown, known + unknown)
-    add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * N * wp.transpose(R))
-
-
 @subroutine
 def set_increment(memory: Any, world: int, i: int, n: int):
     """Set a member to the pose of its new report, and return the increment from the old pose, (6,)."""
@@ -150,7 +142,10 @@ def fuse_increment(model: Any, memory: Any, world: int, i: int, n: int, fusing: 
     memory.scratch[world, i, n].column = after - memory.scratch[world, i, n].row
     before = mat66d(memory.P[world, i, n, n])
     N = before - after - memory.scratch[world, i, n].column
-    monitor_increment(memory, world, i, n, d, block3(N, 3, 3), unknown)
+    known = block3(N, 3, 3)
+    drift = wp.where(wp.trace(known) < wp.float64(0.0), unknown, known + unknown)
+    R = memory.member[world, i, n].pose.R
+    add_to_drift(memory, world, i, memory.member[world, i, n].source, R * d[3:], R * drift * wp.transpose(R))
     N = N + wp.diag(wp.float64(constants.LEAST_NEWS) * wp.get_diag(before))
     memory.known[world, i, 0].covariance = N
     variance = algebra.position_variance(before)
@@ -206,7 +201,8 @@ def unknown_covariance(model: Any, memory: Any, world: int, i: int, n: int, step
     That is how wrong the scale of the sender's odometry is, and how suddenly its twist has changed.
     """
     p = wp.transpose(step.R) * step.p
-    scale = calibration_variances(model, i)[3] + wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE)
+    declared = wp.float64(model.noise[i].odometry_scale)
+    scale = declared * declared + wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE)
     C = (scale * wp.max(wp.float64(1.0), wp.float64(constants.MEAN_TIME) / dt)) * wp.outer(p, p)
     if memory.member[world, i, n].has_twist == 1:
         change = (step.p / dt - memory.member[world, i, n].v) * model.odometry_period

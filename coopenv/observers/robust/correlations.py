@@ -310,13 +310,6 @@ def excess(left: Any, after: Any):
     return more
 
 
-@subroutine
-def set_own_row(model: Any, memory: Any, world: int, i: int, n: int, larger: Any):
-    """Set `scratch.row` of n to its stated covariance, with the inflation that the residual needs, times `larger`."""
-    after = stated_covariance(model, memory, world, i, n)
-    memory.scratch[world, i, n].row = larger * (after + excess(memory.scratch[world, i, n].column, after))
-
-
 @device_function
 def dependence_inflation(memory: Any, world: int, i: int, n: int):
     """Return the share by which member n's covariance is inflated for its dependence on this vehicle.
@@ -398,4 +391,4 @@ def regress(model: Any, memory: Any, world: int, i: int, n: int, received: bool)
     larger = wp.float64(1.0) + dependence_inflation(memory, world, i, n)  # the added error is the same one
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].row = wp.sqrt(larger) * memory.scratch[world, i, k].row
-    set_own_row(model, memory, world, i, n, larger)
+    memory.scratch[world, i, n].row = larger * (after + excess(memory.scratch[world, i, n].column, after))

@@ -163,8 +163,15 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
     report["tick"], report["valid"], report["carries_correlations"] = sent, 0, 0
     if message.position is None and not message.extra:  # the sender is searching for its pose
         return
-    check_pose(message)
-    odometry, depends_on = _numbers(message, "odometry", (6,)), np.asarray(message.extra["depends_on"])
+    if message.position is None or message.rotation is None or message.covariance is None:
+        raise CoopenvError("message: no pose with a covariance")
+    P = np.asarray(message.covariance, np.float64)
+    check_estimate(Estimate(message.rotation, message.position, P))
+    if not is_definite(P, MIN_VARIANCE, LARGEST**2):
+        raise CoopenvError("message: covariance is not positive definite, or not plausible")
+    odometry, depends_on = np.asarray(message.extra["odometry"], np.float64), np.asarray(message.extra["depends_on"])
+    if odometry.shape != (6,) or not (np.abs(odometry) <= LARGEST).all():
+        raise CoopenvError("message: odometry")
     if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
         raise CoopenvError("message: depends_on")
     if "correlated_vehicles" in message.extra:
@@ -172,29 +179,6 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
         report["carries_correlations"] = 1
     report["pose"], report["P"] = (message.rotation, message.position), message.covariance
     report["odometry"], report["depends_on"], report["valid"] = from_six(odometry), depends_on[0], 1
-
-
-def _numbers(message: Message, name: str, shape: tuple[int, ...]) -> Array:
-    """Return an entry of a message; a CoopenvError means another shape, or a number that is too large or none."""
-    values = np.asarray(message.extra[name], np.float64)
-    if values.shape != shape or not (np.abs(values) <= LARGEST).all():
-        raise CoopenvError(f"message: {name}")
-    return values
-
-
-def _vehicles(observer: Any, sender: int, message: Message, name: str, most: int) -> Array:
-    """Return an entry of a message that lists vehicles; a CoopenvError means that it cannot.
-
-    These are at most so many vehicles, different from each other and from the sender.
-    """
-    listed = np.asarray(message.extra[name])
-    count = len(observer.setup.target_names) - observer.setup.landmarks
-    if listed.ndim != 1 or listed.dtype.kind not in "iu" or len(listed) > most:
-        raise CoopenvError(f"message: {name}")
-    vehicles = {sender, *listed.tolist()}
-    if len(vehicles) <= len(listed) or not vehicles <= set(range(count)):
-        raise CoopenvError(f"message: {name}")
-    return listed
 
 
 def lead_along(made: Message, honest: Message) -> Message:
@@ -207,20 +191,20 @@ def lead_along(made: Message, honest: Message) -> Message:
     return replace(made, extra={**made.extra, "odometry": led.astype(honest.extra["odometry"].dtype)})
 
 
-def check_pose(message: Message) -> None:
-    """Refuse a message without a valid pose and a covariance that can be inverted."""
-    if message.position is None or message.rotation is None or message.covariance is None:
-        raise CoopenvError("message: no pose with a covariance")
-    P = np.asarray(message.covariance, dtype=np.float64)
-    check_estimate(Estimate(message.rotation, message.position, P))
-    if not is_definite(P, MIN_VARIANCE, LARGEST**2):
-        raise CoopenvError("message: covariance is not positive definite, or not plausible")
-
-
 def _read_correlations(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Store the correlations of a message; a CoopenvError or LookupError means that they are malformed."""
-    broadcast = _vehicles(observer, sender, message, "correlated_vehicles", MAX_CORRELATIONS)
-    ages, matrices = np.asarray(message.extra["ages"]), np.asarray(message.extra["correlations"])
+    """Store the correlations of a message; a CoopenvError or LookupError means that they are malformed.
+
+    They are with vehicles that are different from each other and from the sender.
+    """
+    broadcast, ages, matrices = (
+        np.asarray(message.extra[name]) for name in ("correlated_vehicles", "ages", "correlations")
+    )
+    if broadcast.ndim != 1 or broadcast.dtype.kind not in "iu" or len(broadcast) > MAX_CORRELATIONS:
+        raise CoopenvError("message: correlated_vehicles")
+    vehicles = {sender, *broadcast.tolist()}
+    known = range(len(observer.setup.target_names) - observer.setup.landmarks)
+    if len(vehicles) <= len(broadcast) or not vehicles <= set(known):
+        raise CoopenvError("message: correlated_vehicles")
     if matrices.shape != (len(broadcast), 6, 6) or matrices.dtype != np.int8 or (matrices < -STEPS).any():
         raise CoopenvError("message: correlations")
     if ages.shape != broadcast.shape or not ((ages >= 0.0) & (ages <= LARGEST)).all():

@@ -63,15 +63,13 @@ from coopenv.observers.robust.memory import (
 from coopenv.observers.robust.messages import ROBUST_MESSAGES, bit_of
 from coopenv.observers.robust.propagation import (
     begin_errors,
-    calibration_noise,
     increment_noise,
     propagate_own,
     take_odometry,
     walk_errors,
-    walk_mounting,
 )
 from coopenv.observers.robust.protection import protection_level
-from coopenv.observers.robust.search import advance_search, begin_search, postpone_acceptance, propagate_search
+from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.source_monitor import correct_sources
 from coopenv.observers.robust.sources import begin_sources, is_excluded
 from coopenv.world.embedded import Embedded
@@ -136,7 +134,7 @@ def declare_lost(model: Any, memory: Any, world: int, i: int, tick: int):
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)
     begin_errors(model, memory, world, i)  # their estimates may be wrong, too
-    noise = odometry_noise(model, i, elapsed) + calibration_noise(memory, world, i, step, elapsed, elapsed)
+    noise = increment_noise(model, memory, world, i, step, elapsed, elapsed)
     begin_search(memory, world, i, carried(anchor.estimate, step, noise))
 
 
@@ -328,9 +326,8 @@ def propagate_belief(model: Any, state: Any, memory: Any, world: int, i: int, no
     receive_broadcast(model, state, memory, world, i)
     step, jump = take_odometry(model, state, memory, world, i, now.period)
     walk_errors(model, memory, world, i, now.period)
-    walk_mounting(model, memory, world, i, now.period)
     if memory.search[world, i].active == 1:
-        noise = increment_noise(model, memory, world, i, step, now.period) + jump
+        noise = increment_noise(model, memory, world, i, step, now.period, wp.float64(constants.MEAN_TIME)) + jump
         propagate_search(memory, world, i, step, noise)
     else:
         noise = odometry_noise(model, i, now.period) + jump
@@ -377,8 +374,9 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
             determined = resect(frame, memory, world, i)
             if determined and is_known(wp.float64(constants.SQUARED_MARGIN) * memory.P[world, i, 0, 0]):
                 memory.search[world, i].active = 0
-            else:
-                postpone_acceptance(memory, world, i)
+            else:  # track the remaining hypothesis for some more frames
+                least = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
+                memory.search[world, i].least_time = least
 
 
 @device_function

@@ -34,15 +34,6 @@ def begin_calibration(memory: Any, world: int, i: int, n: int, variances: Any):
 
 
 @device_function
-def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Inflate the covariance of the mounting by its walk over dt, see `CALIBRATION_CHANGE`."""
-    if mounting_of(memory, world, i) > 0:
-        share = wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE) * dt
-        P = memory.P[world, i, MOUNTING, MOUNTING]
-        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, share * mounting_variances(model, i))
-
-
-@device_function
 def mounting_of(memory: Any, world: int, i: int) -> int:
     """Return the member with the calibration state of the mounting, 0 if there is none."""
     return wp.where(memory.belief[world, i].first_sender > MOUNTING, MOUNTING, 0)
@@ -51,26 +42,22 @@ def mounting_of(memory: Any, world: int, i: int) -> int:
 TWELFTH = 1.0 / 12.0
 
 
-@device_function
-def calibration_variances(model: Any, i: int):
-    """Return the variances of the gyro's bias per axis, `GYRO_BIAS` at least, and of the odometry's scale (4,)."""
-    bias = wp.max(vec3d(model.noise[i].gyro_bias), vec3d(wp.float64(constants.GYRO_BIAS)))
-    errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale))
-    return wp.cw_mul(errors, errors)
+@wp.func
+def odometry_variances(bias: Any, least: wp.float64, scale: Any):
+    """Return the variances (4,) of the gyro's bias per axis and of the odometry's scale, by declared deviations.
 
-
-@device_function
-def walk_variances(model: Any, i: int):
-    """Return the growth of these variances per second."""
-    bias = wp.max(vec3d(model.noise[i].gyro_bias_walk), vec3d(wp.float64(constants.GYRO_BIAS_WALK)))
-    errors = vec4d(bias[0], bias[1], bias[2], wp.float64(model.noise[i].odometry_scale_walk))
+    That of the bias is `least` at least.
+    """
+    deviations = wp.max(vec3d(bias), vec3d(least))
+    errors = vec4d(deviations[0], deviations[1], deviations[2], wp.float64(scale))
     return wp.cw_mul(errors, errors)
 
 
 @device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
     """Begin the calibration states of odometry, member 1, and of the mounting, member 2, if its errors are declared."""
-    odometry = calibration_variances(model, i)
+    noise = model.noise[i]
+    odometry = odometry_variances(noise.gyro_bias, wp.float64(constants.GYRO_BIAS), noise.odometry_scale)
     mounting = mounting_variances(model, i)
     one = wp.float64(1.0)  # entries without a state are arbitrary
     begin_calibration(memory, world, i, ERRORS, vec6d(odometry[0], odometry[1], odometry[2], odometry[3], one, one))
@@ -81,11 +68,19 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
 
 @device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
-    """Inflate the covariance of the odometry's errors by their walk over dt, as declared and as found, see `Source`."""
-    walk = walk_variances(model, i)
+    """Inflate the covariances of the calibration states by their walk over dt.
+
+    Those of the odometry walk as declared and as found, see `Source`; the mounting, see `CALIBRATION_CHANGE`.
+    """
+    noise = model.noise[i]
+    walk = odometry_variances(noise.gyro_bias_walk, wp.float64(constants.GYRO_BIAS_WALK), noise.odometry_scale_walk)
     walk[3] += memory.source[world, i, VELOCITY].walk
     for k in range(4):
         memory.P[world, i, ERRORS, ERRORS][k, k] += walk[k] * dt
+    if mounting_of(memory, world, i) > 0:
+        share = wp.float64(constants.CALIBRATION_CHANGE * constants.CALIBRATION_CHANGE) * dt
+        P = memory.P[world, i, MOUNTING, MOUNTING]
+        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, share * mounting_variances(model, i))
 
 
 @device_function
@@ -135,8 +130,8 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
 
 
 @device_function
-def calibration_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
-    """Return the variances (rotation, translation) of an increment over dt by the odometry's calibration, as noise.
+def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
+    """Return the variances (rotation, translation) of an increment over dt, with the odometry's calibration as noise.
 
     The calibration errors have the covariance of the vehicle's own ones. They add up like noise that is constant over
     the time `correlated`, s.
@@ -144,14 +139,8 @@ def calibration_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, corr
     P = memory.P[world, i, ERRORS, ERRORS]
     time = wp.max(correlated, dt)
     turning = wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) * dt * time
-    return vec2d(turning, P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(constants.SAME_TIME)))
-
-
-@device_function
-def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return the variances (rotation, translation) of an increment over dt, calibration errors included."""
-    noise = odometry_noise(model, i, dt)
-    return noise + calibration_noise(memory, world, i, step, dt, wp.float64(constants.MEAN_TIME))
+    driving = P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(constants.SAME_TIME))
+    return odometry_noise(model, i, dt) + vec2d(turning, driving)
 
 
 @wp.func
@@ -189,7 +178,7 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period)
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period)
         share = dt / (dt + wp.float64(constants.MEAN_TIME))
-        memory.belief[world, i].mean_v = memory.belief[world, i].mean_v + share * (v - memory.belief[world, i].mean_v)
+        memory.belief[world, i].mean_v += share * (v - memory.belief[world, i].mean_v)
     else:
         memory.belief[world, i].mean_v = v
     memory.belief[world, i].has_sample = 1

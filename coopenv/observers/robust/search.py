@@ -336,12 +336,6 @@ def begin_hypotheses(frame: BearingFrame, memory: Any, world: int, i: int, perio
     return triple, solved
 
 
-@device_function
-def postpone_acceptance(memory: Any, world: int, i: int):
-    """Track the remaining hypothesis for some more frames: this frame does not determine the pose well enough."""
-    memory.search[world, i].least_time = memory.search[world, i].tracked_time + wp.float64(constants.NEWS_TIME)
-
-
 @subroutine
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Update the hypotheses by a frame; return whether a single one is left after some frames."""

@@ -116,9 +116,9 @@ def correct_drift_effect(frame: BearingFrame, memory: Any, world: int, i: int, q
 def add_to_drift(memory: Any, world: int, i: int, q: int, d: Any, N: Any):
     """Add the increment d (m, map) of a sender's report, of covariance N, to the sums of its drift."""
     W = wp.inverse(N + wp.float64(constants.MIN_VARIANCE) * wp.identity(3, wp.float64))
-    memory.source[world, i, q].drift = memory.source[world, i, q].drift + d
-    memory.source[world, i, q].drift_vector = memory.source[world, i, q].drift_vector + W * d
-    memory.source[world, i, q].drift_information = memory.source[world, i, q].drift_information + W
+    memory.source[world, i, q].drift += d
+    memory.source[world, i, q].drift_vector += W * d
+    memory.source[world, i, q].drift_information += W
 
 
 @device_function
@@ -293,7 +293,10 @@ def end_block(memory: Any, world: int, i: int, time: Any):
                 end_drift_block(memory, world, i, q, time, kept)
             if q >= CAMERA and memory.source[world, i, q].ratio < wp.float64(constants.OFFSET_GATE):
                 restart_fault(memory, world, i, q)
-    clear_block(memory, world, i)
+    for q in range(SOURCES):
+        if is_active(memory, world, i, q):
+            memory.source[world, i, q].vector = vec3d()
+            fill(memory.information[world, i, q], mat33d())
 
 
 @device_function
@@ -301,12 +304,3 @@ def own_fault_variance(memory: Any, world: int, i: int, q: int):
     """Return the variance of the fault of the own velocity, (m/s)^2, angular velocity, (rad/s)^2, or camera, rad^2."""
     variance = wp.float64(constants.OWN_FAULT * constants.OWN_FAULT)
     return wp.where(q == VELOCITY, variance * wp.length_sq(memory.belief[world, i].mean_v), variance)
-
-
-@device_function
-def clear_block(memory: Any, world: int, i: int):
-    """Clear the information of a block on the sources that are used."""
-    for q in range(SOURCES):
-        if is_active(memory, world, i, q):
-            memory.source[world, i, q].vector = vec3d()
-            fill(memory.information[world, i, q], mat33d())
