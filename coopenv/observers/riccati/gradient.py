@@ -327,20 +327,9 @@ class DifferentiableWorld:
 
     def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
         world, rate = self._world, self.scenario.rates.camera
-        launch.launch(
-            kernel(show_kernel, "float64"),
-            dim=(world.worlds, world.model.agents),
-            inputs=[world.model, truth, world.state, wp.float64(tick / rate)],
-            device=world.device,
-            record_tape=False,
-        )
-        launch.launch(
-            kernel(see_kernel, "float64"),
-            dim=world.worlds,
-            inputs=[world.model, world.state],
-            device=world.device,
-            record_tape=False,
-        )
+        shown = [world.model, truth, world.state, wp.float64(tick / rate)]
+        self._launch(show_kernel, shown, dim=(world.worlds, world.model.agents), differentiable=False)
+        self._launch(see_kernel, [world.model, world.state], dim=world.worlds, differentiable=False)
         dt = wp.float64(1.0 / rate)
         predicted, after = self._make(PoseBelief), self._make(PoseBelief)
         sums = [self._make(mat66), self._make(mat23)]
@@ -352,10 +341,11 @@ class DifferentiableWorld:
             self._launch(correct_kernel, [predicted, *sums, after, vehicle, dt, turn], dim=world.worlds)
         return after
 
-    def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:
+    def _launch(self, function: Any, arguments: list[Any], dim: Any = None, differentiable: bool = True) -> None:
         grid = (self._world.worlds, self._world.model.vehicles) if dim is None else dim
-        compiled = kernel(function, "float64", differentiable=True)
-        launch.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
+        compiled = kernel(function, "float64", differentiable=differentiable)
+        device = self._world.device
+        launch.launch(compiled, dim=grid, inputs=arguments, device=device, record_tape=differentiable)
 
 
 def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[float, bool]]:

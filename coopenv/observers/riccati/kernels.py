@@ -219,11 +219,9 @@ def kalman_step(
     """
     taken = h
     dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
-    turn = wp.length(dx1)
-    while turn > limit and not last:
-        taken = taken * shrink(turn, limit)
+    while wp.length(dx1) > limit and not last:
+        taken = taken * shrink(wp.length(dx1), limit)
         dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
-        turn = wp.length(dx1)
     return taken, dx1, dx2, A, B, D
 
 
@@ -235,11 +233,9 @@ def modal_step(
     taken = h
     T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22)
     dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
-    turn = wp.length(dx1)
-    while turn > limit and not last:
-        taken = taken * shrink(turn, limit)
+    while wp.length(dx1) > limit and not last:
+        taken = taken * shrink(wp.length(dx1), limit)
         dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
-        turn = wp.length(dx1)
     P = covariance_modes(taken, T, spectrum)
     return taken, dx1, dx2, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3)
 
