@@ -23,6 +23,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import simulate
+from tests.helpers.recordings import completed
 
 OTHER = "vehicles.vehicle_2.faults"
 FAULTS: dict[str, dict[str, Any]] = {
@@ -76,8 +77,7 @@ def positions(world: World, ticks: int) -> np.ndarray:
 @pytest.mark.parametrize("name", list(FAULTS))
 def test_the_same_observer_meets_the_same_faults_on_the_host(name: str, observer: str, atol: float) -> None:
     """The host's messages, clocks and restarts are code of their own: Python and dictionaries in place of kernels."""
-    found = run(observer, recorded(name))
-    assert not found.failure
+    found = completed(observer, recorded(name))
     assert_allclose(found.position[1:], in_kernels(scene(name, **{"observer.name": observer}), 3), atol=atol)
 
 
@@ -135,7 +135,7 @@ class SeesMaps(Centralised):
 
 def test_a_joint_observer_has_every_vehicle_s_own_map() -> None:
     SeesMaps.maps = []
-    assert not run(SeesMaps, recorded("map")).failure
+    completed(SeesMaps, recorded("map"))
     off = np.array(SeesMaps.maps) - recorded("map").landmarks[1:, None]
     wrong = np.linalg.norm(off, axis=-1)
     expected = np.zeros_like(wrong)
@@ -256,8 +256,7 @@ def altered(drawn: dict[str, Any]) -> Any:
 @settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=st.lists(messages, min_size=20, max_size=20))
 def test_no_message_ends_a_run(observer: str, drawn: list[dict[str, Any]]) -> None:
-    found = run(observer, recorded("none"), Throws(*map(altered, drawn)))
-    assert not found.failure
+    found = completed(observer, recorded("none"), Throws(*map(altered, drawn)))
     assert np.isfinite(found.position).all()
 
 

@@ -18,7 +18,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.backends.replay import Replay
 from coopenv.base.errors import CoopenvError
-from coopenv.observers import Estimate, Message, Received, Recording, Tick, register, registry, run
+from coopenv.observers import Estimate, Message, Received, Recording, Tick, register, registry
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from coopenv.observers.registry import find, find_embedded, named, portable
 from coopenv.observers.single_frame import DeadReckoning
@@ -26,7 +26,7 @@ from coopenv.scenario.schema import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.state import array
 from tests.helpers.commands import refused
-from tests.helpers.recordings import simulated
+from tests.helpers.recordings import completed, simulated
 from tests.helpers.robust_worlds import small_errors
 
 
@@ -267,8 +267,7 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
 def test_it_is_compared_with_others() -> None:
     recording = simulated()
     for observer in ("toy_counter", COUNTER):
-        result = run(observer, recording)
-        assert not result.failure
+        result = completed(observer, recording)
         counted = np.einsum("knji,knj->kni", result.rotation, result.position)
         assert (counted[1:, :, 0] == np.arange(1, recording.ticks)[:, None]).all()
         leaders = [(setup.targets >= 3).sum() for setup in recording.setups]

@@ -31,6 +31,7 @@ from coopenv.observers import (
 from coopenv.observers.group import ObserverGroup
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.helpers.recordings import completed
 from tests.helpers.recordings import simulated as recording
 from tests.oracles.batch import small_errors
 
@@ -65,7 +66,7 @@ def probe(record_: Recording) -> list[tuple[str, Tick]]:
         pass
 
     assert isinstance(Mine(record_.setups[0]), Observer)
-    assert not run(Mine, record_).failure
+    completed(Mine, record_)
     return Mine.seen
 
 
@@ -117,7 +118,7 @@ def test_no_bearing_need_fit(name: str) -> None:
     made = record(load_scenario("lane:3", {"horizon": 1.0}), 0)
     drawn = np.random.default_rng(0).standard_normal(made.bearings.shape)
     random = np.where(made.visible[..., None], drawn / np.linalg.norm(drawn, axis=-1, keepdims=True), made.bearings)
-    assert not run(name, replace(made, bearings=random)).failure
+    completed(name, replace(made, bearings=random))
 
 
 def test_odometry_without_noise_is_the_true_motion() -> None:
@@ -134,8 +135,7 @@ def test_odometry_without_noise_is_the_true_motion() -> None:
 def test_truth_does_not_leak(name: str) -> None:
     made = recording(horizon=0.2)
     lie = replace(made.truth, rotation=made.truth.rotation[:, ::-1], position=made.truth.position + 100.0)
-    honest, lied = run(name, made), run(name, replace(made, truth=lie))
-    assert not honest.failure
+    honest, lied = completed(name, made), run(name, replace(made, truth=lie))
     assert (honest.position == lied.position).all() and (honest.rotation == lied.rotation).all()
     assert (honest.position_error[1:] != lied.position_error[1:]).all()
 

@@ -37,6 +37,7 @@ from coopenv.observers.planar.model import (
     left_out,
     unsure,
 )
+from tests.observers.test_filters import derivative
 
 DT = 0.05
 COMMANDS = [(0.07, 0.0), (0.08, 0.4), (0.05, 0.4), (0.0, -0.3), (0.067, 0.01), (0.086, -0.398), (0.086, 0.0)] * 3
@@ -95,10 +96,6 @@ def test_gains_of_the_wheels():
     assert IROBOT_CREATE.gain(0.05, 0.005 + 1.2 * 0.05) == pytest.approx((0.88 + 0.84) / 2 + IROBOT_CREATE.slow_gain)
 
 
-def numeric(function, x, step=1e-6):
-    return np.stack([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))], axis=-1)
-
-
 @pytest.mark.parametrize(("second_order", "size"), [(False, 1.0), (True, 1e-8)])  # which counts where P is large
 def test_motion_derivatives_agree_with_differences(second_order, size):
     tuning = replace(CALIBRATING, walk=(0.0,) * 9, turn_noise=(0, 0, 0), path_noise=(0, 0), slide_noise=0, jitter=0)
@@ -113,7 +110,7 @@ def test_motion_derivatives_agree_with_differences(second_order, size):
         own.advance(DT, 0.02, 0.004)
         return own
 
-    f = numeric(lambda s: filtered(s, size * np.eye(STATES)).state, x)
+    f = derivative(lambda e: filtered(x + e, size * np.eye(STATES)).state, STATES)
     f[:3, LEAD] = filtered(x, size * np.eye(STATES)).covariance[:3, LEAD] / size  # smoothed over half a tick: see below
     root = np.diag(np.arange(1.0, STATES + 1))
     np.testing.assert_allclose(filtered(x, size * root).covariance / size, f @ root @ f.T, atol=1e-6)
@@ -134,8 +131,8 @@ def test_bearing_derivatives_agree_with_differences(seen):
         dx, dy = there[:2] - state[[X, Y]]
         return math.atan2(-dy, -dx) - there[2] if seen else math.atan2(dy, dx) - state[HEADING] + state[BIAS]
 
-    h = numeric(bearing, own.state.copy())
     before, P, innovation = own.state.copy(), own.covariance.copy(), 0.02
+    h = derivative(lambda e: bearing(before + e), STATES)
     own.tuning = replace(CALIBRATING, fusion="plain")
     measured = bearing(before) + innovation
     if seen:

@@ -16,6 +16,7 @@ from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Se
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.mrclam_files import barrier_robots, carried_off
+from tests.helpers.recordings import completed
 
 LIMIT_BYTES = 224  # pose and covariance in space
 LANDMARKS = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -146,8 +147,7 @@ def test_robots_in_space_are_refused():
 def test_odometry_that_lies_about_turns(seed, turn_scale):
     """The covariance stays honest and nobody is lost, whatever the wheels make of a command."""
     record = recording_of(barrier_robots(seed, 30.0, turn_scale), "landmarks+robots")
-    result = run(PlanarRobust, record)
-    assert not result.failure
+    result = completed(PlanarRobust, record)
     assert result.position_rmse().max() < 0.3 and result.position_rmse().mean() < 0.15
     assert (result.anees(after=record.dt) < 3).all() and result.anees(after=record.dt).mean() > 0.1
     assert result.position_rmse().mean() < 1.1 * run(PlanarEkf, record).position_rmse().mean()
@@ -217,8 +217,8 @@ def test_a_robot_that_is_unsure_of_its_heading_waits_for_a_bearing(seed, seconds
 
     Nor is it lost by the first bearings.
     """
-    result = run(PlanarRobust, recording_of(barrier_robots(seed, seconds, 0.6), "blind"))
-    assert not result.failure and (result.anees(after=0.05) < 3).all()
+    result = completed(PlanarRobust, recording_of(barrier_robots(seed, seconds, 0.6), "blind"))
+    assert (result.anees(after=0.05) < 3).all()
     assert (result.position_error[result.t > 110.0] < 1.0).all()
 
 
@@ -255,7 +255,6 @@ def _hostile(kind: int) -> Message:
 
 def test_what_is_no_message_ends_no_run_and_changes_nothing():
     record = recording_of(barrier_robots(1, 12.0), "landmarks+robots")
-    babbling, silent = (run(PlanarRobust, record, Babbling(silent)) for silent in (False, True))
-    assert not babbling.failure
+    babbling, silent = (completed(PlanarRobust, record, Babbling(silent)) for silent in (False, True))
     np.testing.assert_array_equal(babbling.position, silent.position)
     np.testing.assert_array_equal(babbling.covariance, silent.covariance)

@@ -14,6 +14,7 @@ from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.env_suite import rest_slow
 from tests.helpers.mrclam_files import barrier_robots
+from tests.helpers.recordings import completed
 
 EXTRA = {
     "seen": np.array([15, 17], np.uint8),
@@ -152,8 +153,7 @@ def nominal():
 @pytest.mark.parametrize(("jump", "drift"), rest_slow([(5.0, 0.0), (0.0, 0.05)], 0))
 def test_a_faulty_sender_at_most_doubles_the_error_of_the_others(nominal, jump, drift):
     record, honest = nominal
-    result = run(PlanarRobust, record, Drifting([0], jump, drift))
-    assert not result.failure
+    result = completed(PlanarRobust, record, Drifting([0], jump, drift))
     assert result.position_rmse()[1:].mean() < 1.5 * honest.position_rmse()[1:].mean()
     assert (result.position_rmse()[1:] < 2.0 * honest.position_rmse()[1:]).all()
     assert (result.anees(after=record.dt)[1:] < 3.0).all()
@@ -163,7 +163,7 @@ def test_robots_without_landmarks_exclude_a_sender_that_two_others_contradict():
     """Robots 4 and 5 see none; of the others the first drifts away by 15 cm/s."""
     Watched.all = []
     record = recording_of(blindfolded(barrier_robots(32, 30.0, 0.8), 4, 5), "landmarks+robots")
-    assert not run(Watched, record, Drifting([0], 0.0, 0.15, since=5.0)).failure
+    completed(Watched, record, Drifting([0], 0.0, 0.15, since=5.0))
     excluded = np.array([[one.excludes(target) for target in range(15, 20)] for one in Watched.all])
     np.testing.assert_array_equal(excluded[1:], np.tile([True, False, False, False, False], (4, 1)))
 
@@ -190,6 +190,5 @@ def test_robots_without_landmarks_follow_the_correct_senders(seed, blind, jump, 
     """Of three senders with landmarks two are correct; without any such sender a jump is detected, and no drift."""
     robots = barrier_robots(seed, 100.0, 0.8)
     record = recording_of(blindfolded(robots, *blind), "landmarks+robots") if blind else recording_of(robots, "blind")
-    honest, result = run(PlanarRobust, record), run(PlanarRobust, record, Drifting([0], jump, drift))
-    assert not result.failure
+    honest, result = completed(PlanarRobust, record), completed(PlanarRobust, record, Drifting([0], jump, drift))
     assert result.position_rmse()[1:].mean() < 2.0 * honest.position_rmse()[1:].mean()

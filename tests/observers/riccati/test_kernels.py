@@ -29,6 +29,7 @@ from tests.helpers.builders import (
     start,
     vehicle,
 )
+from tests.helpers.recordings import completed
 from tests.oracles import continuous
 from tests.oracles.batch import small_errors
 
@@ -233,8 +234,7 @@ def test_it_is_the_embedded_observer_with_camera_and_markers_off_centre() -> Non
     scenario = small_errors({"horizon": 2.0, "noise.bearing.scale": 0.003}, size=0.5)
     R, p, P, nees = embedded(scenario, 5)
     recording = record(scenario, 5)
-    result = run_observer("riccati", recording)
-    assert not result.failure
+    result = completed("riccati", recording)
     assert_allclose(result.rotation[1:], R, atol=1e-9)
     assert_allclose(result.position[1:], (R @ p[..., None])[..., 0], atol=1e-9)
     assert_allclose(result.covariance[1:], P, atol=1e-9)

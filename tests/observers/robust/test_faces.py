@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from coopenv.api.engine import Engine
 from coopenv.bench.observers.convergence import random_start
 from coopenv.estimation.poses import Coordinates
-from coopenv.observers import Recording, run
+from coopenv.observers import Recording
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.constants import MAX_MEMBERS, MEAN_TIME
@@ -24,7 +24,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.env_suite import SHIPPED, rest_slow
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.recordings import replayed
+from tests.helpers.recordings import completed, replayed
 from tests.helpers.robust_ticks import OpenRobust
 from tests.helpers.robust_worlds import crowd, estimates, nees_of, small_errors
 
@@ -52,8 +52,7 @@ RECORDS = {
 @pytest.mark.parametrize("name", rest_slow(RECORDS, 0, 1, 4, 6))
 def test_host_and_world_estimate_the_same(name: str) -> None:
     recording = RECORDS[name]()
-    result, played = run("robust", recording), replayed(recording)
-    assert not result.failure
+    result, played = completed("robust", recording), replayed(recording)
     assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
     assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
 
@@ -130,8 +129,7 @@ def test_those_in_view_are_met_when_others_are_gone():
                     late.append(members >= set(range(gone, leaders)))
             return estimate
 
-    result = run(Watched, record)
-    assert not result.failure
+    result = completed(Watched, record)
     assert all(len(members) == MAX_MEMBERS and leaders - 1 not in members for members in full[2:])
     assert late and all(late)
     assert (result.nis_dof[-30:, leaders] >= 2).all() and result.nis_dof[-30:, leaders].mean() > 3.9

@@ -18,36 +18,30 @@ from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.registry import find
 from coopenv.observers.robust.constants import RISK
 from coopenv.observers.robust.protection import QUANTILE, fault_variances, levels, own_variances
+from tests.helpers.recordings import completed
 from tests.helpers.robust_ticks import OpenRobust
 from tests.helpers.robust_worlds import everybody_sees_everybody, noise_free, small_errors
 from tests.helpers.warp_calls import Calls
 
 
-def all_found(result, position=0.1, orientation=1.0):
-    return (result.position_error[-1] < position).all() and (result.orientation_error[-1] < orientation).all()
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2, "mirrored"])
 def test_any_start_is_left_behind(seed):
     mirrored = seed == "mirrored"
-    result = run(
-        "robust", noise_free(4.0, "busy_intersection_mirror") if mirrored else random_start(noise_free(4.0), seed)
-    )
-    assert not result.failure
-    assert all_found(result, 1e-3, 0.01)
+    start = noise_free(4.0, "busy_intersection_mirror") if mirrored else random_start(noise_free(4.0), seed)
+    result = completed("robust", start)
+    assert (result.position_error[-1] < 1e-3).all() and (result.orientation_error[-1] < 0.01).all()
 
 
 def misled(record):
     """Return whether anybody is farther off in the end, or surer, than it should be."""
-    result = run("robust", record)
-    assert not result.failure
+    result = completed("robust", record)
     return (result.position_error[-1] > [0.2, 0.2, 0.3, 0.6, 0.6]).any() or (result.anees(8.0) > 6.0).any()
 
 
 def test_landmarks_that_are_lost_do_not_mislead():
     """Other faults are those of tests/observers/robust/test_depth.py and test_lies.py."""
-    results = [run("robust", VARIANTS["landmarks_lost"].applied(small_errors(12.0, seed), seed)) for seed in range(2)]
-    assert not any(result.failure for result in results)
+    lost = [VARIANTS["landmarks_lost"].applied(small_errors(12.0, seed), seed) for seed in range(2)]
+    results = [completed("robust", record) for record in lost]
     off, limit = np.array([result.position_error[-1] for result in results]), np.array([0.1, 0.1, 0.15, 0.3, 0.8])
     assert (off.mean(axis=0) < limit).all() and (off < 2.0 * limit).all(), off
     assert all((result.anees(8.0) < 6.0).all() for result in results)
@@ -80,9 +74,8 @@ def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
                 said.append(message.position is not None)
             return message
 
-    result = run(Kidnapped, record)
-    assert not result.failure and not all(said)
-    assert said[-1]
+    result = completed(Kidnapped, record)
+    assert said[-1] and not all(said)
     assert result.position_error[-1, 0] < 0.1
     assert (result.position_error[-1] < 0.6).all()
 
@@ -96,8 +89,7 @@ def test_robots_on_a_plane_are_pointed_to_their_observer():
 
 def test_rumours_that_go_round_do_not_make_anybody_overconfident():
     record = everybody_sees_everybody(8.0)
-    result = run("robust", record)
-    assert not result.failure
+    result = completed("robust", record)
     assert (result.anees(3.0) < 2.0).all()
     assert (result.position_rmse(3.0) < run("mekf_covariance", record).position_rmse(3.0) / 3.0).all()
 
