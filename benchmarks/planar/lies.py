@@ -14,18 +14,13 @@ class Drifting:
 
     def __init__(self, who: Sequence[int], jump: float, drift: float, since: float = 15.0) -> None:
         """Take the lying senders, counted from 0, m, m/s, and from when on, s."""
-        self.who, self.jump, self.drift, self.since, self._now = who, jump, drift, since, 0.0
+        self.who, self.jump, self.drift, self.since = who, jump, drift, since
 
-    def applies(self, vehicle: int, time: float) -> bool:
-        """Return whether a robot lies at a time in s."""
-        self._now = time
-        return vehicle in self.who and time >= self.since
-
-    def broadcast(self, observer: Any, message: Message) -> Message:
+    def __call__(self, vehicle: int, time: float, observer: Any, message: Message) -> Message:
         """Return what is broadcast instead; what it tells of whom it saw agrees with it."""
-        if message.position is None:
+        if vehicle not in self.who or time < self.since or message.position is None:
             return message
-        off = (self.jump + self.drift * (self._now - self.since)) * np.array([0.6, 0.8, 0.0])
+        off = (self.jump + self.drift * (time - self.since)) * np.array([0.6, 0.8, 0.0])
         lie = replace(message, position=message.position + off, covariance=1e-4 * np.eye(3))
         return observer.tampered(lie, message)  # type: ignore[no-any-return]
 
@@ -34,16 +29,13 @@ class Replaying:
     """Some robots broadcast what they sent some messages ago, from 15 s on."""
 
     def __init__(self, who: Sequence[int], messages: int) -> None:
-        self.who, self.messages, self._vehicle = who, messages, 0
+        self.who, self.messages = who, messages
         self._sent: dict[int, list[Message]] = {}
 
-    def applies(self, vehicle: int, time: float) -> bool:
-        """Return whether a robot lies at a time in s."""
-        self._vehicle = vehicle
-        return vehicle in self.who and time >= 15.0
-
-    def broadcast(self, observer: Any, message: Message) -> Message:
+    def __call__(self, vehicle: int, time: float, observer: Any, message: Message) -> Message:
         """Return what is broadcast instead."""
-        sent = self._sent.setdefault(self._vehicle, [])
+        if vehicle not in self.who or time < 15.0:
+            return message
+        sent = self._sent.setdefault(vehicle, [])
         sent.append(message)
         return sent[max(len(sent) - 1 - self.messages, 0)]

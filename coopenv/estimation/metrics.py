@@ -265,26 +265,26 @@ class Interval(NamedTuple):
     high: float
 
 
-def mean_bounds(dof: int, runs: int = 1, level: float = LEVEL) -> Interval:
+def mean_bounds(dof: int, runs: int = 1) -> Interval:
     """Return where the mean over independent runs of a chi-square of `dof` degrees, divided by `dof`, lies.
 
     For ANEES the runs are Monte Carlo runs at one instant: ticks of one run are correlated, so the bounds do not hold
-    for a mean over time. For NIS, which is white over time, a run may be a tick. `level` is the probability of lying
+    for a mean over time. For NIS, which is white over time, a run may be a tick. `LEVEL` is the probability of lying
     inside.
     """
     from scipy.stats import chi2  # here, as loading it takes 0.4 s
 
-    total, tail = dof * runs, (1.0 - level) / 2.0
-    return Interval(float(chi2.ppf(tail, total)) / total, float(chi2.ppf(1.0 - tail, total)) / total)
+    total = dof * runs
+    return Interval(*(float(end) / total for end in chi2.interval(LEVEL, total)))
 
 
-def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> Interval:
+def wilson_interval(successes: int, trials: int) -> Interval:
     """Return the interval of a probability of which `successes` in `trials` were seen; all of [0, 1] without trials."""
     if trials == 0:
         return Interval(0.0, 1.0)
     from scipy.stats import binomtest
 
-    return Interval(*binomtest(successes, trials).proportion_ci(level, "wilson"))
+    return Interval(*binomtest(successes, trials).proportion_ci(LEVEL, "wilson"))
 
 
 def diverged(position_error: Array, orientation_error: Array) -> np.ndarray:

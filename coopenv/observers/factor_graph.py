@@ -47,9 +47,9 @@ class FactorGraph(PoseObserver):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self.lever_arm, self.noise = setup.lever_arm, setup.noise
-        self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
-        self.to_body = adjoint(np.eye(3), setup.lever_arm)
+        self.lever_arm, self.noise = np.asarray(setup.lever_arm, float), setup.noise
+        self.to_camera = adjoint(np.eye(3), -self.lever_arm)
+        self.to_body = adjoint(np.eye(3), self.lever_arm)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""

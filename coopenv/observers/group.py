@@ -4,10 +4,11 @@ A source of ticks drives a group: the runner on a record, the environment on a w
 """
 
 import copy
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from traceback import extract_tb
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,14 +44,8 @@ class TimedEstimate(NamedTuple):
     elapsed: float
 
 
-class Tamper(Protocol):
-    """Changes the broadcasts of some vehicle in tests and attacks."""
-
-    def applies(self, vehicle: int, time: float) -> bool:
-        """Return whether it changes the message of a vehicle at a time, s."""
-
-    def broadcast(self, observer: Observer, message: Message) -> Message:
-        """Return the broadcast in place of a message."""
+Tamper = Callable[[int, float, Observer, Message], Message]
+"""(vehicle, time in s, observer, message): returns the broadcast in place of a message, in tests and attacks."""
 
 
 class ObserverGroup:
@@ -135,8 +130,8 @@ class ObserverGroup:
             shift, turn, std = interference.shift[vehicle], interference.turn[vehicle], interference.std[vehicle]
             message = altered(observer, message, shift, turn, float(std), bool(interference.consistent[vehicle]))
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
-        if tamper is not None and tamper.applies(vehicle, k * self.observer_init.dt):
-            message = tamper.broadcast(observer, message)
+        if tamper is not None:
+            message = tamper(vehicle, k * self.observer_init.dt, observer, message)
         if not self.mail.post(vehicle, k, message, replay, kept) and unchanged:
             check_message(message)
 

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled, eliminated, place, product
-from coopenv.estimation.poses import Array, cholesky, skew
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, adjoint, compiled, eliminated, place, product
+from coopenv.estimation.poses import Array, cholesky
 from coopenv.observers.bearing_measurements import (
     FRAME,
     LEFT,
@@ -67,10 +67,9 @@ class ConsiderFilter(Mekf):
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)
-        self.to_marker = np.eye(6)  # own left error to that of the marker's pose
-        self.to_marker[3:, :3] = -skew(setup.marker)
-        self.from_marker = np.eye(6)
-        self.from_marker[3:, :3] = skew(setup.marker)
+        marker = np.asarray(setup.marker, float)
+        self.to_marker = adjoint(np.eye(3), -marker)  # own left error to that of the marker's pose
+        self.from_marker = adjoint(np.eye(3), marker)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose that is independent of the other vehicles."""

@@ -49,10 +49,6 @@ class Marginal(NamedTuple):
     information: Array  # (6N, 6N)
     mean: Array  # (6N,) error about the poses of the frame
 
-    def moved(self, dx: Array) -> "Marginal":
-        """Return it about poses moved by dx (N, 6)."""
-        return self._replace(mean=self.mean - dx.ravel())
-
 
 class Solution(NamedTuple):
     """Gauss-Newton step over the frames from one on."""
@@ -121,7 +117,7 @@ class FixedLagSmoother(GraphEstimator):
         solution = self.solve(prior)
         block, dx = solution.factor(), solution.dx
         graph.move(prior.frame, dx)
-        prior = prior.moved(dx[0])
+        prior = prior._replace(mean=prior.mean - dx[0].ravel())  # about the moved poses
         if prior.frame == 0:
             self.start = prior
         anchor = max(prior.frame, last - lag)

@@ -151,15 +151,11 @@ class Speaker:
 def test_messages_of_lying_senders():
     honest = Message(position=np.zeros(3), covariance=np.eye(3))
     liar = Drifting([1], jump=1.0, drift=0.5, since=10.0)
-    assert not liar.applies(0, 20.0) and not liar.applies(1, 9.0) and liar.applies(1, 12.0)
-    assert np.linalg.norm(liar.broadcast(Speaker(), honest).position) == pytest.approx(2.0)
-    assert liar.broadcast(Speaker(), Message()).position is None
+    assert liar(0, 20.0, Speaker(), honest) is honest is liar(1, 9.0, Speaker(), honest)
+    assert np.linalg.norm(liar(1, 12.0, Speaker(), honest).position) == pytest.approx(2.0)
+    assert liar(1, 12.0, Speaker(), Message()).position is None
     echo = Replaying([1], 3)
-    sent = [
-        echo.broadcast(Speaker(), replace(honest, position=np.full(3, k))).position[0]
-        for k in range(6)
-        if echo.applies(1, 20)
-    ]
+    sent = [echo(1, 20.0, Speaker(), replace(honest, position=np.full(3, k))).position[0] for k in range(6)]
     assert sent == [0, 0, 0, 0, 1, 2]
 
 

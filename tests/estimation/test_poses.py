@@ -26,6 +26,7 @@ from coopenv.estimation.poses import (
     solve,
 )
 from tests.helpers.warp_calls import DTYPES, EPSILON, Calls
+from tests.oracles.continuous import skew
 
 ANGLES = np.concatenate(
     [
@@ -146,10 +147,8 @@ def test_orthonormalise_removes_the_first_order() -> None:
 
 
 def hat(xi: np.ndarray) -> np.ndarray:
-    x, y, z = xi[:3]
     T = np.zeros((4, 4))
-    T[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    T[:3, 3] = xi[3:]
+    T[:3, :3], T[:3, 3] = skew(xi[:3]), xi[3:]
     return T
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from coopenv.backends.replay import Replay
-from coopenv.observers import Recording, Run, run
+from coopenv.observers import Message, Recording, Run, run
 from coopenv.observers.contract import Factory
 from coopenv.observers.group import Tamper
 from coopenv.runs.recorder import record
@@ -30,6 +32,16 @@ def completed(observer: str | Factory, recording: Recording, tamper: Tamper | No
     result = run(observer, recording, tamper)
     assert not result.failure
     return result
+
+
+class Tampering:
+    """Changes what a vehicle broadcasts, by functions of its messages in turn."""
+
+    def __init__(self, *changes: Callable[[Message], Any], vehicle: int = 1) -> None:
+        self.turn, self.vehicle = cycle(changes), vehicle
+
+    def __call__(self, vehicle: int, time: float, observer: Any, message: Message) -> Any:
+        return next(self.turn)(message) if vehicle == self.vehicle else message
 
 
 def differences(a: Any, b: Any, where: str = "") -> list[str]:

@@ -116,10 +116,9 @@ class Lies:
     start: float = 0.0  # s
     end: float = np.inf
 
-    def applies(self, vehicle: int, time: float) -> bool:
-        return vehicle == self.sender and self.start <= time < self.end
-
-    def broadcast(self, observer: Any, message: Message) -> Message:
+    def __call__(self, vehicle: int, time: float, observer: Any, message: Message) -> Message:
+        if vehicle != self.sender or not self.start <= time < self.end:
+            return message
         if message.position is None or message.rotation is None:
             return message
         R, p = from_six(np.asarray(message.extra["odometry"], float))

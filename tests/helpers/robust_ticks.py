@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Message, Received, Setup, Tick
 from coopenv.observers.contract import Gains, SensorNoise
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.robust.memory import SOURCES
 from coopenv.observers.robust.observer import ROBUST
 
 
@@ -40,16 +39,6 @@ class OpenRobust(KernelObserver):
         """(6n, 6n) joint covariance of n members."""
         n = len(self.members)
         return self.memory.P[:n, :n].swapaxes(1, 2).reshape(6 * n, 6 * n)
-
-    def slot(self, target: int) -> int:
-        """Return the slot of the monitor of a target, -1 if it has none."""
-        return next((q for q in range(1, SOURCES) if self.memory.source["target"][q] == target), -1)
-
-    @property
-    def excluded(self) -> set[int]:
-        """Which targets are excluded."""
-        source = self.memory.source
-        return set(source["target"][source["excluded"] == 1].tolist())
 
 
 Pose = tuple[np.ndarray, np.ndarray]

@@ -162,14 +162,15 @@ def left_covariance(result: Run, vehicle: int) -> np.ndarray:
     return G @ P @ G.T
 
 
-def assert_most_probable(name: str, vehicles: Sequence[int]) -> None:
-    R, p, covariance = small_solution(4, tuple(vehicles))
-    result = completed(name, small_record())
+def assert_most_probable(name: str, vehicles: Sequence[int], ticks: int = 4) -> None:
+    made = small_record(ticks)
+    R, p, covariance = small_solution(ticks, tuple(vehicles))
+    result = completed(name, made)
     for i in vehicles:
         std = np.sqrt(np.diag(covariance[i]))
         e = Coordinates.LEFT.error(R[i], p[i], result.rotation[-1, i], result.position[-1, i])
         assert np.abs(e / std).max() < 0.01
-        start = Coordinates.LEFT.error(R[i], p[i], small_record().start_rotation[i], small_record().start_position[i])
+        start = Coordinates.LEFT.error(R[i], p[i], made.start_rotation[i], made.start_position[i])
         assert np.abs(start / std).max() > 0.1  # the measurements did something
         assert_same_covariance(left_covariance(result, i), covariance[i])
 

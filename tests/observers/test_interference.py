@@ -22,8 +22,9 @@ from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.world import World
-from tests.helpers.builders import simulate
-from tests.helpers.recordings import completed
+from tests.helpers.builders import estimated_position, start
+from tests.helpers.builders import run as over_ticks
+from tests.helpers.recordings import Tampering, completed
 
 OTHER = "vehicles.vehicle_2.faults"
 FAULTS: dict[str, dict[str, Any]] = {
@@ -54,20 +55,13 @@ def recorded(name: str, seed: int = 3) -> Recording:
 
 def in_kernels(made: Scenario, seed: int) -> np.ndarray:
     """Return (K, N, 3) the positions that the world's own observers estimate, m."""
-    world = simulate(made, 1)
-    world.reset([world_keys(seed)[0]])
-    world.mask.zero_()
-    return positions(world, made.horizon_ticks)
+    return positions(start(made, [world_keys(seed)[0]]), made.horizon_ticks)
 
 
 def positions(world: World, ticks: int) -> np.ndarray:
     """Return (K, N, 3) the estimated positions over some ticks, m."""
-    found = []
-    for _ in range(ticks):
-        world.advance(1)
-        R, p = world.view("estimate_rotation")[0], world.view("estimate_position")[0]
-        found.append(np.einsum("nij,nj->ni", R, p))
-    return np.array(found)
+    states = over_ticks(world, ticks, "estimate_rotation", "estimate_position")
+    return np.array([estimated_position(state)[0] for state in states[1:]])
 
 
 @pytest.mark.parametrize(
@@ -152,20 +146,6 @@ def test_clocks_shift_ages() -> None:
         assert age == pytest.approx(max(0.0, -ahead / 60), abs=1e-9) and time > 0.4
 
 
-class Throws:
-    """Lets a vehicle broadcast what somebody draws."""
-
-    def __init__(self, *messages: Any) -> None:
-        self.messages, self.count = messages, 0
-
-    def applies(self, vehicle: int, time: float) -> bool:
-        return vehicle == 1
-
-    def broadcast(self, observer: Any, message: Message) -> Any:
-        self.count += 1
-        return self.messages[self.count % len(self.messages)](message)
-
-
 def with_(**fields: Any) -> Any:
     return lambda message: replace(message, **fields)
 
@@ -189,7 +169,7 @@ HOSTILE = {
 def test_what_is_no_message_is_refused_and_counted(name: str) -> None:
     """It is as if it had been lost: followers go on with the last one that was sound."""
     made = recorded("none")
-    found = listen(made, Throws(HOSTILE[name]))
+    found = listen(made, Tampering(HOSTILE[name]))
     assert not found.failure and np.isfinite(found.position).all()
     followers = [i for i, setup in enumerate(made.setups) if 4 in setup.targets]
     assert (found.refused[followers] == made.ticks - 1).all()
@@ -197,7 +177,7 @@ def test_what_is_no_message_is_refused_and_counted(name: str) -> None:
 
 
 def test_the_last_sound_message_stays_heard() -> None:
-    listen(recorded("none"), Throws(lambda message: message, HOSTILE["NaN"]))
+    listen(recorded("none"), Tampering(HOSTILE["NaN"], lambda message: message))
     ages = [age for _, _, age in Listens.heard]
     assert {round(60 * age) for age in ages[4:]} == {0, 1}
     assert len(ages) == recorded("none").ticks - 2  # the first one after the start was none
@@ -256,7 +236,7 @@ def altered(drawn: dict[str, Any]) -> Any:
 @settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=st.lists(messages, min_size=20, max_size=20))
 def test_no_message_ends_a_run(observer: str, drawn: list[dict[str, Any]]) -> None:
-    found = completed(observer, recorded("none"), Throws(*map(altered, drawn)))
+    found = completed(observer, recorded("none"), Tampering(*map(altered, drawn)))
     assert np.isfinite(found.position).all()
 
 

@@ -17,7 +17,7 @@ from coopenv.observers.schmidt_kalman import Pairwise, SchmidtKalman
 from coopenv.observers.schmidt_kalman import considered as update
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.helpers.recordings import completed
+from tests.helpers.recordings import Tampering, completed
 from tests.observers.test_filters import derivative, pose, spd
 from tests.oracles.batch import assert_same_covariance, small_record
 
@@ -108,15 +108,9 @@ MISSHAPEN = {
 @pytest.mark.parametrize("part", MISSHAPEN)
 @pytest.mark.parametrize("name", FILTERS)
 def test_extras_of_another_shape_end_no_run(name: str, part: str) -> None:
-    class Misshapen:
-        def applies(self, vehicle: int, time: float) -> bool:
-            return vehicle == 1
-
-        def broadcast(self, observer: object, message: Message) -> Message:
-            return replace(message, extra={**message.extra, part: MISSHAPEN[part]})
-
     made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), 0)
-    found = completed(name, made, Misshapen())
+    misshapen = Tampering(lambda message: replace(message, extra={**message.extra, part: MISSHAPEN[part]}))
+    found = completed(name, made, misshapen)
     assert np.isfinite(found.position).all()
 
 

@@ -157,17 +157,7 @@ def unobservable_dimension(kind: type[Centralised], made: Recording) -> int:
     class Watched(kind):  # type: ignore[misc, valid-type]
         def predict(self, ticks: list[Tick]) -> None:
             nonlocal whole
-            P, self.P = self.P, np.zeros_like(self.P)
-            poses, first = self.poses, getattr(self, "first", None)
-            columns = []
-            for axis in range(len(P)):  # F column by column, from F D F^T - Q of rank-one D, with the noise left out
-                self.poses, self.first = poses, first
-                self.P = np.zeros_like(P)
-                self.P[axis, axis] = 1.0
-                super().predict([replace(t, noise=replace(t.noise, velocity=0.0, angular_velocity=0.0)) for t in ticks])
-                columns.append(self.P[:, axis] / np.sqrt(self.P[axis, axis]))
-            whole = np.stack(columns, axis=1) @ whole
-            self.poses, self.first, self.P = poses, first, P
+            whole = self.transition(ticks) @ whole
             super().predict(ticks)
 
         def correct(self, ticks: list[Tick], seen: dict[int, np.ndarray]) -> None:
@@ -180,7 +170,6 @@ def unobservable_dimension(kind: type[Centralised], made: Recording) -> int:
             self.used.append(linear.H.reshape(-1, linear.H.shape[-1]))
             return linear
 
-    Watched.joint = True
     completed(Watched, made)
     values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
     return int((values < 1e-7 * values[0]).sum())

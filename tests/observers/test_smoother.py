@@ -16,7 +16,8 @@ from coopenv.observers.smoother import FixedLagSmoother, Smoother
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.helpers.recordings import completed
-from tests.oracles.batch import assert_same_covariance, small_record, small_solution
+from tests.observers.test_filters import assert_most_probable
+from tests.oracles.batch import assert_same_covariance, small_record
 
 
 @pytest.mark.parametrize("name", ["smoother", "fixed_lag_smoother"])
@@ -27,14 +28,7 @@ def test_with_small_errors_it_is_the_dense_least_squares(
     """With a lag of one frame all older frames are marginalised, which costs nothing in a linear problem."""
     monkeypatch.setattr(smoother, "LAG", lag)
     monkeypatch.setattr(smoother, "STEP_PERIOD", 1e-3)
-    made = small_record(5)
-    R, p, covariance = small_solution(5)
-    result = completed(name, made)
-    for i in range(5):
-        std = np.sqrt(np.diag(covariance[i]))
-        e = Coordinates.LEFT.error(R[i], p[i], result.rotation[-1, i], result.position[-1, i])
-        assert np.abs(e / std).max() < 0.01
-        assert_same_covariance(result.covariance[-1, i], covariance[i])
+    assert_most_probable(name, range(5), 5)
 
 
 def test_in_a_lane_it_is_at_least_as_good_as_every_filter() -> None:

@@ -100,13 +100,6 @@ class Scenario:
         """Return the landmarks' positions (L, 3) at time t."""
         return self.landmarks + self.landmark_velocity * t
 
-    def bearings(self, t: float, i: int) -> Array:
-        """Return the body-frame unit vectors from the camera of vehicle i to its neighbours at time t."""
-        R, position = self.pose(t)
-        targets = np.concatenate([self.landmark_positions(t), position])[list(self.neighbours[i])]
-        d = (targets - position[i]) @ R[i] - self.lever_arm[i]
-        return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
 
 def busy_intersection(mirror: bool = False) -> Scenario:
     """Return the paper's five-vehicle simulation; `mirror` takes the initial rotation the other way round."""

@@ -9,6 +9,7 @@ from coopenv.estimation.linalg import (
     block3,
     cholesky6,
     exp_so3,
+    join6,
     orthonormalise,
     quaternion_vector,
     rodrigues,
@@ -18,7 +19,7 @@ from coopenv.estimation.linalg import (
     turn_by,
 )
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.memory import Pose, PoseEstimate, mat66d, vec2d, vec6d
+from coopenv.observers.robust.memory import Pose, PoseEstimate, mat33d, vec2d, vec6d
 from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = constants.KNOWN_ANGLE**2
@@ -75,9 +76,8 @@ def recentring(error: Any):
     square = wp.dot(w, w)
     a, b, c = rodrigues(square)
     S = skew(w)
-    zero = wp.matrix(dtype=wp.float64, shape=(3, 3))
     right = wp.identity(3, wp.float64) - b * S + c * (S * S)
-    return lower_blocks(right, zero, wp.transpose(turn_by(w, square, a, b)))
+    return join6(right, mat33d(), mat33d(), wp.transpose(turn_by(w, square, a, b)))
 
 
 @wp.func
@@ -147,16 +147,6 @@ def between(before: Pose, after: Pose):
     """Return the increment from one pose to another."""
     Rt = wp.transpose(before.R)
     return Pose(Rt * after.R, Rt * (after.p - before.p))
-
-
-@wp.func
-def lower_blocks(A: Any, C: Any, D: Any):
-    """Return the 6x6 matrix [[A, 0], [C, D]]."""
-    M = mat66d()
-    M[:3, :3] = A
-    M[3:, :3] = C
-    M[3:, 3:] = D
-    return M
 
 
 @wp.func
@@ -258,7 +248,7 @@ def is_regular(M: Any, inverse: Any, most: Any):
 def inverse_factor(A: Any):
     """Return the inverse of the Cholesky factor of a positive definite 6x6 matrix; NaN if it is not."""
     _, L21, _, I11, I22 = cholesky6(block3(A, 0, 0), block3(A, 0, 3), block3(A, 3, 3))
-    return lower_blocks(I11, -(I22 * L21 * I11), I22)
+    return join6(I11, mat33d(), -(I22 * L21 * I11), I22)
 
 
 @wp.func

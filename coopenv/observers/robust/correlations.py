@@ -17,10 +17,20 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, sheared, skew, symmetric_part
+from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, exp_so3, join6, sheared, skew, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Correlation, Pose, SenderReport, fill, fill_rows, mat66d, mat66f, vec3d
-from coopenv.observers.robust.messages import dependents, depends_on_own, marker_jacobian, own_report
+from coopenv.observers.robust.memory import (
+    Correlation,
+    Pose,
+    SenderReport,
+    fill,
+    fill_rows,
+    mat33d,
+    mat66d,
+    mat66f,
+    vec3d,
+)
+from coopenv.observers.robust.messages import dependents, depends_on_own, own_report
 from coopenv.observers.robust.sources import is_excluded
 from coopenv.world.nearby import agent_of, box_of, box_of_entry, entry_at, entry_count, is_target
 from coopenv.world.v2x import content_tick
@@ -35,7 +45,7 @@ CORRELATION_BYTES = wp.constant(42)
 def factor(P: Any):
     """Return the Cholesky factor of a 6x6 matrix."""
     L11, L21, L22, _, _ = cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
-    return algebra.lower_blocks(L11, L21, L22)
+    return join6(L11, mat33d(), L21, L22)
 
 
 @device_function
@@ -69,7 +79,8 @@ def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):
         P = sheared(P, -skew(marker))
-        C = marker_jacobian(marker) * C
+        one = wp.identity(3, wp.float64)
+        C = join6(one, mat33d(), -skew(marker), one) * C
     X = algebra.inverse_factor(P) * C * wp.transpose(algebra.inverse_factor(memory.P[world, i, n, n]))
     steps = wp.float64(constants.STEPS)
     for k in range(6):

@@ -40,13 +40,6 @@ def includes(mask: wp.uint64, vehicle: int) -> bool:
     return (mask & bit_of(vehicle)) != wp.uint64(0)
 
 
-@wp.func
-def marker_jacobian(marker: Any):
-    """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
-    one = wp.identity(3, wp.float64)
-    return algebra.lower_blocks(one, -skew(marker), one)
-
-
 @subroutine
 def own_report(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Return the report that a vehicle broadcasts: empty while its pose is not known.

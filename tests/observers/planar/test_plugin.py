@@ -16,7 +16,7 @@ from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Se
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.mrclam_files import barrier_robots, carried_off
-from tests.helpers.recordings import completed
+from tests.helpers.recordings import Tampering, completed
 
 LIMIT_BYTES = 224  # pose and covariance in space
 LANDMARKS = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
@@ -222,21 +222,8 @@ def test_a_robot_that_is_unsure_of_its_heading_waits_for_a_bearing(seed, seconds
     assert (result.position_error[result.t > 110.0] < 1.0).all()
 
 
-class Babbling:
-    """The first robot broadcasts one of many things that are no message, or nothing."""
-
-    def __init__(self, silent: bool) -> None:
-        self.silent, self.count = silent, 0
-
-    def applies(self, vehicle, time):
-        return vehicle == 0
-
-    def broadcast(self, observer, message):
-        self.count += 1
-        return Message() if self.silent else _hostile(self.count % 9)
-
-
-def _hostile(kind: int) -> Message:
+def hostile() -> tuple[Message, ...]:
+    """Return things that are no message."""
     p, P, nan = np.zeros(3), np.eye(3), np.nan
     told = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1], np.float32)
     extra = {"seen": np.arange(15, 20, dtype=np.uint8), "bearing": np.zeros(5, np.float32), "from": told}
@@ -250,11 +237,14 @@ def _hostile(kind: int) -> Message:
         Message(position=p, covariance=nan * P, extra={**extra, "bearing": np.full(5, np.inf, np.float32)}),
         Message(position=p[:2], covariance=P, extra={**extra, "from": told[:4]}),
         Message(position=p, covariance=P[0], extra={**extra, "bearing": np.zeros(2, np.float32)}),
-    )[kind]
+    )
 
 
 def test_what_is_no_message_ends_no_run_and_changes_nothing():
     record = recording_of(barrier_robots(1, 12.0), "landmarks+robots")
-    babbling, silent = (completed(PlanarRobust, record, Babbling(silent)) for silent in (False, True))
+    babbling, silent = (
+        completed(PlanarRobust, record, Tampering(*[lambda _, m=m: m for m in sent], vehicle=0))
+        for sent in (hostile(), [Message()])
+    )
     np.testing.assert_array_equal(babbling.position, silent.position)
     np.testing.assert_array_equal(babbling.covariance, silent.covariance)

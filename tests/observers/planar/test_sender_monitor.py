@@ -8,6 +8,7 @@ import pytest
 from benchmarks.planar.changes import blindfolded
 from benchmarks.planar.lies import Drifting
 from coopenv.backends.mrclam import recording_of
+from coopenv.observers.contract import Setup
 from coopenv.observers.planar.fusion import ENOUGH, LEAST_STD, MOST_SEEN, RobotMonitor, sightings_of
 from coopenv.observers.planar.model import PlanarPose, misfit
 from coopenv.observers.planar.plugin import PlanarRobust
@@ -161,24 +162,16 @@ def test_a_faulty_sender_at_most_doubles_the_error_of_the_others(nominal, jump, 
 
 def test_robots_without_landmarks_exclude_a_sender_that_two_others_contradict():
     """Robots 4 and 5 see none; of the others the first drifts away by 15 cm/s."""
-    Watched.all = []
+    built: list[PlanarRobust] = []
     record = recording_of(blindfolded(barrier_robots(32, 30.0, 0.8), 4, 5), "landmarks+robots")
-    completed(Watched, record, Drifting([0], 0.0, 0.15, since=5.0))
-    excluded = np.array([[one.excludes(target) for target in range(15, 20)] for one in Watched.all])
+
+    def kept(setup: Setup) -> PlanarRobust:
+        built.append(PlanarRobust(setup))
+        return built[-1]
+
+    completed(kept, record, Drifting([0], 0.0, 0.15, since=5.0))
+    excluded = np.array([[one._monitors.of(target).excluded for target in range(15, 20)] for one in built])
     np.testing.assert_array_equal(excluded[1:], np.tile([True, False, False, False, False], (4, 1)))
-
-
-class Watched(PlanarRobust):
-    """Shows which senders it excludes."""
-
-    all: list[Watched]
-
-    def __init__(self, setup):
-        super().__init__(setup)
-        Watched.all.append(self)
-
-    def excludes(self, target: int) -> bool:
-        return self._monitors.of(target).excluded
 
 
 @pytest.mark.slow

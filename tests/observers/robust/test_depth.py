@@ -255,26 +255,20 @@ def draw(number: int) -> Drawn:
 
 def built(drawn: Drawn) -> Scenario:
     """Return the scenario of a drawn scene."""
-    made = load_scenario(drawn.name, {"observer.name": "robust", "horizon": 41.0, **drawn.overrides})
+    raw = load_scenario(drawn.name, {"observer.name": "robust", "horizon": 41.0, **drawn.overrides}).model_dump()
 
     def longer(values: Any) -> tuple[float, ...]:
         return tuple(drawn.scale * value for value in values)
 
-    landmarks = [mark.model_copy(update={"position": longer(mark.position)}) for mark in made.landmarks]
-    vehicles = []
-    for vehicle in made.vehicles:
-        motion = vehicle.motion.model_dump()
-        for part in (motion, *motion.get("segments", ())):
+    for mark in raw["landmarks"]:
+        mark["position"] = longer(mark["position"])
+    for vehicle in raw["vehicles"]:
+        for part in (vehicle["motion"], *vehicle["motion"].get("segments", ())):
             if "linear" in part:
                 part["linear"] = longer(part["linear"])
-        start = {"orientation_angle": drawn.turn, "position_radius": drawn.offset}
-        changed = {
-            "motion": type(vehicle.motion).model_validate(motion),
-            "initial_pose": vehicle.initial_pose.model_copy(update={"position": longer(vehicle.initial_pose.position)}),
-            "initial_estimate": vehicle.initial_estimate.model_copy(update=start),
-        }
-        vehicles.append(vehicle.model_copy(update=changed))
-    return made.model_copy(update={"landmarks": tuple(landmarks), "vehicles": tuple(vehicles)})
+        vehicle["initial_pose"]["position"] = longer(vehicle["initial_pose"]["position"])
+        vehicle["initial_estimate"] |= {"orientation_angle": drawn.turn, "position_radius": drawn.offset}
+    return Scenario(**raw)
 
 
 def consistency(drawn: Drawn) -> np.ndarray:

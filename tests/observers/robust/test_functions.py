@@ -29,6 +29,7 @@ from tests.helpers.robust_ticks import (
     tick,
 )
 from tests.helpers.warp_calls import Calls
+from tests.oracles.continuous import skew
 
 
 @wp.func
@@ -143,22 +144,18 @@ TICKS = 90
 V, W = np.array([2.0, 0.3, -0.1]), np.array([0.2, -0.1, 1.2])
 
 
-def cross(w: np.ndarray) -> np.ndarray:
-    return np.cross(np.eye(3), w)
-
-
 def rate() -> np.ndarray:
     """Return the derivative of left errors (theta, rho) by themselves at a constant twist."""
     A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = -cross(W)
-    A[3:, :3] = -cross(V)
+    A[:3, :3] = A[3:, 3:] = -skew(W)
+    A[3:, :3] = -skew(V)
     return A
 
 
 def step(dt: float) -> Pose:
     """Return the increment of a constant twist, as the exponential of a 4x4 matrix."""
     twist = np.zeros((4, 4))
-    twist[:3, :3], twist[:3, 3] = cross(W), V
+    twist[:3, :3], twist[:3, 3] = skew(W), V
     T = expm(dt * twist)
     return T[:3, :3], T[:3, 3]
 
