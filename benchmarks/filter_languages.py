@@ -7,6 +7,7 @@ import sys
 import time
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.estimation.poses import Array, exp_so3, lengths, orthonormalise, right_jacobian, skew, solve
 from coopenv.observers import bearing_measurements
@@ -43,8 +44,8 @@ def across(u: Array) -> Array:
 
 def linearise(
     R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
-) -> tuple[Array, Array, Array, Array]:
-    """Return residuals, H, N and G of a left error, as `bearing_measurements.linearise` does."""
+) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Return what `bearing_measurements.linearise` does of a left error."""
     a = (positions - p).dot(R)
     d = a - lever_arm
     distance = np.maximum(lengths(d), 1e-9)[:, None]
@@ -52,12 +53,13 @@ def linearise(
     J = B / distance[..., None]
     G = J.dot(R.T)
     H = np.concatenate([J @ skew(a), -J], axis=-1)
-    return (B @ bearings[..., None])[..., 0], H, G @ C @ G.transpose(0, 2, 1) + variance * np.eye(2), G
+    N = G @ C @ G.transpose(0, 2, 1) + variance * np.eye(2)
+    return (B @ bearings[..., None])[..., 0], H, N, G, (d * bearings).sum(axis=1) > 0.0
 
 
 def stacked(R: Array, p: Array, frame: Frame) -> Stacked:
     """Return residual (2m,), H (2m, 6) and N (2m, 2m) at a pose."""
-    residual, H, N, _ = linearise(R, p, False, *frame)
+    residual, H, N, *_ = linearise(R, p, False, *frame)
     m, dense = np.arange(len(N)), np.zeros((len(N), 2, len(N), 2))
     dense[m, :, m, :] = N
     return residual.ravel(), H.reshape(-1, 6), dense.reshape(2 * len(N), -1)

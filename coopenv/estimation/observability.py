@@ -362,18 +362,18 @@ def convergence_rates(
     return ConvergenceRates(scene.t, guaranteed, np.maximum(frozen, 0.0))
 
 
-def least_mean(t: Array, rates: Array, window: float = WINDOW) -> tuple[float, float]:
-    """Return the least mean of rates (K,) over any window, and when that begins, s; NaN of a shorter record."""
+def least_mean(t: Array, rates: Array) -> tuple[float, float]:
+    """Return the least mean of rates (K,) over any `WINDOW`, and when that begins, s; NaN of a shorter record."""
     total = np.concatenate([[0.0], np.cumsum(np.diff(t) * (rates[1:] + rates[:-1]) / 2)])
-    start = np.flatnonzero(t <= t[-1] - window + 1e-9)
+    start = np.flatnonzero(t <= t[-1] - WINDOW + 1e-9)
     if not len(start):
         return float("nan"), float("nan")
-    end = np.minimum(np.searchsorted(t, t[start] + window - 1e-9), len(t) - 1)
+    end = np.minimum(np.searchsorted(t, t[start] + WINDOW - 1e-9), len(t) - 1)
     mean = (total[end] - total[start]) / (t[end] - t[start])
     return float(mean.min()), float(t[start[np.argmin(mean)]])
 
 
-def slowest_decay(t: Array, error: Array, window: float = WINDOW) -> tuple[float, float]:
+def slowest_decay(t: Array, error: Array) -> tuple[float, float]:
     """Return the least rate, 1/s, at which an error (K,) fell over windows one after the other, and when that began, s.
 
     The rate of a window is the least-squares slope of -log(error), negative where the error grew. Windows count until
@@ -384,7 +384,7 @@ def slowest_decay(t: Array, error: Array, window: float = WINDOW) -> tuple[float
     low = np.flatnonzero(~(error > max(3.0 * floor, np.finfo(float).tiny)))
     end = float(t[low[0]]) if len(low) else float(t[-1])
     found = []
-    for start in np.arange(float(t[0]), end - window + 1e-9, window):
-        within = (t >= start - 1e-9) & (t <= start + window + 1e-9)
+    for start in np.arange(float(t[0]), end - WINDOW + 1e-9, WINDOW):
+        within = (t >= start - 1e-9) & (t <= start + WINDOW + 1e-9)
         found.append((-float(np.polyfit(t[within], np.log(error[within]), 1)[0]), float(start)))
     return min(found, default=(float("nan"), float("nan")))

@@ -167,7 +167,7 @@ class BearingMeasurements(NamedTuple):
 
     def only(self, kept: NDArray[np.bool_] | slice) -> "BearingMeasurements":
         """Return the bearings of a mask (m,) or of a range."""
-        return self._make(part[kept] for part in self)
+        return BearingMeasurements._make(part[kept] for part in self)
 
 
 class LinearisedBearings(NamedTuple):
@@ -181,7 +181,7 @@ class LinearisedBearings(NamedTuple):
 
     def only(self, kept: NDArray[np.bool_]) -> "LinearisedBearings":
         """Return the bearings of a mask (m,)."""
-        return self._make(part[kept] for part in self)
+        return LinearisedBearings._make(part[kept] for part in self)
 
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""

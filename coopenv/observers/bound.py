@@ -177,22 +177,18 @@ def steps(recording: Recording, ticks: range, states: list[int] = POSE) -> Array
 
 
 def information(
-    recording: Recording,
-    joint: bool = True,
-    observers: ArrayLike | None = None,
-    ticks: range | None = None,
-    states: list[int] = POSE,
+    recording: Recording, joint: bool, observers: ArrayLike, ticks: range, states: list[int] = POSE
 ) -> Array:
-    """Return sum of H^T N^-1 H (k, wN, wN) over the visible edges at each tick, linearised at the truth.
+    """Return sum of H^T N^-1 H (k, wN, wN) over the visible edges at some ticks, linearised at the truth.
 
-    `joint`: a neighbour's pose is unknown, too; `observers`: the vehicles that measure, None: all; `ticks`: at
-    which ones, None: at all; `states`: what is unknown of each vehicle.
+    `joint`: a neighbour's pose is unknown, too; `observers`: the vehicles that measure; `states`: what is unknown of
+    each vehicle.
     """
     truth, N, L, w = recording.truth, len(recording.setups), recording.landmarks.shape[1], len(states)
-    at = np.arange(recording.ticks) if ticks is None else np.array(ticks)
+    at = np.array(ticks)
     R, visible, before = truth.rotation[at], recording.visible[at], np.maximum(at - 1, 0)
     M = np.zeros((len(at), w * N, w * N))
-    for i in range(N) if observers is None else np.unique(observers):
+    for i in np.unique(observers):
         setup = recording.setups[i]
         own = slice(w * i, w * i + w)
         Rt = np.swapaxes(R[:, i], -1, -2)

@@ -44,7 +44,7 @@ def test_a_known_motion_adds_up_information() -> None:
         {"horizon": 0.1, "noise.velocity": 0.0, "noise.angular_velocity": 0.0, "noise.bearing.scale": 0.01}
     )
     made = record(scenario, 0)
-    M, F = information(made, joint=True), transitions(made)
+    M, F = information(made, True, range(5), range(made.ticks)), transitions(made)
     J = np.zeros((30, 30))
     for i in range(5):
         J[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.linalg.inv(made.start_covariance[i])
@@ -75,7 +75,7 @@ def test_only_what_was_seen_counts() -> None:
     blind = replace(made, visible=np.zeros_like(made.visible))
     free = cramer_rao(blind)
     noise = made.setups[0].noise.odometry(made.dt)
-    assert_allclose(information(blind), 0.0)
+    assert_allclose(information(blind, True, range(5), range(made.ticks)), 0.0)
     angle = np.trace(free.covariance[-1, 0, :3, :3])
     assert_allclose(angle, np.trace(made.start_covariance[0, :3, :3]) + 30 * noise[:3].sum(), rtol=1e-9)
     assert (cramer_rao(made).position[-1] < free.position[-1]).all()
