@@ -159,26 +159,24 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 
 @device_function
-def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
-    """Return the member that has been out of view for longest, 0 if all have been in view within `MAX_UNSEEN_TIME`."""
-    found = int(0)
-    for n in range(memory.belief[world, i].first_sender, memory.belief[world, i].members):
-        unseen = wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period
-        if unseen > wp.float64(MAX_UNSEEN_TIME):
-            if found == 0 or memory.member[world, i, n].seen_tick < memory.member[world, i, found].seen_tick:
-                found = n
-    return found
-
-
-@device_function
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
-    """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
-    if memory.belief[world, i].members - memory.belief[world, i].first_sender < SENDER_SLOTS:
+    """Return whether there is room for one more, after an eviction if there has to be one and may be one.
+
+    Evicted is the member that has been out of view for longest, unless that is within `MAX_UNSEEN_TIME`.
+    """
+    first = memory.belief[world, i].first_sender
+    members = memory.belief[world, i].members
+    if members - first < SENDER_SLOTS:
         return True
-    n = longest_unseen(model, memory, world, i, tick)
-    if n > 0:
-        remove_member(memory, world, i, n)
-    return n > 0
+    longest_unseen = int(first)
+    for n in range(first + 1, members):
+        if memory.member[world, i, n].seen_tick < memory.member[world, i, longest_unseen].seen_tick:
+            longest_unseen = n
+    unseen = wp.float64(tick - memory.member[world, i, longest_unseen].seen_tick) * model.camera_period
+    if unseen <= wp.float64(MAX_UNSEEN_TIME):
+        return False
+    remove_member(memory, world, i, longest_unseen)
+    return True
 
 
 @device_function

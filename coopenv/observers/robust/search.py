@@ -21,6 +21,7 @@ from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import (
     SEARCH,
+    frames_in,
     innovation_squared,
     innovation_with,
     linearise,
@@ -170,25 +171,16 @@ def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
 
 
 @device_function
-def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
-    """Return whether a hypothesis costs less than another one, or as much and is nearer to the prior."""
-    a = memory.hypothesis[world, i, h].cost
-    b = memory.hypothesis[world, i, g].cost
-    if a == b:
-        return memory.hypothesis[world, i, h].prior_distance < memory.hypothesis[world, i, g].prior_distance
-    return a < b
-
-
-@device_function
 def sort_hypotheses(memory: Any, world: int, i: int):
-    """Sort hypotheses by their cost, the least one first."""
+    """Sort hypotheses by their cost, the least one first; of equal ones, that nearest to the prior."""
     count = memory.search[world, i].hypotheses
     for h in range(count):
         for g in range(h + 1, count):
-            if costs_less(memory, world, i, g, h):
-                other = memory.hypothesis[world, i, h]
-                memory.hypothesis[world, i, h] = memory.hypothesis[world, i, g]
-                memory.hypothesis[world, i, g] = other
+            a = memory.hypothesis[world, i, h]
+            b = memory.hypothesis[world, i, g]
+            if b.cost < a.cost or (b.cost == a.cost and b.prior_distance < a.prior_distance):
+                memory.hypothesis[world, i, h] = b
+                memory.hypothesis[world, i, g] = a
 
 
 @device_function
@@ -231,7 +223,7 @@ def expected_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
     if memory.measurement[world, i, n].variance > wp.float64(0.0):
         time = wp.float64(constants.MEAN_TIME)
     noise = memory.measurement[world, i, n].noise
-    persistent = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
+    persistent = (noise - frame.variance) / frames_in(time, frame.period)
     return wp.float64(2.0) * (frame.variance + persistent) / noise
 
 

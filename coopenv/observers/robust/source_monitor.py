@@ -42,14 +42,6 @@ from coopenv.world.warp_internals import device_function, subroutine
 
 
 @device_function
-def share_of(frame: BearingFrame, memory: Any, world: int, i: int, n: int):
-    """Return the share of a bearing's information that counts: errors of messages are the same for `NEWS_TIME`."""
-    if memory.measurement[world, i, n].member == 0:
-        return wp.float64(1.0)
-    return wp.min(frame.period / wp.float64(constants.NEWS_TIME), wp.float64(1.0))
-
-
-@device_function
 def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int):
     """Add a frame to the vector and the information of a source, and correct its sensitivities."""
     first_sender = memory.belief[world, i].first_sender
@@ -71,7 +63,9 @@ def correct_source(frame: BearingFrame, memory: Any, world: int, i: int, q: int)
             if q == CAMERA:
                 M = M + memory.derivative[world, i, n, 2].jacobian[:, :3]
             WM = memory.measurement[world, i, n].weight * M
-            weighted = share_of(frame, memory, world, i, n) * WM
+            weighted = WM
+            if memory.measurement[world, i, n].member > 0:  # errors of messages are the same for that time
+                weighted = wp.min(frame.period / wp.float64(constants.NEWS_TIME), wp.float64(1.0)) * WM
             A = A + wp.transpose(weighted) * M
             memory.effect[world, i, n, q] = M
             memory.weighted_effect[world, i, n, q] = weighted
