@@ -125,7 +125,8 @@ class ObserverGroup:
         if not unchanged:
             check_message(message)
         observer, replay, kept = self.observers[vehicle], 0, 0
-        self.mail.expect_as(vehicle, message)
+        if message.covariance is not None:
+            self.mail.forms[vehicle] = np.shape(message.covariance)
         if interference is not None:
             shift, turn, std = interference.shift[vehicle], interference.turn[vehicle], interference.std[vehicle]
             message = altered(observer, message, shift, turn, float(std), bool(interference.consistent[vehicle]))

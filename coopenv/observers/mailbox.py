@@ -54,11 +54,6 @@ class Mailbox:
         self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in observer_init.setups]
         """Per receiver: the targets that are vehicles."""
 
-    def expect_as(self, vehicle: int, message: Message) -> None:
-        """Let a vehicle expect received covariances of the shape of its own."""
-        if message.covariance is not None:
-            self.forms[vehicle] = np.shape(message.covariance)
-
     def post(self, vehicle: int, k: int, message: Message, replay: int = 0, kept: int = 0) -> bool:
         """Send one message and return whether it is valid; that of the start is received but not counted.
 
