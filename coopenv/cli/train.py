@@ -31,7 +31,7 @@ class TrainOptions:
         int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of worlds, weights and exploration (default: 0).")
     ] = None
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions of vehicles to learn from.")] = None
-    minutes: Annotated[float | None, typer.Option(min=0.0, help="Minutes to learn, instead of --steps.")] = None
+    minutes: Annotated[float | None, typer.Option(min=1e-3, help="Minutes to learn, instead of --steps.")] = None
     overrides: options.Overrides = None
     out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
     resume: Annotated[
@@ -270,7 +270,8 @@ def dataset(given: DatasetOptions) -> None:
         episodes = drive_vehicles(scenario, driver, given.seed, given.worlds, progress.update)
     again = options.command_text("dataset", given, ("identity", "out", "force"))
     facts = {"algorithm_name": own, "description": f"{scenario.title}: {again}"}
-    registered = name if environment in list_envs() and not given.overrides else ""
+    alone = sum(scenario.acting) == 1  # which the registered environment drives
+    registered = name if environment in list_envs() and not given.overrides and alone else ""
     write_dataset(episodes, scenario, registered, place, identity, facts)
     steps = sum(len(episode.actions) for episode in episodes)
     size = f"{len(episodes)} episodes, {steps:,} steps"

@@ -38,7 +38,7 @@ def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarr
         returned = policy(observations)
     try:
         actions = np.asarray(returned, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (RuntimeError, TypeError, ValueError):  # such as of a tensor that requires a gradient
         raise ActionError(f"the policy returned no array of numbers, but {shown(returned)}") from None
     if actions.shape != (len(observations), width):
         raise ActionError(

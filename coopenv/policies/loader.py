@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from collections.abc import Callable, Iterable
 from copy import deepcopy
@@ -154,6 +155,35 @@ def _training_anew(folder: Path, training: Any) -> str:
     return shlex.join([*words, "--out", str(folder), "--force"])
 
 
+class ModelPolicy:
+    """The policy of a model with `predict`; one of Stable-Baselines3 keeps its memory and its `VecNormalize`."""
+
+    def __init__(self, model: Any) -> None:
+        self._predict: Any = model.predict
+        self._remembers = "episode_start" in inspect.signature(model.predict).parameters
+        self._normaliser = getattr(model, "get_vec_normalize_env", lambda: None)()
+        self._state: Any = None
+        self._begins = np.zeros(0, dtype=bool)
+
+    def reset(self, mask: np.ndarray) -> None:
+        """Forget what belongs to the episodes of rows in a mask (rows,)."""
+        same = len(mask) == len(self._begins)
+        self._begins = self._begins | mask if same else np.ones(len(mask), dtype=bool)
+        self._state = self._state if same else None
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Return the most likely actions."""
+        if len(rows) != len(self._begins):
+            self.reset(np.ones(len(rows), dtype=bool))
+        if self._normaliser is not None:
+            rows = self._normaliser.normalize_obs(rows)
+        if not self._remembers:
+            return np.asarray(self._predict(rows, deterministic=True)[0])
+        actions, self._state = self._predict(rows, self._state, self._begins, deterministic=True)
+        self._begins = np.zeros(len(rows), dtype=bool)
+        return np.asarray(actions)
+
+
 def find_agent(name_or_place: str | Path | Callable[..., Any]) -> Agent:
     """Return the driver behind a name of `agents/`, a folder, `file.py:Name` or `package.module:Name`, or such code.
 
@@ -162,11 +192,10 @@ def find_agent(name_or_place: str | Path | Callable[..., Any]) -> Agent:
     Raises:
         CoopenvError: there is none, or its `agent.toml` is not valid.
     """
-    predict = None if isinstance(name_or_place, type) else getattr(name_or_place, "predict", None)
-    if callable(name_or_place) or predict is not None:
+    is_model = not isinstance(name_or_place, type) and hasattr(name_or_place, "predict")
+    if callable(name_or_place) or is_model:
         name = getattr(name_or_place, "__name__", type(name_or_place).__name__)
-        chosen = predict and (lambda rows: predict(rows, deterministic=True)[0])
-        return Agent(name=name, entry=name, code=chosen or name_or_place)
+        return Agent(name=name, entry=name, code=ModelPolicy(name_or_place) if is_model else name_or_place)
     name, names = str(name_or_place), list_agents()
     if name not in names and installation.is_reference(name):
         return Agent(name=name.rpartition(":")[2], entry=installation.absolute_reference(name))

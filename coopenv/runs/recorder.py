@@ -214,7 +214,9 @@ def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
     try:
         parse_dataset_id(identity)
     except (ValueError, TypeError):
-        raise CoopenvError(f"--id {identity}: expected NAMESPACE/NAME-v0, of letters, digits, - and _") from None
+        raise CoopenvError(
+            f"--id {identity}: expected NAMESPACE/NAME-v0, each two or more letters, digits, - and _"
+        ) from None
     own = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
     place = (root or Path(own)) / identity / "data"
     check_new(place, force, place.parent)

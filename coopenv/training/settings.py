@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.backends.sources import open_simulation
-from coopenv.base.errors import CoopenvError, OutputError, check_one_of
+from coopenv.base.errors import CoopenvError, OutputError, check_one_of, listed
 from coopenv.base.files import writing
 from coopenv.base.installation import (
     absolute_reference,
@@ -39,6 +39,7 @@ from coopenv.scenario.scenes import scene_text
 
 SETTINGS_FILE = "train.toml"
 Count = Annotated[int, Field(gt=0, le=2**31)]
+Several = Annotated[int, Field(gt=1, le=2**31)]
 Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
@@ -115,9 +116,9 @@ class EvaluationSettings(Section):
 
     every: Count = 250_000
     """Decisions of vehicles between two evaluations; a checkpoint is written after each."""
-    worlds: Count = 32
+    worlds: Several = 32
     """Held-out worlds of an evaluation during training, one episode each."""
-    final_worlds: Count = 256
+    final_worlds: Several = 256
     """Held-out worlds of the last evaluation, for the results in `agent.toml`."""
 
 
@@ -144,6 +145,10 @@ class Settings(Section):
     def _check_network(self) -> "Settings":
         if self.network and (self.steps != 0 or self.clone is None):
             raise ValueError(f"network: '{self.network}' learns by a clone alone: set clone.agent and steps = 0")
+        if self.steps == 0 and self.clone is None:
+            raise ValueError("steps: 0 is for a clone alone, nothing is learnt without [clone]")
+        if sum(variation.share for variation in self.variations) > 1.0:
+            raise ValueError("variations: their shares add up to more than 1")
         if not self.network and self.clone is not None and self.clone.elsewhere is not None:
             raise ValueError("clone.elsewhere: only with network = 'sets', since observations differ")
         return self
@@ -184,18 +189,31 @@ class TrainingPlan:
             CoopenvError: an override is not possible there, or changes what is observed or what actions mean.
         """
         settings, found = self.settings, list[tuple[Scenario, int]]()
-        layout = observation_layout(open_simulation(self.environment, self.all_overrides))
+        judged = _meaning(open_simulation(self.environment, self.all_overrides))
         randomised = {**self.all_overrides, **settings.randomised}
-        for own in settings.variations:
-            varied = open_simulation(self.environment, {**randomised, **own.scenario})
-            here = observation_layout(varied)
-            if (here, here.actions) != (layout, layout.actions):
-                raise CoopenvError(f"variations: {own.scenario} changes the observation or the action")
-            found.append((varied, max(1, round(own.share * worlds))))
+        plain = open_simulation(self.environment, randomised)
+        varied = [open_simulation(self.environment, {**randomised, **own.scenario}) for own in settings.variations]
+        changes = [("randomised", settings.randomised), *(("variations", own.scenario) for own in settings.variations)]
+        for (name, change), scenario in zip(changes, [plain, *varied], strict=True):
+            here = _meaning(scenario)
+            if differing := [key for key in {**judged, **here} if here.get(key) != judged.get(key)]:
+                raise CoopenvError(f"{name}: {change} changes what entries mean: {listed(differing, 4)}")
+        found = [(s, max(1, round(own.share * worlds))) for s, own in zip(varied, settings.variations, strict=True)]
         left = worlds - sum(count for _, count in found)
         if left > 0 or not found:
-            found.insert(0, (open_simulation(self.environment, randomised), max(1, left)))
+            found.insert(0, (plain, max(1, left)))
         return found
+
+
+def _meaning(scenario: Scenario) -> dict[str, object]:
+    """Return by name what says what the entries of observations and actions mean."""
+    layout = observation_layout(scenario)
+    return {
+        **layout,
+        "actions": layout.actions,
+        **settings_of_meaning(scenario, layout),
+        "who acts": any(scenario.acting),
+    }
 
 
 def read_settings(

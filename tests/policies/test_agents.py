@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -137,6 +138,27 @@ def test_whatever_is_an_agent_drives_a_run() -> None:
     ways = [coopenv.run("facade", policy=policy, steps=5).trajectory.position for policy in names]
     for way in ways[1:]:
         np.testing.assert_array_equal(way, ways[0])
+
+
+def test_models_keep_their_memory_by_episode_and_their_normalisation() -> None:
+    class Counts:
+        """As a recurrent model of Stable-Baselines3: the first entry of an action counts the decisions of a row."""
+
+        def predict(self, rows: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+            state = np.zeros(len(rows)) if state is None else state
+            state = np.where(episode_start, 0.0, state) + 0.1
+            return np.column_stack([state, rows[:, 0]]), state
+
+        def get_vec_normalize_env(self) -> Any:
+            return SimpleNamespace(normalize_obs=lambda rows: rows - 1.0)
+
+    policy = load_agent(Counts(), "facade")
+    rows = np.ones((3, 37))
+    np.testing.assert_allclose(policy(rows), [[0.1, 0.0]] * 3)
+    restart(policy, np.array([False, True, False]))
+    np.testing.assert_allclose(policy(rows)[:, 0], [0.2, 0.1, 0.2])
+    restart(policy, np.ones(2, dtype=bool))
+    np.testing.assert_allclose(policy(rows[:2]), [[0.1, 0.0]] * 2)
 
 
 def test_agents_made_for_an_environment() -> None:

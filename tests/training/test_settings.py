@@ -86,12 +86,19 @@ def test_shares_of_the_worlds_to_learn_in_differ(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("overrides", "error"),
-    [({"observation.map_size": 2}, "changes the observation or the action"), ({"camera.range": -1}, "camera.range")],
+    [
+        ({"observation.map_size": 2}, "changes what entries mean: map_"),
+        ({"observation.planar": False}, "changes what entries mean: goal"),
+        ({"dynamics.max_speed": 3.0}, "changes what entries mean: .*dynamics.max_speed"),
+        ({"rates.decision": 5.0}, "changes what entries mean: rates.decision"),
+        ({"vehicles.0.motion.driver": "peek"}, "changes what entries mean: who acts"),
+        ({"camera.range": -1}, "camera.range"),
+    ],
 )
-def test_a_variation_that_is_not_possible_is_refused(overrides: dict[str, object], error: str) -> None:
-    settings = Settings.model_validate({"variations": ({"share": 0.1, "scenario": overrides},)})
-    with pytest.raises(CoopenvError, match=error):
-        TrainingPlan("facade", settings, 0).scenarios(8)
+def test_worlds_to_learn_in_mean_what_those_to_be_judged_in_mean(overrides: dict[str, object], error: str) -> None:
+    for changed in ({"variations": ({"share": 0.1, "scenario": overrides},)}, {"randomised": overrides}):
+        with pytest.raises(CoopenvError, match=error):
+            TrainingPlan("facade", Settings.model_validate(changed), 0).scenarios(8)
 
 
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
@@ -147,6 +154,9 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("network = 'sets'\nsteps = 9\nclone.agent = 'peek'", r"'sets' learns by a clone alone"),
         ("steps = 0\nclone = { agent = 'peek', elsewhere = ['facade'] }", r"clone\.elsewhere: only with network = 'se"),
         ("network = 'graph'", r"network: .*'sets'"),
+        ("steps = 0", r"steps: 0 is for a clone alone"),
+        ("variations = [{ share = 0.8, scenario = {} }, { share = 0.3, scenario = {} }]", r"add up to more than 1"),
+        ("evaluation.final_worlds = 1", r"evaluation\.final_worlds: .*greater than 1"),
     ],
 )
 def test_mistakes_are_one_line(text: str, message: str, tmp_path: Path) -> None:
