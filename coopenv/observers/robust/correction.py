@@ -53,15 +53,18 @@ def set_projection(memory: Any, world: int, i: int, n: int):
 
 
 @subroutine
-def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: bool, projecting: bool):
+def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, projecting: bool):
     """Find the correction by all bearings that fit, without a change of the covariance.
 
-    A sequential update with the residuals that the earlier bearings leave equals the batch update. With `gating`, the
-    bearings are those that the gate has linearised and projected; bearings to members are gated again sequentially.
-    Rejected bearings correct nothing; for the monitors, their innovation is limited to the gate. Considered members are
-    not corrected.
+    A sequential update with the residuals that the earlier bearings leave equals the batch update. Rejected bearings
+    correct nothing; for the monitors, their innovation is limited to the gate. Considered members are not corrected.
+
+    Returns:
+        The largest NIS of a bearing that fits, given the earlier ones, and the sum of all.
     """
     members = memory.belief[world, i].members
+    most = wp.float64(0.0)
+    total = wp.float64(0.0)
     for k in range(members):
         memory.scratch[world, i, k].correction = vec6d()
     for n in range(bearings):
@@ -69,7 +72,6 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
             if projecting:
                 project(memory, world, i, n)
             set_projection(memory, world, i, n)
-            member = memory.measurement[world, i, n].member
             residual = memory.measurement[world, i, n].residual
             for part in range(DERIVATIVES):
                 k = memory.derivative[world, i, n, part].member
@@ -78,17 +80,39 @@ def correct_by_bearings(memory: Any, world: int, i: int, bearings: int, gating: 
                     residual = residual + memory.derivative[world, i, n, part].jacobian * left
             weighted = memory.measurement[world, i, n].weight * residual
             nis = wp.dot(weighted, residual)
-            if gating and member > 0 and nis > wp.float64(constants.BEARING_GATE):
-                memory.measurement[world, i, n].fits = -1
             if memory.measurement[world, i, n].fits == -1:
                 residual = residual * wp.sqrt(wp.min(wp.float64(constants.BEARING_GATE) / nis, wp.float64(1.0)))
             memory.measurement[world, i, n].innovation = residual
             if memory.measurement[world, i, n].fits == 1:
+                most = wp.max(most, nis)
+                total += nis
                 for k in range(members):
                     correction = memory.scratch[world, i, k].correction + weighted * memory.projection[world, i, n, k]
                     memory.scratch[world, i, k].correction = correction
     for k in range(memory.belief[world, i].first_sender, members):
         memory.scratch[world, i, k].correction = vec6d()
+    return most, total
+
+
+@subroutine
+def gate_jointly(memory: Any, world: int, i: int, bearings: int):
+    """Reject, one by one, the bearing without which the others fit best, until each fits given the earlier ones."""
+    most, total = correct_by_bearings(memory, world, i, bearings, False)
+    while most > wp.float64(constants.BEARING_GATE):
+        least = wp.float64(wp.inf)
+        worst = int(-1)
+        for n in range(bearings):
+            if memory.measurement[world, i, n].fits == 1:
+                memory.measurement[world, i, n].fits = -1
+                most, total = correct_by_bearings(memory, world, i, bearings, True)
+                memory.measurement[world, i, n].fits = 1
+                if total < least:
+                    least = total
+                    worst = n
+        if worst < 0:  # no sum is a number: the estimate is not valid
+            return
+        memory.measurement[world, i, worst].fits = -1
+        most, total = correct_by_bearings(memory, world, i, bearings, True)
 
 
 @subroutine
@@ -150,12 +174,15 @@ def iterated_update(frame: BearingFrame, memory: Any, world: int, i: int):
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, i, k].last_correction = vec6d()
         memory.scratch[world, i, k].pose = memory.member[world, i, k].pose
-    correct_by_bearings(memory, world, i, bearings, memory.belief[world, i].gate_disabled == 0, False)
+    if memory.belief[world, i].gate_disabled == 0:
+        gate_jointly(memory, world, i, bearings)
+    else:
+        correct_by_bearings(memory, world, i, bearings, False)
     share = next_share(memory, world, i, bearings, True)
     step = int(1)
     while share > wp.float64(0.0) and step < constants.MAX_ITERATIONS:
         linearise_again(frame, memory, world, i, share)
-        correct_by_bearings(memory, world, i, bearings, False, True)
+        correct_by_bearings(memory, world, i, bearings, True)
         share = next_share(memory, world, i, bearings, False)
         step += 1
     for k in range(memory.belief[world, i].members):

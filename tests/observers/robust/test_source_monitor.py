@@ -12,6 +12,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from benchmarks.evidence import CHANGES, STEP_AT, changed, road
+from coopenv.api.engine import Engine
+from coopenv.base.errors import world_keys
 from coopenv.observers import Recording
 from coopenv.observers.robust.constants import FAULT_GATE, FOUND_SHARE, MEAN_TIME, MONITOR_TIME, SHORT_TIME
 from coopenv.observers.robust.memory import LANDMARK_SLOTS, SENDER_SLOTS, SOURCES
@@ -168,6 +170,17 @@ def test_the_solution_without_a_landmark_follows_from_that_with_it(seed: int) ->
         off.append([left_error(truth, pose) / std for pose in (with_it.pose(k, 0), moved)])
     rms = np.sqrt(np.mean(np.square(off), axis=(0, 2)))
     assert rms[1] < 0.5 * rms[0], rms
+
+
+@pytest.mark.parametrize("landmark", ["SL1", "SL2", "SL3"])
+def test_a_landmark_that_is_wrong_from_the_start_is_rejected_whichever_comes_first(landmark: str) -> None:
+    """By its start the leader can tell which of three bearings is wrong, though each alone fits."""
+    map_error = {"chance": 1.0, "landmark": landmark, "offset": 3.0}
+    changes = {"observer.name": "robust", "faults.map_error": map_error}
+    engine = Engine(load_scenario("busy_intersection_tracking", changes), 24, "float64")
+    engine.reset(world_keys(5, 24))
+    engine.step(ticks=360)
+    assert np.median(engine.view("position_error")[:, 0]) < 1.0  # 2.4 to 4.5 m with each bearing gated alone
 
 
 @pytest.mark.parametrize(("landmark", "size"), [(4, 0.1), (5, 0.1), (6, 0.3), (8, 0.3)])
