@@ -42,6 +42,7 @@ WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
 
 
+KEPT_FOR = 60.0  # s of learning after which at the latest there is a checkpoint
 FORMAT = 2
 HEADER = "coopenv_checkpoint"
 Arrays = dict[str, np.ndarray]
@@ -170,19 +171,22 @@ def _learn(
     judge: Callable[[list[int]], list[Result]],
     keep: Callable[[], None],
 ) -> None:
-    """Update until the budget is spent; judge and write a checkpoint every so often."""
-    evaluation = trainer.plan.settings.evaluation
+    """Update until the budget is spent; judge every so often. A checkpoint follows, or a minute's updates."""
+    evaluation, kept = trainer.plan.settings.evaluation, trainer.seconds
     if trainer.status.steps == 0:
         keep()
     while trainer.status.share < 1.0:
         before = trainer.status.steps // evaluation.every
         status = trainer.update()
         report.status(status)
-        if status.steps // evaluation.every > before and status.share < 1.0:
+        due = status.steps // evaluation.every > before
+        if due and status.share < 1.0:
             seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
             means = {result.metric: result.mean for result in judge(seeds)}
             trainer.record(means)
             curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
+        if (due or status.seconds - kept > KEPT_FOR) and status.share < 1.0:
+            kept = status.seconds
             keep()
 
 

@@ -115,7 +115,7 @@ class EvaluationSettings(Section):
     """Judging the mean action on held-out maps."""
 
     every: Count = 250_000
-    """Decisions of vehicles between two evaluations; a checkpoint is written after each."""
+    """Decisions of vehicles between two evaluations."""
     worlds: Several = 32
     """Held-out worlds of an evaluation during training, one episode each."""
     final_worlds: Several = 256
