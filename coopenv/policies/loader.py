@@ -229,6 +229,8 @@ def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> N
         raise CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
     if name.endswith(".py"):
         raise CoopenvError(f"{name}: name a class or function in it: {name}:Class")
+    if Path(name).is_dir():
+        raise CoopenvError(f"{name}: there is no {AGENT_FILE} in this folder")
     known = f"{', '.join(names)}; or a folder with agent.toml, or FILE.py:CLASS"
     raise CoopenvError(f"unknown {what} {shown(name)}{suggest(name, names)}; known: {known}")
 

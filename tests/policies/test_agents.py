@@ -186,7 +186,12 @@ def test_what_is_nearly_an_agent_is_told_how_to_become_one(tmp_path: Path) -> No
     (tmp_path / "begun" / "checkpoint.safetensors").write_bytes(b"")
     (tmp_path / "mine.py").write_text("class Mine: ...")
     scenario = coopenv.load_scenario("open_square")
-    for name, message in (("begun", "unfinished training: go on with .* --resume"), ("mine.py", r"mine\.py:Class$")):
+    (tmp_path / "empty").mkdir()
+    for name, message in (
+        ("begun", "unfinished training: go on with .* --resume"),
+        ("mine.py", r"mine\.py:Class$"),
+        ("empty", "there is no agent.toml in this folder"),
+    ):
         with pytest.raises(coopenv.CoopenvError, match=message):
             find_agent(tmp_path / name)
         with pytest.raises(coopenv.CoopenvError, match=message):
