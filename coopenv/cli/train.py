@@ -30,7 +30,9 @@ class TrainOptions:
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of worlds, weights and exploration (default: 0).")
     ] = None
-    steps: Annotated[int | None, typer.Option(min=1, help="Decisions of vehicles to learn from, in whole rollouts.")] = None
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Decisions of vehicles to learn from, in whole rollouts.")
+    ] = None
     minutes: Annotated[float | None, typer.Option(min=1e-3, help="Minutes to learn, instead of --steps.")] = None
     overrides: options.Overrides = None
     out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None
