@@ -214,6 +214,23 @@ def test_addresses_and_localhost_are_served_behind_any_port(hosts: list[str], st
         assert status_of(address, host) == status_of(f"{address}/?initialCameraFov=1", host) == status
 
 
+def test_bytes_that_are_no_request_leave_the_terminal_quiet(
+    address: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    where = urlsplit(address)
+    host = f"Host: {where.netloc}".encode()
+    for request, status in (
+        (b"GET /\xff HTTP/1.1\r\n" + host, b"HTTP/1.1 403"),
+        (b"GET /\xff HTTP/1.1\r\nHost: \xff", b"HTTP/1.1 403"),
+        (b"POST / HTTP/1.1\r\n" + host, b""),
+        (b"\x16\x03\x01", b""),
+    ):
+        with socket.create_connection((where.hostname, where.port), timeout=20) as link:
+            link.sendall(request + b"\r\n\r\n")
+            assert link.recv(4096).startswith(status)
+    assert not caplog.text and capfd.readouterr().err == ""
+
+
 def test_what_viser_starts_unguarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     viser = pytest.importorskip("viser", reason="needs the extra 'view'")
 

@@ -1,6 +1,7 @@
 """`replay.html`, which plays an episode and opens from disk, and the guarded server of viser; extra `view`."""
 
 import errno
+import logging
 import re
 import socket
 from collections.abc import Callable, Iterator, Mapping
@@ -76,7 +77,8 @@ def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, st
             return process_request(connection, replace(request, path=path))
 
         guards.append(guard)
-        return serve(*arguments, process_request=guard, **options)
+        quiet = logging.Logger("view", logging.CRITICAL)  # a client's errors are not the terminal's
+        return serve(*arguments, process_request=guard, **{**options, "logger": quiet})
 
     with _STARTING:
         serve = asyncio_server.serve
@@ -134,7 +136,7 @@ def refusal(path: str, headers: Any, token: str, names: set[str]) -> tuple[str, 
         return "this Origin is not served here", ""
     route, question, query = path.partition("?")
     first, _, rest = route.removeprefix("/").partition("/")
-    if not compare_digest(first.encode(), token.encode()):
+    if not compare_digest(first.encode(errors="replace"), token.encode()):
         return "the address lacks the token that the terminal shows", ""
     return "", f"/{rest}{question}{query}"
 
