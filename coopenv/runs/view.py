@@ -150,10 +150,9 @@ class Viewer:
 
     def _obey(self) -> bool:
         """Carry out the user's requests; return whether there were any. An error is shown in the panel."""
-        any_wish = False
-        while not self._panel.wishes.empty():
-            name, value = self._panel.wishes.get()
-            any_wish = True
+        names = list(self._panel.wishes)
+        for name in names:
+            value = self._panel.wishes.pop(name)
             try:
                 if name.startswith("show "):
                     setattr(self._look, name.removeprefix("show "), value)
@@ -163,7 +162,7 @@ class Viewer:
                 self._panel.set_status(
                     f"That cannot be: {error if isinstance(error, CoopenvError) else error_text(error)}"
                 )
-        return any_wish
+        return bool(names)
 
     def _set_playing(self, playing: bool) -> None:
         self.playing, self._due = playing, monotonic()

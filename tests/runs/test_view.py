@@ -25,6 +25,7 @@ from coopenv.runs.view import Viewer
 from coopenv.viz.scene import Origin
 from coopenv.viz.web.page import free_port, guarded_server
 from tests.helpers.fleet import Fleet
+from tests.helpers.processes import wait_until
 
 pytest.importorskip("viser", reason="needs the extra view")
 
@@ -92,8 +93,7 @@ def turns(count: int) -> Callable[[], bool]:
 
 
 def wish(viewer: Viewer, *wishes: tuple[str, Any]) -> None:
-    for each in wishes:
-        viewer._panel.wishes.put(each)
+    viewer._panel.wishes.update(wishes)
     viewer.run(turns(1))
 
 
@@ -164,6 +164,32 @@ def client(url: str, **more: Any) -> Any:
 
     versions = [f"viser-v{viser.__version__}"]
     return connect(url.replace("http", "ws"), subprotocols=versions, max_size=None, **more)
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    **{"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 50.0)},
+    **{"look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 1.0, 0.0)},
+    **{"fov": 1.0, "near": 0.1, "far": 10.0, "image_height": 10, "image_width": 10},
+}
+
+
+def control(server: Any, label: str) -> tuple[str, Any]:
+    """Return the identifier of a control and the control."""
+    handles = server.gui._gui_input_handle_from_uuid.items()
+    return next((uuid, handle) for uuid, handle in handles if getattr(handle, "label", "") == label)
+
+
+def update(server: Any, label: str, value: Any, name: str = "value") -> dict[str, Any]:
+    """Return a client's message that changes a control."""
+    return {"type": "GuiUpdateMessage", "uuid": control(server, label)[0], "updates": {name: value}}
+
+
+def send(link: Any, *messages: Any) -> None:
+    import msgspec
+
+    for message in messages:
+        link.send(msgspec.msgpack.encode(message))
 
 
 def status_of(url: str, host: str) -> int:
@@ -275,6 +301,19 @@ def test_a_value_that_was_not_offered_is_refused(label: str, value: Any) -> None
         assert (shown.playing, shown._speed, len(reel.frames)) == (False, 1.0, 1)
         wish(shown, ("step", None))
         assert len(reel.frames) == 2
+    reel.close()
+
+
+def test_of_queued_wishes_for_one_thing_the_last_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    reel, asked = reel_of("urban_crossing"), []
+    monkeypatch.setattr(reel, "change", lambda **changes: asked.append(changes))
+    with guarded_server("127.0.0.1") as (server, url), client(url) as link:
+        shown = Viewer(server, reel)
+        send(link, CAMERA, *(update(server, "Observer", name) for name in 10 * ["riccati", "mekf"]))
+        send(link, update(server, "Vehicle", "f2"))
+        wait_until(lambda: shown._panel.wishes == {"observer": "mekf", "vehicle": 1})
+        shown.run(turns(1))
+    assert asked == [{"observer": "mekf"}]
     reel.close()
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -139,11 +138,11 @@ _SWITCHES = {
 
 
 class Panel:
-    """viser's panel; what the user does comes out of `wishes` as (name, value), in the thread that asks."""
+    """viser's panel; `wishes` has the latest value of each thing that the user asked for, for the thread that shows."""
 
     def __init__(self, gui: Any, stage: Stage, source: Origin, look: Look, abilities: Abilities, length: float) -> None:
         """Add everything; `length` is that of the episode, s."""
-        self.wishes: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self.wishes: dict[str, Any] = {}
         self._gui, self._stage, self._source, self._look = gui, stage, source, look
         self._time_at = self._texts_at = self._plots_at = -np.inf
         self._playing: Any = None
@@ -181,7 +180,7 @@ class Panel:
 
     def _add_playback(self, length: float) -> None:
         self._playing = self._gui.add_button("Pause")
-        self._playing.on_click(lambda event: self.wishes.put(("play", None)))
+        self._playing.on_click(lambda event: self.wishes.update(play=None))
         group = self._gui.add_button_group("Go", ("Step", "Restart"))
         self._on(group.on_click, "go", {"Step": "step", "Restart": "restart"})
         self._choice("Speed", SPEEDS, "Times real time.", initial="1")
@@ -217,7 +216,8 @@ class Panel:
             meant = [float(given)] if isinstance(given, int | float) and low <= given <= high else []
         else:
             meant = [meaning for value, meaning in offered.items() if value == given]
-        self.wishes.put((name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered"))
+        name, value = (name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered")
+        self.wishes[name] = value
 
     def set_source(self, source: Origin) -> None:
         """Set the heading and the legend."""
