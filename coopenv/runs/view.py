@@ -40,10 +40,7 @@ class Viewer:
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities, reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
-        vehicles = {i: i for i in range(self._stage.vehicles)}
-        self._picture.actors.cars.handle.on_click(
-            lambda event: self._panel.wish("vehicle", event.instance_index, vehicles)
-        )
+        self._picture.actors.cars.handle.on_click(lambda event: self._panel.wishes.update(vehicle=event.instance_index))
         server.on_client_connect(self._welcome)
         self._k, self._speed, self.playing = 0, 1.0, True
         self._live, self._near = not reel.abilities.pace, 1.0
@@ -172,9 +169,6 @@ class Viewer:
         self._set_playing(not self.playing)
         self._panel.set_status("")
 
-    def _wish_refused(self, words: str) -> None:
-        raise CoopenvError(words)
-
     def _wish_go(self, action: str) -> None:
         getattr(self, f"_wish_{action}")(None)
 
@@ -198,7 +192,9 @@ class Viewer:
         ticks = np.array([frame.tick for frame in self._reel.frames])
         self._k = int(np.argmin(np.abs(ticks - tick)))
 
-    _wish_vehicle = pick
+    def _wish_vehicle(self, vehicle: int | None) -> None:
+        if vehicle in (None, *range(self._stage.vehicles)):  # a client can click on any number
+            self.pick(vehicle)
 
     def _wish_magnification(self, magnification: float) -> None:
         self._look.magnification = magnification

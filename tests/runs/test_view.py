@@ -265,43 +265,123 @@ def test_what_viser_starts_unguarded_is_refused(monkeypatch: pytest.MonkeyPatch)
         pass
 
 
+@pytest.fixture
+def worked() -> Iterator[tuple[Viewer, Any, Any]]:
+    """A view that pauses, viser's server and a client."""
+    reel = reel_of("urban_crossing")
+    with guarded_server("127.0.0.1") as (server, url), client(url) as link:
+        shown = Viewer(server, reel)
+        wish(shown, ("play", None))
+        send(link, CAMERA)
+        yield shown, server, link
+    reel.close()
+
+
+def check_works(shown: Viewer, server: Any, link: Any) -> None:
+    """Check that a view still carries out what its panel offers."""
+    send(link, update(server, "Vehicle", "f2"))
+    wait_until(lambda: shown._look.picked == 1, lambda: shown.run(turns(1)))
+    shown._faded_at = -np.inf
+    wish(shown, ("step", None))
+    assert len(shown._reel.frames) == 2 and not shown._panel._status.visible
+
+
+NAN = float("nan")
+
+
 @pytest.mark.parametrize(
     ("label", "value"),
     [
         ("Fault", "zzz"),
         ("Observer", "../mine.py:Observer"),
         ("Vehicle", "f99"),
+        ("Vehicle", "x" * 50_000),
         ("Speed", "0"),
         ("Speed", "nan"),
-        ("Speed", "inf"),
-        ("Time [s]", float("nan")),
-        ("Time [s]", 1e9),
-        ("Time [s]", -1.0),
+        ("Speed", 1),
+        *(("Time [s]", value) for value in (NAN, 1e9, -1.0, "1", [1.0], None)),
     ],
 )
-def test_a_value_that_was_not_offered_is_refused(label: str, value: Any) -> None:
-    import msgspec
+def test_a_value_that_is_not_offered_is_refused(
+    label: str, value: Any, worked: tuple[Viewer, Any, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    shown, server, link = worked
+    before = control(server, label)[1].value
+    send(link, update(server, label, value), update(server, "Names", False))
+    wait_until(lambda: "show names" in shown._panel.wishes)
+    assert list(shown._panel.wishes) == ["show names"] and control(server, label)[1].value == before
+    check_works(*worked)
+    assert not caplog.text
 
-    reel = reel_of("urban_crossing")
-    with guarded_server("127.0.0.1") as (server, url), client(url) as link:
-        shown = Viewer(server, reel)
-        wish(shown, ("play", None))
-        handles = server.gui._gui_input_handle_from_uuid
-        uuid = next(uuid for uuid, handle in handles.items() if getattr(handle, "label", "") == label)
-        camera = {"position": (float("nan"),) * 3, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
-        size = {"fov": 1.0, "near": 0.1, "far": 10.0, "image_height": 10, "image_width": 10}
-        for message in (
-            {"type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), **camera, **size},
-            {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}},
-        ):
-            link.send(msgspec.msgpack.encode(message))
-        end = monotonic() + 20.0
-        shown.run(lambda: "is not offered" not in shown._panel._status.content and monotonic() < end)
-        assert "That cannot be: " in shown._panel._status.content
-        assert (shown.playing, shown._speed, len(reel.frames)) == (False, 1.0, 1)
-        wish(shown, ("step", None))
-        assert len(reel.frames) == 2
-    reel.close()
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        *({**CAMERA, "position": at} for at in ([1.0, 2.0], [NAN] * 3, [1e200] * 3)),
+        *({**CAMERA, name: value} for name, value in (("image_height", 0), ("fov", "x"), ("more", 1))),
+        {"type": "ViewerCameraMessage"},
+        {"type": "GuiFormDirtyMessage", "uuid": "x" * 10_000},
+        {"type": ["GuiUpdateMessage"]},
+        {"type": "GuiUpdateMessage", "uuid": "nothing", "updates": {"value": 1}},
+        [1],
+        b"\xff",
+    ],
+    ids=lambda message: f"{message}"[:60],
+)
+def test_no_message_of_a_client_ends_the_view(
+    message: Any,
+    worked: tuple[Viewer, Any, Any],
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    _, server, link = worked
+    send(link, message)
+    check_works(*worked)
+    kept = server._websock_server._broadcast_buffer.message_from_id.values()
+    assert not any(type(each).__name__ == "GuiFormDirtyMessage" for each in kept)
+    assert not caplog.text and capfd.readouterr().err == ""
+
+
+def test_vehicles_can_be_clicked_on_and_nothing_else(worked: tuple[Viewer, Any, Any]) -> None:
+    shown, _, link = worked
+    name = shown._picture.actors.cars.handle.name
+    where = {"screen_pos": (0.5, 0.5), "ray_origin": (0.0, 0.0, 1.0), "ray_direction": (0.0, 0.0, -1.0)}
+    for index, picked in ((0, 0), (99, 0), (-1, 0), (2**63, 0), (2, 2), (None, None)):
+        click = {"name": name, "instance_index": index, "modifier": None, "owner": "", **where}
+        send(link, {"type": "SceneNodeClickMessage", **click})
+        wait_until(lambda index=index: shown._panel.wishes == {"vehicle": index})
+        shown.run(turns(1))
+        assert shown._look.picked == picked and not shown._panel._status.visible
+
+
+def test_neither_properties_nor_files_can_be_sent(worked: tuple[Viewer, Any, Any]) -> None:
+    _, server, link = worked
+    slider = control(server, "Time [s]")
+    part = {"source_component_uuid": slider[0], "transfer_uuid": "t"}
+    start = {"filename": "f", "mime_type": "m", "part_count": 1, "size_bytes": 1, **part}
+    send(link, {"type": "FileTransferStartUpload", **start})
+    send(link, {"type": "FileTransferPart", "part_index": 0, "content": b"x", **part})
+    send(link, update(server, "Time [s]", value=True, name="removed"))
+    check_works(*worked)
+    assert not slider[1]._impl.removed and isinstance(slider[1].value, float)
+
+
+def test_no_client_can_share_the_view_or_send_much(
+    worked: tuple[Viewer, Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    _, server, link = worked
+    asked: list[str] = []
+    for name in ("request_share_url", "disconnect_share_url"):
+        monkeypatch.setattr(server, name, lambda: asked.append("share"))
+    send(link, {"type": "ShareUrlRequest"}, {"type": "ShareUrlDisconnect"})
+    check_works(*worked)
+    assert not asked
+    link.send(bytes(2**20))
+    with pytest.raises(ConnectionClosed, match="1009"):
+        while link.recv(timeout=20):
+            pass
 
 
 def test_of_queued_wishes_for_one_thing_the_last_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:

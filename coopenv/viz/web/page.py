@@ -51,8 +51,8 @@ def viser_module() -> Any:
 def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, str]]:
     """Yield a server of viser, and the address of its page with the token that it needs, which `refusal` guards.
 
-    viser itself answers every WebSocket and every host name and has no setting for it. The guard is put before its
-    own `process_request` while it starts.
+    viser itself answers every WebSocket, host name and message and has no setting for it. The guard is put before its
+    own `process_request` and its reception of messages, which `is_needed` filters, while it starts.
 
     Args:
         host: address of this computer.
@@ -69,16 +69,27 @@ def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, st
     token, names = token_urlsafe(TOKEN_BYTES), {"localhost", host.lower(), socket.gethostname().lower()}
     guards: list[Callable[[Any, Any], Any]] = []
 
-    def guarded_serve(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+    def guarded_serve(handle: Any, *arguments: Any, process_request: Any, **options: Any) -> Any:
         def guard(connection: Any, request: Any) -> Any:
             reason, path = refusal(request.path, request.headers, token, names)
             if reason:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
             return process_request(connection, replace(request, path=path))
 
+        async def filtered(connection: Any) -> None:
+            receive = connection.recv
+
+            async def receive_needed() -> Any:
+                while not is_needed(message := await receive(), server.gui):
+                    pass
+                return message
+
+            connection.recv = receive_needed
+            await handle(connection)
+
         guards.append(guard)
-        quiet = logging.Logger("view", logging.CRITICAL)  # a client's errors are not the terminal's
-        return serve(*arguments, process_request=guard, **{**options, "logger": quiet})
+        options |= {"max_size": 2**16, "logger": logging.Logger("view", logging.CRITICAL)}  # which is quiet
+        return serve(filtered, *arguments, process_request=guard, **options)
 
     with _STARTING:
         serve = asyncio_server.serve
@@ -94,6 +105,28 @@ def guarded_server(host: str, port: int | None = None) -> Iterator[tuple[Any, st
         yield server, f"http://{shown}:{server.get_port()}/{token}"
     finally:
         server.stop()
+
+
+def is_needed(message: Any, gui: Any) -> bool:
+    """Return whether a client's message is a camera, a click or a value that a control of viser's `gui` offers."""
+    import msgspec
+    from viser import _messages as known
+
+    kinds = {k.__name__: k for k in (known.ViewerCameraMessage, known.SceneNodeClickMessage, known.GuiUpdateMessage)}
+    try:
+        given = msgspec.msgpack.decode(message)
+        meant: Any = msgspec.convert(given, kinds[given.pop("type")])
+        fine: bool = given.keys() == vars(meant).keys()
+        if isinstance(meant, known.ViewerCameraMessage):
+            fine &= meant.image_height > 0 and bool(np.abs(np.hstack([*vars(meant).values()])).max() < 1e9)  # finite
+        elif isinstance(meant, known.GuiUpdateMessage):
+            control, value = gui._gui_input_handle_from_uuid[meant.uuid], meant.updates.pop("value")
+            options = getattr(control, "options", (False, True))
+            offered = control.min <= value <= control.max if hasattr(control, "max") else value in options
+            fine &= bool(offered) and not meant.updates
+        return fine
+    except Exception:  # a message never ends the view
+        return False
 
 
 PORT, PORTS = 8080, 20

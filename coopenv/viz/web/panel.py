@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.base.errors import shown
 from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
@@ -103,9 +102,6 @@ _CELL = "padding:2px;text-align:right"
 NONE_PICKED = "none"
 _PICK = "*Pick a vehicle above, or click on one in the scene.*"
 NO_FAULT = "none"
-REFUSED = "refused"
-"""Name of a wish for a value that was not offered; its value is the reason."""
-SWITCH = {False: False, True: True}
 TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
 """s of real time between two positions of the slider, two tables, and two images and plots."""
 
@@ -174,19 +170,19 @@ class Panel:
             magnified.value = initial if initial in MAGNIFICATIONS else "1"
             self._on(magnified.on_click, "magnification", MAGNIFICATIONS)
             for name, label in _SWITCHES.items():
-                self._on(gui.add_checkbox(label, getattr(look, name)).on_update, f"show {name}", SWITCH)
+                self._on(gui.add_checkbox(label, getattr(look, name)).on_update, f"show {name}")
             self._legend = gui.add_html("")
         self.set_source(source)
 
     def _add_playback(self, length: float) -> None:
         self._playing = self._gui.add_button("Pause")
-        self._playing.on_click(lambda event: self.wishes.update(play=None))
+        self._on(self._playing.on_click, "play")
         group = self._gui.add_button_group("Go", ("Step", "Restart"))
         self._on(group.on_click, "go", {"Step": "step", "Restart": "restart"})
         self._choice("Speed", SPEEDS, "Times real time.", initial="1")
         end = max(0.1, round(length, 2))
         self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
-        self._on(self._time.on_update, "seek", (0.0, end))
+        self._on(self._time.on_update, "seek")
 
     def _choice(self, label: str, offered: Mapping[str, Any], hint: str, initial: str | None = None) -> Any:
         """Add a control that offers values by their texts, at first the first one unless another one is given."""
@@ -194,30 +190,15 @@ class Panel:
         self._on(control.on_update, label.lower(), offered)
         return control
 
-    def _on(self, listen: Callable[[Any], Any], name: str, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
-        """Turn the user's changes of a control into wishes; changes by the program are no wishes."""
+    def _on(self, listen: Callable[[Any], Any], name: str, meanings: Mapping[str, Any] | None = None) -> None:
+        """Turn the user's changes of a control, or their `meanings`, into wishes; changes by the program are none."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
-                self.wish(name, event.target.value, offered)
+                value = event.target.value  # which is offered: `is_needed` ignores others
+                self.wishes[name] = meanings[value] if meanings else value
 
         listen(changed)
-
-    def wish(self, name: str, given: Any, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
-        """Put a wish into `wishes`, or that it is refused, because a client can send any value.
-
-        Args:
-            name: of the wish.
-            given: value of the control.
-            offered: meaning by value, or the lowest and the highest number.
-        """
-        if isinstance(offered, tuple):
-            low, high = offered
-            meant = [float(given)] if isinstance(given, int | float) and low <= given <= high else []
-        else:
-            meant = [meaning for value, meaning in offered.items() if value == given]
-        name, value = (name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered")
-        self.wishes[name] = value
 
     def set_source(self, source: Origin) -> None:
         """Set the heading and the legend."""
