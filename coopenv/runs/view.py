@@ -1,6 +1,7 @@
 """`coopenv view`: the server and what it shows."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from time import monotonic, sleep
 from typing import Any
 
@@ -61,7 +62,8 @@ class Viewer:
     def _aim(self, camera: Any) -> None:
         """Point a client's camera at the picked vehicle, or at everything."""
         narrow = camera.aspect < _NARROW
-        aim(camera, self._stage, float(camera.aspect), _RAISED if narrow else 0.0, self._near)
+        with suppress(ValueError):  # of a camera that has no direction
+            aim(camera, self._stage, float(camera.aspect), _RAISED if narrow else 0.0, self._near)
 
     def run(self, going: Callable[[], bool] = lambda: True) -> None:
         """Show frames until `going` returns False."""

@@ -317,7 +317,7 @@ def test_a_value_that_is_not_offered_is_refused(
 @pytest.mark.parametrize(
     "message",
     [
-        *({**CAMERA, "position": at} for at in ([1.0, 2.0], [NAN] * 3, [1e200] * 3)),
+        *({**CAMERA, "position": at} for at in ([1.0, 2.0], [NAN] * 3, [1e200] * 3, CAMERA["look_at"])),
         *({**CAMERA, name: value} for name, value in (("image_height", 0), ("fov", "x"), ("more", 1))),
         {"type": "ViewerCameraMessage"},
         {"type": "GuiFormDirtyMessage", "uuid": "x" * 10_000},
