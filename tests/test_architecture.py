@@ -91,15 +91,15 @@ LINES_AND_FILES = {
     "base": (1820, 10),
     "bench": (5360, 19),
     "cars": (10765, 47),
-    "cli": (2625, 8),
+    "cli": (2630, 8),
     "estimation": (1865, 8),
     "evaluation": (495, 3),
     "observers": (11730, 47),
     "policies": (2075, 10),
-    "runs": (3505, 13),
+    "runs": (3500, 13),
     "scenario": (3770, 13),
     "training": (1750, 7),
-    "viz": (4805, 19),
+    "viz": (4820, 19),
     "world": (5570, 20),
 }
 """Physical lines and Python files that each wing may have at most; raised only with a reason in the commit."""
