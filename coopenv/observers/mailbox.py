@@ -128,10 +128,10 @@ class Mailbox:
         return copied
 
     def get_state(self) -> dict[str, Any]:
-        """Return the sent and received messages and the counts."""
+        """Return the sent and received messages, the expected forms and the counts."""
         received = [{sender: tuple(last) for sender, last in of_one.items()} for of_one in self.received]
         counts = {"bytes": self.bytes, "refused": self.refused}
-        return {"sent": self.sent, "said": self.replayable, "heard": received, **counts}
+        return {"sent": self.sent, "said": self.replayable, "heard": received, "forms": self.forms, **counts}
 
     def set_state(self, state: Any) -> None:
         """Set the state that `get_state` returned, as read-only arrays; other values raise any exception."""
@@ -151,6 +151,7 @@ class Mailbox:
             }
             for of_one in received
         ]
+        self.forms = {senders[j]: tuple(map(index, form)) for j, form in state["forms"].items()}
         self.bytes, self.refused = count, refused
 
 

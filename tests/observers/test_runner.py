@@ -266,6 +266,25 @@ def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
         assert not message.extra["index"].flags.writeable
 
 
+def test_a_restored_group_refuses_what_it_would_have_refused() -> None:
+    """Covariances of another shape than a vehicle's own, also before it has sent again."""
+    made = recording("busy_intersection_tracking", v2x__period=3, v2x__delay=0)
+
+    def tamper(vehicle: int, time: float, observer: Observer, message: Message) -> Message:
+        return replace(message, covariance=np.eye(6)) if vehicle == 1 else message
+
+    groups = [ObserverGroup(find("mekf_covariance"), made.observer_init, tamper) for _ in range(2)]
+    for group in groups:
+        group.start(made.start_rotation, made.start_position)
+    for k in range(1, 13):
+        if k == 9:
+            groups[1].set_state(groups[1].checked_state(groups[1].get_state(), begun=True))
+        for group in groups:
+            for i in made.order:
+                group.update(i, made.at(k), made.inbox_tick[k, i])
+    assert groups[0].refused.tolist() == groups[1].refused.tolist() and groups[0].refused.any()
+
+
 def test_the_mean_nees_is_over_the_ticks_with_a_covariance() -> None:
     class Sometimes(Probe):
         def update(self, tick: Tick) -> Estimate:
