@@ -75,7 +75,7 @@ class CarWorld(World):
         camera = model.camera.numpy()  # on the CPU this and the others are views
         camera["quantise"], camera["undistort"] = 0, 1
         if self._frames:
-            camera["miss"], model.noise.numpy()["bearing"] = 0.0, 0.0
+            camera["miss_probability"], model.noise.numpy()["bearing"] = 0.0, 0.0
         targets = np.tile(np.arange(model.agents), (model.vehicles, 1))
         for vehicle in range(model.vehicles):
             own = model.landmarks + vehicle
